@@ -1,0 +1,160 @@
+"""How fast the environment is, against a naive use of the same simulator, and what its pictures look like.
+
+    python benchmarks/env.py speed                    # episodes per second, ms per frame, gain of a second core
+    python benchmarks/env.py sheet docs/scenes.png    # every preset, arm, light, tile size and rendering at 224 px
+
+The naive rival loads the scene anew for every episode and draws the whole picture after every action. Ours
+restores a saved state, draws a picture every fifth action and lays robot, cube and tiles over the cached table.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+from PIL import Image, ImageDraw
+
+from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.env.camera import Picture
+from probe_kit.env.scene import FLOOR_COLOR, INVISIBLE, TABLE_COLOR, Scene
+from probe_kit.env.spec import LightSpec
+
+SPEC = SceneSpec(start_jitter=0.02, start_jitter_yaw=1.5, early_stop=True)
+OBSERVE_EVERY = 5
+CELL = 224
+
+
+class ExpertEnv(Act2AnswerEnv):
+    """The environment with a method that plays expert episodes, so that worker processes can be told to."""
+
+    def play(self, count: int, first_seed: int = 0) -> int:
+        """Play `count` episodes with an observation every fifth action; returns how many succeeded."""
+        successes = 0
+        for seed in range(first_seed, first_seed + count):
+            self.reset(seed=seed)
+            expert = ScriptedExpert(self)
+            expert.reset()
+            while not self.trial.over:
+                self.advance(expert.act())
+                if self.trial.steps % OBSERVE_EVERY == 0:
+                    self.observe()
+            successes += self.outcome().is_success
+        return successes
+
+
+def naive_picture(scene: Scene) -> Picture:
+    """The whole scene drawn in one go."""
+    for body, color in ((scene.table, TABLE_COLOR), (scene.floor, FLOOR_COLOR)):
+        scene.client.changeVisualShape(body, -1, rgbaColor=color)
+    picture = scene.frame().rgb
+    for body in (scene.table, scene.floor):
+        scene.client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
+    return picture
+
+
+def play_naively(count: int) -> int:
+    """Play `count` episodes, each in a scene loaded for it, drawing after every action."""
+    successes = 0
+    for seed in range(count):
+        env = Act2AnswerEnv(SPEC)
+        env.reset(seed=seed)
+        expert = ScriptedExpert(env)
+        expert.reset()
+        while not env.trial.over:
+            env.advance(expert.act())
+            naive_picture(env.scene)
+        successes += env.outcome().is_success
+        env.close()
+    return successes
+
+
+def seconds(work: Callable[[], object], clock: Callable[[], float], repeats: int = 3) -> float:
+    """The shortest of some runs; other load on the machine only ever makes it longer."""
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        work()
+        times.append(clock() - start)
+    return min(times)
+
+
+def speed(episodes: int) -> None:
+    """Print the comparison. One core in CPU seconds, the second core in wall seconds."""
+    env = ExpertEnv(SPEC)
+    env.play(2)
+    assert env.play(episodes) == play_naively(2) * episodes // 2 == episodes, "an episode failed"
+    frames = [seconds(lambda draw=draw: draw(env), time.process_time, 20) for draw in (
+        lambda env: naive_picture(env.scene), lambda env: env.scene.picture(env.scene.frame()))]  # fmt: skip
+    naive = 2 / seconds(lambda: play_naively(2), time.process_time)
+    ours = episodes / seconds(lambda: env.play(episodes), time.process_time)
+    env.close()
+    print(f"picture 640x480   naive {1e3 * frames[0]:6.1f} ms   ours {1e3 * frames[1]:6.1f} ms")
+    print(f"expert episodes   naive {naive:6.2f} /s   ours {ours:6.2f} /s   {ours / naive:.1f} times, one core")
+    one, two = (workers(count, episodes) for count in (1, 2))
+    print(f"worker processes  one   {one:6.2f} /s   two  {two:6.2f} /s   {two / one:.2f} times, wall clock")
+
+
+def workers(count: int, episodes: int) -> float:
+    """Episodes per second of wall clock with `count` processes playing `episodes` each."""
+    envs = gym.vector.AsyncVectorEnv([lambda: ExpertEnv(SPEC)] * count, context="forkserver")
+    envs.call("play", 1)
+    rate = count * episodes / seconds(lambda: envs.call("play", episodes), time.perf_counter)
+    envs.close()
+    return rate
+
+
+def label(text: str, color: str) -> Image.Image:
+    """A picture with two large characters."""
+    picture = Image.new("RGB", (256, 256), color)
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((3, 3, 252, 252), outline="black", width=5)
+    draw.text((128, 128), text, fill="black", font_size=150, anchor="mm")
+    return picture
+
+
+def sheet(path: Path) -> None:
+    """Write the first frame of every kind of scene, as a policy sees it: squeezed to 224 x 224."""
+    cells = {}
+    for preset in ("bridge", "frontal", "vl-think"):
+        for rendering in ("raw", "visual-matching"):
+            cells[f"{preset}, {rendering}"] = SceneSpec.preset(preset, rendering=rendering)
+    for level in (0.7, 1.3):
+        cells[f"light {level:.0%}"] = SceneSpec(light=LightSpec(level=level))
+    for side in (0.088, 0.154):
+        cells[f"tile {side / 0.11:.0%}"] = SceneSpec(tile_side=side)
+    columns = 4
+    rows = -(-len(cells) // columns)
+    board = Image.new("RGB", (columns * (CELL + 8), rows * (CELL + 26)), "white")
+    for i, (title, spec) in enumerate(cells.items()):
+        corner = (i % columns * (CELL + 8) + 4, i // columns * (CELL + 26) + 22)
+        board.paste(first_frame(spec), corner)
+        ImageDraw.Draw(board).text((corner[0], corner[1] - 18), title, fill="black", font_size=13)
+    board.save(path)
+
+
+def first_frame(spec: SceneSpec) -> Image.Image:
+    """What the camera sees before the first action."""
+    scene = Scene(spec)
+    pictures = {"left": label("7A", "#ffee77"), "right": label("R2", "#99e5ff")}
+    scene.reset(pictures, (*spec.cube_xy, spec.cube_side / 2), spec.cube_yaw)
+    picture = scene.picture(scene.frame())
+    scene.close()
+    return Image.fromarray(picture).resize((CELL, CELL), Image.Resampling.LANCZOS)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("speed").add_argument("--episodes", type=int, default=10)
+    commands.add_parser("sheet").add_argument("path", type=Path)
+    arguments = parser.parse_args()
+    if arguments.command == "speed":
+        speed(arguments.episodes)
+    else:
+        sheet(arguments.path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""probe_kit: what a Vision-Language-Action model still knows, where inside it, and where it is lost.
+
+    import probe_kit as pk
+    run = pk.extract_run(pk.ExtractSettings("pi0-tiny", categories=("color",), items=20), "run")
+    results = pk.train_probes(run)
+    print(pk.retention_table([run]).to_markdown())
+
+Data flows one way: suite → env → hooks → extract → train → retention.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from probe_kit.env import Act2AnswerEnv, SceneSpec
+    from probe_kit.errors import ProbeKitError
+    from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+    from probe_kit.hooks import Site, capture, load_policy
+    from probe_kit.retention import retention as retention_table
+    from probe_kit.retention.figures import layer_curve
+    from probe_kit.suite import Suite, build_suite, default_suite, load_suite
+    from probe_kit.train import load_results, train_probes
+
+# Everything is imported on first use: `import probe_kit` must not load torch.
+_HOME = {
+    "Act2AnswerEnv": "env",
+    "ExtractSettings": "extract",
+    "ProbeKitError": "errors",
+    "Run": "extract",
+    "SceneSpec": "env",
+    "Site": "hooks",
+    "Suite": "suite",
+    "build_suite": "suite",
+    "capture": "hooks",
+    "default_suite": "suite",
+    "extract_run": "extract",
+    "layer_curve": "retention.figures",
+    "load_policy": "hooks",
+    "load_results": "train",
+    "load_suite": "suite",
+    "open_run": "extract",
+    "retention_table": "retention",
+    "train_probes": "train",
+}
+__all__ = [
+    "Act2AnswerEnv",
+    "ExtractSettings",
+    "ProbeKitError",
+    "Run",
+    "SceneSpec",
+    "Site",
+    "Suite",
+    "build_suite",
+    "capture",
+    "default_suite",
+    "extract_run",
+    "layer_curve",
+    "load_policy",
+    "load_results",
+    "load_suite",
+    "open_run",
+    "retention_table",
+    "train_probes",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f"probe_kit.{_HOME[name]}")
+    return getattr(module, "retention" if name == "retention_table" else name)

@@ -1,0 +1,61 @@
+"""The whole pipeline on the embedded default, small enough to watch: what `probe-kit demo` runs."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract.layout import VIDEOS
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.figures import layer_curve
+from probe_kit.suite import build_suite
+from probe_kit.train import train_probes
+
+CATEGORIES = ("color", "shape", "counting")
+ITEMS = 12
+PERMUTATIONS = 100
+
+Progress = Callable[..., None]
+Stage = Callable[[str], Progress]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo made."""
+
+    folder: Path
+    run: Run
+    table: RetentionTable
+
+    def next_steps(self) -> str:
+        """Where to look, and what to try."""
+        lines = [
+            f"[bold]Look at[/] {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
+            f"        {self.folder / 'episode.gif'}  what one episode looks like",
+            f"        {self.folder / 'table.md'}  the tables above",
+            f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
+            "[bold]Try[/]     probe-kit suite show            the questions",
+            "        probe-kit extract --model expert --items 4    a policy that knows the answers",
+            "        probe-kit models                the models that can be probed",
+        ]
+        if self.run.random_weights:
+            lines.insert(0, "[bold yellow]The policy has random weights:[/] expect SR near 0 and no signal.")
+        return "\n".join(lines)
+
+
+def run_demo(folder: Path, stage: Stage) -> Demo:
+    """Suite, episodes, probes, table, figure and film in `folder`; called again, it continues.
+
+    stage: gives a progress callback (done, total, …) for a stage of this name.
+    """
+    suite = build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
+    settings = ExtractSettings("pi0-tiny", suite=suite.folder, video="first")
+    run = extract_run(settings, folder / "run", progress=stage("episodes"))
+    results = train_probes(run, permutations=PERMUTATIONS, progress=stage("probing sites"))
+    table = retention([run])
+    layer_curve(results).savefig(folder / "layer_curves.png")
+    (folder / "table.md").write_text(table.to_markdown())
+    film = next((run.path / VIDEOS).glob("*.gif"))
+    shutil.copyfile(film, folder / "episode.gif")
+    return Demo(folder, run, table)

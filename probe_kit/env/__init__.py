@@ -1,0 +1,19 @@
+"""The Act2Answer environment: a question asked on a table top and answered by putting a cube on a picture.
+
+`gymnasium.make("probe_kit/Act2Answer-v0", spec=SceneSpec())` and `Act2AnswerEnv(SceneSpec())` are the same.
+Importing this module loads neither the simulator nor torch.
+"""
+
+from gymnasium.envs.registration import register, registry
+
+from probe_kit.env.act2answer import Act2AnswerEnv
+from probe_kit.env.expert import ScriptedExpert
+from probe_kit.env.outcome import Outcome, success_by_radius
+from probe_kit.env.spec import SceneSpec
+
+ENV_ID = "probe_kit/Act2Answer-v0"
+
+if ENV_ID not in registry:
+    register(ENV_ID, entry_point="probe_kit.env.act2answer:Act2AnswerEnv")
+
+__all__ = ["ENV_ID", "Act2AnswerEnv", "Outcome", "SceneSpec", "ScriptedExpert", "success_by_radius"]

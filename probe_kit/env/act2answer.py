@@ -1,0 +1,218 @@
+"""The environment: two pictures on a table, a cube, an arm, and an instruction that names one picture."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from probe_kit.env.camera import Frame, Picture
+from probe_kit.env.controller import check_action
+from probe_kit.env.outcome import Outcome
+from probe_kit.env.question import Question
+from probe_kit.env.scene import Scene
+from probe_kit.env.spec import SceneSpec
+from probe_kit.env.trial import Trial
+from probe_kit.errors import EpisodeOverError, SceneError
+from probe_kit.suite.items import other_side
+
+Observation = dict[str, Any]
+Info = dict[str, Any]
+
+
+class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[misc]
+    """Answer a question by putting the cube on one of two pictures.
+
+    Observation: `pixels.image` (H, W, 3) uint8, and `agent_pos` (8,) float32: x, y, z of the tool in metres,
+    roll, pitch, yaw relative to pointing down in radians, a zero that Bridge policies expect, and the opening
+    of the gripper (1 open, 0 closed).
+    Action (7,): xyz delta in metres and roll-pitch-yaw delta in radians along the fixed world axes, added to
+    the last commanded pose, and the gripper: above 0.5 opens it, the rest closes it. One action takes 0.2 s.
+    Reward: 1.0 with the last action if the cube lies in the correct zone, otherwise 0.0.
+    Reset options: `item` (an Item; without it two plain pictures) and `layout` ("original" or "swapped").
+
+    The episode is truncated after `max_steps`, when the cube falls off the table or when the simulator
+    breaks; it terminates only with `SceneSpec.early_stop`. One process can hold many environments, but the
+    simulator holds Python's lock while it works: run in parallel with processes, not with threads.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
+
+    def __init__(self, spec: SceneSpec | None = None, render_mode: str | None = "rgb_array") -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise SceneError(f"render mode {render_mode!r} does not exist; use 'rgb_array'.")
+        self.scene_spec = spec or SceneSpec()
+        self.render_mode = render_mode
+        limits = self.scene_spec.limits
+        width, height = self.scene_spec.picture_size or (
+            self.scene_spec.camera.width,
+            self.scene_spec.camera.height,
+        )
+        high = np.array([limits.translation] * 3 + [limits.rotation] * 3 + [1.0], np.float32)
+        self.action_space = spaces.Box(np.append(-high[:6], np.float32(0.0)), high, dtype=np.float32)
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict({"image": spaces.Box(0, 255, (height, width, 3), np.uint8)}),
+                "agent_pos": spaces.Box(-10.0, 10.0, (8,), np.float32),
+            }
+        )
+        self._question = Question.built_in()
+        self._scene: Scene | None = None
+        self._trial: Trial | None = None
+        self._frame: Frame | None = None
+        self._closed = False
+
+    # -- gymnasium ---------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Start an episode; `info["tile_visibility"]` says how much of each picture the camera sees.
+
+        Raises SuiteError for a missing or broken picture and SceneError for an unknown option, in both cases
+        before anything moved. Raises EpisodeOverError after `close`.
+        """
+        super().reset(seed=seed)
+        if self._closed:
+            raise EpisodeOverError("this environment was closed; make a new one.")
+        self._question = _question(options or {})
+        if self._scene is None:
+            self._scene = Scene(self.scene_spec)
+        self._trial = self._start(self._scene)
+        observation = self.observe()
+        return observation, self._info() | {"tile_visibility": self.scene.tile_visibility(self._current_frame())}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
+        """`advance` and then `observe`."""
+        reward, terminated, truncated, info = self.advance(action)
+        return self.observe(), reward, terminated, truncated, info
+
+    def render(self) -> Picture:
+        """The picture (H, W, 3) uint8 of the scene now, as rendered."""
+        return self.scene.picture(self._current_frame())
+
+    def close(self) -> None:
+        """Free the simulator; a second call does nothing."""
+        if self._scene is not None:
+            self._scene.close()
+        self._scene, self._trial, self._closed = None, None, True
+
+    # -- cheap stepping ----------------------------------------------------------------------------------
+
+    def advance(self, action: ArrayLike) -> tuple[float, bool, bool, Info]:
+        """Carry out one action without drawing a picture: reward, terminated, truncated, info.
+
+        A policy that executes a chunk of actions blindly needs a picture only before the next chunk, and
+        drawing is most of the work. Raises ActionError for a bad action, with nothing moved, and
+        EpisodeOverError before `reset` or after the end.
+        """
+        trial = self.trial
+        if trial.over:
+            raise EpisodeOverError(f"the episode ended after {trial.steps} steps; call `reset` to start another.")
+        trial.advance(check_action(action))
+        self._frame = None
+        info = self._info()
+        return float(info["is_success"]), trial.stopped_early, trial.ending is not None, info
+
+    def observe(self) -> Observation:
+        """The observation now; draws the picture unless it was drawn since the last action."""
+        picture = self.render()
+        if self.scene_spec.picture_size is not None:
+            picture = np.asarray(
+                Image.fromarray(picture).resize(self.scene_spec.picture_size, Image.Resampling.LANCZOS)
+            )
+        arm = self.scene.arm
+        agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
+        return {"pixels": {"image": picture}, "agent_pos": agent_pos}
+
+    def outcome(self) -> Outcome:
+        """The record of the episode so far. Raises EpisodeOverError if no action was carried out yet."""
+        if self.trial.steps == 0:
+            raise EpisodeOverError("no action was carried out yet, so there is no outcome; call `step` first.")
+        return self.trial.outcome()
+
+    # -- what experts and tools may look at, and policies may not ----------------------------------------
+
+    @property
+    def scene(self) -> Scene:
+        """The simulated scene. Raises EpisodeOverError before the first `reset`."""
+        return self.trial.scene
+
+    @property
+    def trial(self) -> Trial:
+        """The running or finished episode. Raises EpisodeOverError before `reset` and after `close`."""
+        if self._trial is None:
+            raise EpisodeOverError("there is no episode; call `reset` first (and not after `close`).")
+        return self._trial
+
+    @property
+    def question(self) -> Question:
+        """The question of the current episode."""
+        return self._question
+
+    # -- what lerobot reads ------------------------------------------------------------------------------
+
+    @property
+    def task_description(self) -> str:
+        """The instruction of the current episode."""
+        return self._question.instruction
+
+    @property
+    def task(self) -> str:
+        """Name of the current episode, `<item_id>:o` or `<item_id>:s`."""
+        return self._question.name
+
+    @property
+    def _max_episode_steps(self) -> int:
+        return self.scene_spec.max_steps
+
+    # -- inside ------------------------------------------------------------------------------------------
+
+    def _start(self, scene: Scene) -> Trial:
+        """Lay out the question; the start of the cube is drawn from the seed of the episode."""
+        spec = self.scene_spec
+        xy = np.array(spec.cube_xy) + self.np_random.uniform(-spec.start_jitter, spec.start_jitter, 2)
+        yaw = spec.cube_yaw + self.np_random.uniform(-spec.start_jitter_yaw, spec.start_jitter_yaw)
+        scene.reset(self._question.pictures, (float(xy[0]), float(xy[1]), spec.cube_side / 2), float(yaw))
+        if spec.start_grasped:
+            scene.put_cube_in_hand()
+        self._frame = None
+        return Trial(scene, self._question)
+
+    def _current_frame(self) -> Frame:
+        if self._frame is None:
+            self._frame = self.scene.frame()
+        return self._frame
+
+    def _info(self) -> Info:
+        trial, spec = self.trial, self.scene_spec
+        record = trial.outcome()
+        return {
+            "outcome": record.zone if trial.over else None,
+            "is_success": trial.over and record.is_success,
+            "cube_xy": np.array(record.cube_xy),
+            "cube_z": record.cube_z,
+            "distance_correct": record.distance_correct,
+            "distance_wrong": record.distance_wrong,
+            "tile_xy_correct": np.array(spec.tile_xy(record.side_correct)),
+            "tile_xy_wrong": np.array(spec.tile_xy(other_side(record.side_correct))),
+            "side_correct": record.side_correct,
+            "side_placed": record.side_placed,
+            "layout": record.layout,
+            "is_grasped": record.is_grasped,
+            "cube_moved": record.cube_moved,
+            "on_tile": record.on_tile,
+            "steps": record.steps,
+            "clipped": record.clipped,
+            "ik_error": trial.ik_error,
+            "truncation_reason": record.truncation_reason,
+        }
+
+
+def _question(options: dict[str, Any]) -> Question:
+    unknown = sorted(set(options) - {"item", "layout"})
+    if unknown:
+        raise SceneError(f"reset has no option {unknown[0]!r}; it takes 'item' and 'layout'.")
+    layout = options.get("layout", "original")
+    item = options.get("item")
+    return Question.built_in(layout) if item is None else Question.from_item(item, layout)

@@ -1,0 +1,119 @@
+"""A scripted expert with privileged sight: it shows that the task can be done, and how well at best."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.act2answer import Act2AnswerEnv
+from probe_kit.env.rotations import Array, to_rpy
+from probe_kit.errors import EpisodeOverError
+from probe_kit.suite.items import other_side
+
+MAX_SHIFT = 0.05
+"""Largest translation of one action, metres."""
+MAX_TURN = 0.35
+"""Largest rotation of one action, radians."""
+TRAVEL_HEIGHT = 0.12
+RELEASE_GAP = 0.003
+OPEN, CLOSED = 1.0, 0.0
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A tool position (3,) and turn about +z, the gripper command on the way, and actions to wait there."""
+
+    position: Array
+    yaw: float
+    gripper: float
+    wait: int = 0
+
+
+class ScriptedExpert:
+    """Carries the cube to the correct tile (`mirrored`: to the wrong one), through the public actions alone.
+
+    env: an Act2AnswerEnv, wrapped or not. Call `reset` after each reset of the environment.
+    """
+
+    def __init__(self, env: Any, mirrored: bool = False) -> None:
+        self._env: Act2AnswerEnv = env.unwrapped
+        self._mirrored = mirrored
+        self._actions: Iterator[Array] | None = None
+
+    def reset(self) -> None:
+        """Look at the table and plan. Raises EpisodeOverError if the environment was not reset."""
+        plan = self._carry() if self._env.scene_spec.start_grasped else [*self._grasp(), *self._carry()]
+        self._actions = self._follow(plan)
+
+    def act(self) -> NDArray[np.float32]:
+        """The next action (7,) float32; once the cube is placed it stays still with the gripper open."""
+        if self._actions is None:
+            raise EpisodeOverError("the expert has no plan; call its `reset` after that of the environment.")
+        return next(self._actions).astype(np.float32)
+
+    def _grasp(self) -> list[Waypoint]:
+        """Over the cube, down, close, and up again."""
+        x, y, _ = self._cube()
+        yaw, height = self._cube_yaw(), self._grasp_height()
+        above, at = np.array([x, y, TRAVEL_HEIGHT]), np.array([x, y, height])
+        return [
+            Waypoint(above, yaw, OPEN),
+            Waypoint(at, yaw, OPEN),
+            Waypoint(at, yaw, CLOSED, wait=3),
+            Waypoint(above, yaw, CLOSED),
+        ]
+
+    def _carry(self) -> list[Waypoint]:
+        """Over the tile, down to just above it, open, and up again."""
+        spec, side = self._env.scene_spec, self._env.question.side_correct
+        x, y = spec.tile_xy(other_side(side) if self._mirrored else side)
+        height = spec.tile_height + self._grasp_height() + RELEASE_GAP
+        above, at = np.array([x, y, TRAVEL_HEIGHT]), np.array([x, y, height])
+        yaw = 0.0 if spec.start_grasped else self._cube_yaw()
+        return [
+            Waypoint(above, yaw, CLOSED),
+            Waypoint(at, yaw, CLOSED),
+            Waypoint(at, yaw, OPEN, wait=2),
+            Waypoint(above, yaw, OPEN),
+        ]
+
+    def _follow(self, plan: list[Waypoint]) -> Iterator[Array]:
+        """Actions along the way-points, then no motion for ever."""
+        for waypoint in plan:
+            while not self._arrived(waypoint):
+                yield self._towards(waypoint)
+            for _ in range(waypoint.wait):
+                yield np.array([0, 0, 0, 0, 0, 0, waypoint.gripper])
+        while True:
+            yield np.array([0, 0, 0, 0, 0, 0, OPEN])
+
+    def _towards(self, waypoint: Waypoint) -> Array:
+        shift, turn = self._remaining(waypoint)
+        shift *= min(1.0, MAX_SHIFT / max(float(np.linalg.norm(shift)), 1e-9))
+        return np.array([*shift, 0.0, 0.0, np.clip(turn, -MAX_TURN, MAX_TURN), waypoint.gripper])
+
+    def _arrived(self, waypoint: Waypoint) -> bool:
+        shift, turn = self._remaining(waypoint)
+        return bool(np.linalg.norm(shift) < 1e-4 and abs(turn) < 1e-3)
+
+    def _remaining(self, waypoint: Waypoint) -> tuple[Array, float]:
+        """Translation and turn about +z from the commanded pose to the way-point."""
+        target = self._env.trial.controller.target
+        yaw = to_rpy(target.rotation @ np.array(self._env.scene.arm.model.down).T)[2]
+        return waypoint.position - target.position, float(waypoint.yaw - yaw)
+
+    def _cube(self) -> Array:
+        return self._env.scene.cube_state().position
+
+    def _cube_yaw(self) -> float:
+        """The turn of the cube that is nearest to none; a cube looks the same after a quarter turn."""
+        x, y, z, w = self._env.scene.cube_state().quaternion
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+
+    def _grasp_height(self) -> float:
+        """Height of the tool when the cube lies on the table between the fingers."""
+        model = self._env.scene.arm.model
+        return max(self._env.scene_spec.cube_side / 2 + model.hand_drop, model.clearance)

@@ -1,0 +1,237 @@
+"""Every number of the scene in one frozen record, which is stored with every run.
+
+Frame: the world frame is the base frame of the WidowX of BridgeV2. +x points away from the robot, +y to its
+left, +z up, and the table top is z = 0. Units: metres, radians, seconds, kilograms, newtons.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+
+from probe_kit.errors import SceneError
+from probe_kit.suite.items import Side
+
+XY = tuple[float, float]
+XYZ = tuple[float, float, float]
+ArmName = Literal["panda", "widowx"]
+Rendering = Literal["raw", "visual-matching"]
+
+EPSILON_MARGIN = 0.01
+"""What the default outcome radius adds to half a tile side, metres (the rule of VL-Think)."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A pinhole camera without distortion; the default is the Bridge third-person view of SimplerEnv.
+
+    eye, forward: position and viewing direction (any length) in the world; +z is up in the picture.
+    width, height: rendered pixels. fov: vertical field of view in degrees. near, far: clipping planes.
+    """
+
+    eye: XYZ = (0.0, -0.16, 0.36)
+    forward: XYZ = (1.0, 0.553, -1.085)
+    width: int = 640
+    height: int = 480
+    fov: float = 42.1004
+    near: float = 0.01
+    far: float = 10.0
+
+
+@dataclass(frozen=True)
+class LightSpec:
+    """One lamp and the share of light each way of reflection gives; `level` scales all of them.
+
+    direction points towards the lamp. A white tile on the table reflects 0.77 of full scale, so that the
+    brightest ablation of the paper (`level=1.3`) reaches white without clipping. There are no shadows.
+    """
+
+    direction: XYZ = (0.2, -0.6, 1.5)
+    ambient: float = 0.45
+    diffuse: float = 0.35
+    specular: float = 0.05
+    level: float = 1.0
+
+
+@dataclass(frozen=True)
+class PhysicsSpec:
+    """How time passes: 48 substeps at 240 Hz make one action at 5 Hz.
+
+    A strong grip on a light cube needs many solver iterations: 40 N with 30 iterations squeezes the cube out
+    of the hand every time, 15 N with 100 never did.
+    """
+
+    rate: float = 240.0
+    substeps: int = 48
+    solver_iterations: int = 100
+    grip_force: float = 15.0
+    finger_speed: float = 0.12
+    friction: float = 1.0
+
+
+@dataclass(frozen=True)
+class LimitSpec:
+    """What the controller accepts; anything beyond is clipped and counted.
+
+    translation, rotation: largest change per action and axis. low, high: corners of the box the commanded
+    tool position stays in (its floor is raised to the finger clearance of the arm). ik_error, ik_turn_error:
+    what may remain to the wanted pose before the arm holds still instead of moving.
+    """
+
+    translation: float = 0.10
+    rotation: float = 0.50
+    low: XYZ = (0.15, -0.30, 0.0)
+    high: XYZ = (0.50, 0.30, 0.40)
+    ik_error: float = 0.005
+    ik_turn_error: float = 0.05
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """The whole experiment but the question: places, robot, camera, light, physics and limits.
+
+    tile_left, tile_right: tile centres (x, y). tile_yaw: turn of both tiles about +z; at zero the top of a
+    picture points away from the robot. tile_side, tile_height: size of a tile.
+    cube_xy, cube_yaw: where the cube starts, give or take `start_jitter` per axis and `start_jitter_yaw`,
+    drawn uniformly from the seed of the episode. cube_side, cube_mass, cube_color (RGB in [0, 1]).
+    epsilon: radius of the outcome zones around the tile centres; None means tile_side / 2 + 0.01.
+    home: tool position at the start, the gripper pointing down. start_grasped: begin with the cube in hand.
+    max_steps: actions per episode. early_stop: end when the cube was released and lay still for 5 actions.
+    moved: how far the cube must end from its start to count as moved.
+    rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo (`background`; None means
+    our own wooden table). picture_size: (width, height) handed to the policy, None for as rendered.
+    arm_urdf: a description of the same arm to load instead of ours.
+
+    Raises SceneError if the zones overlap, if the untouched cube would already lie in one, if the home pose
+    is outside the limits, or if a value makes no sense.
+    """
+
+    name: str = "bridge"
+    arm: ArmName = "panda"
+    arm_urdf: Path | None = None
+    tile_left: XY = (0.397, 0.183)
+    tile_right: XY = (0.397, -0.127)
+    tile_yaw: float = 0.0
+    tile_side: float = 0.11
+    tile_height: float = 0.006
+    cube_xy: XY = (0.247, 0.028)
+    cube_yaw: float = 0.0
+    cube_side: float = 0.03
+    cube_mass: float = 0.027
+    cube_color: XYZ = (0.13, 0.70, 0.20)
+    start_jitter: float = 0.0
+    start_jitter_yaw: float = 0.0
+    epsilon: float | None = None
+    home: XYZ = (0.292, -0.006, 0.16)
+    start_grasped: bool = False
+    max_steps: int = 60
+    early_stop: bool = False
+    moved: float = 0.03
+    rendering: Rendering = "raw"
+    background: Path | None = None
+    picture_size: tuple[int, int] | None = None
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    light: LightSpec = field(default_factory=LightSpec)
+    physics: PhysicsSpec = field(default_factory=PhysicsSpec)
+    limits: LimitSpec = field(default_factory=LimitSpec)
+
+    def __post_init__(self) -> None:
+        self._check_values()
+        self._check_zones()
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> Self:
+        """A named scene, with fields replaced: `bridge` (default), `frontal` or `vl-think`.
+
+        Raises SceneError for an unknown name or field.
+        """
+        if name not in PRESETS:
+            raise SceneError(f"no scene preset {name!r}; there are {', '.join(PRESETS)}.")
+        unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise SceneError(f"SceneSpec has no field {unknown[0]!r}; see `help(SceneSpec)` for all of them.")
+        return replace(cls(name=name), **{**PRESETS[name], **changes})
+
+    @property
+    def zone_radius(self) -> float:
+        """Radius of the outcome zones in metres: `epsilon`, or the rule when it is None."""
+        return self.tile_side / 2 + EPSILON_MARGIN if self.epsilon is None else self.epsilon
+
+    @property
+    def control_period(self) -> float:
+        """Seconds per action."""
+        return self.physics.substeps / self.physics.rate
+
+    def tile_xy(self, side: Side) -> XY:
+        """Centre of the tile on `side`."""
+        return self.tile_left if side == "left" else self.tile_right
+
+    def to_json(self) -> dict[str, Any]:
+        """The record as plain JSON values, with the outcome radius that is really used."""
+        plain = asdict(self) | {"epsilon": self.zone_radius}
+        return {key: str(value) if isinstance(value, Path) else value for key, value in plain.items()}
+
+    def _check_values(self) -> None:
+        positive = {
+            "tile_side": self.tile_side,
+            "tile_height": self.tile_height,
+            "cube_side": self.cube_side,
+            "cube_mass": self.cube_mass,
+            "epsilon": self.zone_radius,
+            "max_steps": self.max_steps,
+            "light.level": self.light.level,
+        }
+        for name, value in positive.items():
+            if not value > 0:
+                raise SceneError(f"{name} is {value}; expected a positive number.")
+        if self.rendering not in get_args(Rendering):
+            raise SceneError(
+                f"rendering {self.rendering!r} does not exist; use {' or '.join(get_args(Rendering))}."
+            )
+        if self.arm not in get_args(ArmName):
+            raise SceneError(f"arm {self.arm!r} does not exist; use {' or '.join(get_args(ArmName))}.")
+        low, home, high = self.limits.low, self.home, self.limits.high
+        if not all(a <= b <= c for a, b, c in zip(low, home, high, strict=True)):
+            raise SceneError(f"home {home} is outside the workspace {low} to {high}. Change `home` or `limits`.")
+
+    def _check_zones(self) -> None:
+        radius, gap = self.zone_radius, float(np.hypot(*np.subtract(self.tile_left, self.tile_right)))
+        if not 2 * radius < gap:
+            raise SceneError(
+                f"outcome zones of radius {radius:.3f} m overlap: the tile centres are {gap:.3f} m apart. "
+                "Use a smaller `epsilon` or move the tiles apart."
+            )
+        reach = radius + self.moved + self.start_jitter * np.sqrt(2)
+        for tile in (self.tile_left, self.tile_right):
+            if float(np.hypot(*np.subtract(self.cube_xy, tile))) <= reach:
+                raise SceneError(
+                    f"a cube that starts at {self.cube_xy} may lie in the zone of the tile at {tile} without "
+                    "having been moved. Use a smaller `epsilon` or `start_jitter`, or start it elsewhere."
+                )
+
+
+PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "bridge": {},
+        "vl-think": {"home": (0.292, -0.006, 0.135)},
+        "frontal": {
+            "tile_left": (0.285, 0.176),
+            "tile_right": (0.435, -0.096),
+            "tile_yaw": 0.505,
+            "cube_xy": (0.255, -0.019),
+            "cube_yaw": 0.505,
+            "home": (0.292, 0.0, 0.16),
+        },
+    }
+)
+"""What each named scene changes in the default one.
+
+bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs, so that the gripper
+hides nothing of either picture in the first frame, the one that probes read.
+vl-think: their home pose as well; the gripper then hides 4 % of the left picture.
+frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it, so that
+both pictures have the same size and shape on screen.
+"""

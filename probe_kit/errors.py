@@ -1,0 +1,143 @@
+"""Every error probe_kit raises on purpose, with the exit code the command line gives it.
+
+Each message says what was seen, what was expected, and what to do.
+
+Exit codes: 1 the result is not what was asked, 2 wrong usage, 3 refused.
+"""
+
+
+class ProbeKitError(Exception):
+    """Base of all errors below; catch it to catch them all."""
+
+    exit_code = 1
+
+
+# -- wrong usage -------------------------------------------------------------------------------------
+
+
+class UsageError(ProbeKitError):
+    """An argument cannot be what was given."""
+
+    exit_code = 2
+
+
+class UnknownModelError(UsageError):
+    """No family or policy of this name is registered."""
+
+
+class UnknownCategoryError(UsageError):
+    """The suite has no such category."""
+
+
+class UnknownSiteError(UsageError):
+    """The policy or the run has no such site or view."""
+
+
+class RunNotFoundError(UsageError):
+    """The folder is not a run."""
+
+
+class NoProbesError(UsageError):
+    """The run has activations but no probe results yet, or no activations at all."""
+
+
+# -- suite and environment ---------------------------------------------------------------------------
+
+
+class SuiteError(ProbeKitError):
+    """The suite is invalid: a picture is missing or changed, a field is wrong, the hash differs."""
+
+
+class SceneError(ProbeKitError):
+    """The scene cannot be built as described, such as overlapping outcome zones."""
+
+    exit_code = 2
+
+
+class ActionError(ProbeKitError, ValueError):
+    """An action has the wrong shape or is not finite; the environment did not move."""
+
+
+class EpisodeOverError(ProbeKitError, RuntimeError):
+    """`step` was called before `reset` or after the end of an episode."""
+
+
+# -- policies and capture ----------------------------------------------------------------------------
+
+
+class WeightsError(ProbeKitError):
+    """The weights in the file are not exactly the weights of the model."""
+
+    exit_code = 3
+
+
+class CheckpointError(ProbeKitError):
+    """A file that belongs to a checkpoint is missing or contradicts another."""
+
+    exit_code = 3
+
+
+class InstructionError(ProbeKitError):
+    """The instruction does not fit the policy: too long, or words its tokenizer does not know."""
+
+
+class ObservationError(ProbeKitError):
+    """An observation lacks a camera or a state, or has the wrong type or range."""
+
+
+class CaptureError(ProbeKitError):
+    """A capture cannot be started: one is already active, or the module is compiled."""
+
+
+class SiteNeverFiredError(CaptureError):
+    """A site fired fewer times than the policy promises."""
+
+
+class SiteFiredTooOftenError(CaptureError):
+    """A site fired more times than the policy promises."""
+
+
+class CaptureChangedActionError(CaptureError):
+    """Actions with and without capture differ."""
+
+
+class NonFiniteActivationError(CaptureError):
+    """A captured activation holds NaN or infinity."""
+
+
+class EmptyRoleError(CaptureError):
+    """A pooled view was asked for, but a row has no token of that role."""
+
+
+# -- runs --------------------------------------------------------------------------------------------
+
+
+class SettingsMismatchError(ProbeKitError):
+    """The folder holds a run with other settings."""
+
+    exit_code = 3
+
+
+class DiskSpaceError(ProbeKitError):
+    """The run would not fit on the disk."""
+
+    exit_code = 3
+
+
+class RunDamagedError(ProbeKitError):
+    """Stored bytes are missing or differ from what was committed."""
+
+
+class RunIncompleteError(ProbeKitError):
+    """Episodes of the plan are not committed yet."""
+
+
+# -- probes ------------------------------------------------------------------------------------------
+
+
+class TooFewGroupsError(ProbeKitError):
+    """There are fewer independent groups than folds, or only one class."""
+
+
+class ProbeNotConvergedError(ProbeKitError):
+    """The logistic solver stopped before the optimum."""

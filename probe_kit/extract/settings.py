@@ -1,0 +1,78 @@
+"""What one extraction is asked to do, and the part of it that names the result."""
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import SettingsMismatchError, UsageError
+from probe_kit.extract.layout import CODECS
+
+TOKENS = ("pooled", "all")
+VIDEOS = ("none", "first", "all")
+
+
+@dataclass(frozen=True)
+class ExtractSettings:
+    """Everything `probe-kit extract` can be told; the defaults are the command line's.
+
+    model: a family of `probe-kit models`, or `expert` / `expert-mirrored` (scripted, no activations).
+    checkpoint: folder or hub id; None for the family's default.
+    suite: suite folder; None for the embedded suite.
+    categories: slugs; None for all of the suite. items: items per category; None for all.
+    tokens: `pooled` stores pooled views only, `all` also every token.
+    captured_calls: policy inferences captured per episode, from the first on.
+    execute: actions executed per inference; None for the policy's own.
+    """
+
+    model: str
+    checkpoint: str | None = None
+    random_weights: bool = False
+    suite: Path | None = None
+    categories: tuple[str, ...] | None = None
+    items: int | None = None
+    scene: SceneSpec = field(default_factory=SceneSpec)
+    seed: int = 0
+    tokens: str = "pooled"
+    captured_calls: int = 1
+    execute: int | None = None
+    codec: str = "zstd"
+    device: str = "cpu"
+    dtype: str | None = None
+    video: str = "none"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS)):
+            if getattr(self, name) not in allowed:
+                raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
+        for name in ("captured_calls", "execute", "items"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UsageError(f"{name} is {value}; expected at least 1")
+
+    def choices(self) -> dict[str, Any]:
+        """The settings that change the stored numbers by themselves: neither paths nor the machine."""
+        machine = {"checkpoint", "suite", "device", "video", "categories", "items", "scene"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in machine}
+
+
+def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: Path) -> None:
+    """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
+    was, now = _flat(stored), _flat(asked)
+    different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]
+    if different:
+        lines = [f"  {key}: stored {was.get(key)!r}, asked {now.get(key)!r}" for key in different]
+        raise SettingsMismatchError(
+            f"{where} holds a run with other settings:\n" + "\n".join(lines) + "\n"
+            "Choose another --out, or repeat the stored settings to continue it"
+        )
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix: value}
+    return {
+        key: leaf
+        for name, child in value.items()
+        for key, leaf in _flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+    }

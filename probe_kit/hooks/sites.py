@@ -1,0 +1,61 @@
+"""Sites: the names under which activations are captured, stored, probed and plotted."""
+
+import re
+from dataclasses import dataclass
+
+from probe_kit.errors import UnknownSiteError
+
+_PATTERN = re.compile(r"(?P<stream>[a-z_]+)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?")
+
+
+@dataclass(frozen=True, order=True)
+class Site:
+    """One named tensor: `backbone.07.residual`, `expert.03.residual@4`.
+
+    stream: `backbone` (VLM) or `expert` (action part).
+    layer: residual stream *entering* block `layer`; 0 is the embeddings, the last one enters the final norm.
+    iteration: flow-matching step, counted from 0 (pure noise); None where the stream runs once.
+    """
+
+    stream: str
+    layer: int
+    quantity: str = "residual"
+    iteration: int | None = None
+
+    def __str__(self) -> str:
+        suffix = "" if self.iteration is None else f"@{self.iteration}"
+        return f"{self.stream}.{self.layer:02d}.{self.quantity}{suffix}"
+
+    @classmethod
+    def parse(cls, name: str) -> "Site":
+        """The site called `name`. Raises UnknownSiteError if the name has another form."""
+        match = _PATTERN.fullmatch(name)
+        if match is None:
+            raise UnknownSiteError(
+                f"{name!r} is not a site; expected <stream>.<layer>.<quantity>[@<iteration>], "
+                "such as backbone.07.residual or expert.03.residual@4"
+            )
+        iteration = match["iteration"]
+        return cls(
+            match["stream"], int(match["layer"]), match["quantity"], None if iteration is None else int(iteration)
+        )
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The shape of one residual stream.
+
+    layers: number of residual sites, one more than the number of blocks.
+    width: features per token.
+    iterations: flow-matching steps per inference, or None where the stream runs once.
+    """
+
+    name: str
+    layers: int
+    width: int
+    iterations: int | None = None
+
+    def sites(self) -> list[Site]:
+        """All residual sites, ordered by iteration, then layer."""
+        steps: list[int | None] = [None] if self.iterations is None else list(range(self.iterations))
+        return [Site(self.name, layer, "residual", step) for step in steps for layer in range(self.layers)]

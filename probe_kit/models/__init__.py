@@ -1,0 +1,1 @@
+"""Networks: lerobot's own classes at any size, and families no maintained package carries. No capture logic."""

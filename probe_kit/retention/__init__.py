@@ -1,0 +1,34 @@
+"""Success rate, retention, and the tables and figures that show them.
+
+Reads runs and probe results; needs no simulator and no model.
+"""
+
+from probe_kit.retention.figures import layer_curve
+from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
+from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.success import (
+    PairedItems,
+    Regime,
+    SuccessRate,
+    chance_margin,
+    normalised_score,
+    success_rate,
+)
+from probe_kit.retention.table import RetentionTable, retention
+
+__all__ = [
+    "PairedItems",
+    "Peak",
+    "Regime",
+    "Retention",
+    "RetentionRow",
+    "RetentionTable",
+    "SuccessRate",
+    "best_site",
+    "chance_margin",
+    "layer_curve",
+    "measure_retention",
+    "normalised_score",
+    "retention",
+    "success_rate",
+]

@@ -1,0 +1,89 @@
+"""The retention table in LaTeX: booktabs rules, and five heat colours for retention."""
+
+from collections.abc import Sequence
+
+from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.writers import (
+    debiased_value,
+    model_name,
+    number,
+    peak,
+    percent,
+    retention_value,
+    title,
+)
+
+HEAT = (
+    (0.2, "pkheat1", "FDE0DD"),
+    (0.4, "pkheat2", "FBD3C0"),
+    (0.6, "pkheat3", "FEF0C7"),
+    (0.8, "pkheat4", "E2F0CB"),
+    (float("inf"), "pkheat5", "C3E6C3"),
+)
+"""Upper bound of retention, colour name, RGB: from lost (red) to kept (green)."""
+
+_SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "Δ": r"$\Delta$",
+    "–": "--",
+    "−": "$-$",
+}
+
+
+def latex(rows: Sequence[RetentionRow]) -> str:
+    """A complete `table` environment; needs the packages booktabs and xcolor with its option `table`."""
+    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
+    body: list[str] = []
+    for row in rows:
+        body += [r"\midrule"] * (row.category == MEAN) + [_line(row)] + [r"\midrule"] * (row.category == MEAN)
+    return "\n".join(
+        [
+            "% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}",
+            *colours,
+            r"\begin{table}",
+            rf"\caption{{{escape(title('Success rate and retention', rows))}}}",
+            r"\begin{tabular}{lllrrrrrrrll}",
+            r"\toprule",
+            r"Model & View & Category & $n$ & SR & $\Delta$ & Prefix & depth & Action & depth"
+            r" & Retention & Debiased [95\,\%] \\",
+            r"\midrule",
+            *body[:-1],
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def escape(text: str) -> str:
+    """`text` with LaTeX's special characters made harmless."""
+    return "".join(_SPECIAL.get(character, character) for character in text)
+
+
+def _line(row: RetentionRow) -> str:
+    cells = [
+        model_name(row),
+        row.view or "–",
+        row.category,
+        str(row.n_episodes),
+        percent(row.sr),
+        percent(row.delta),
+        percent(row.prefix_accuracy),
+        number(row.prefix_depth),
+        percent(row.action_accuracy),
+        peak(row.action_depth, row.action_iteration),
+        retention_value(row),
+        debiased_value(row),
+    ]
+    escaped = [escape(cell) for cell in cells]
+    if row.retention_defined and row.retention is not None:
+        escaped[10] = rf"\cellcolor{{{heat_colour(row.retention)}}}{escaped[10]}"
+    return " & ".join(escaped) + r" \\"
+
+
+def heat_colour(value: float) -> str:
+    """Name of the colour of a retention value."""
+    return next(name for bound, name, _ in HEAT if value < bound)

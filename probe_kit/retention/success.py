@@ -1,0 +1,156 @@
+"""What the policy did: success rate, whether it differs from guessing, and on which side it errs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import comb, sqrt
+from statistics import NormalDist, fmean
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import UsageError
+from probe_kit.train.scores import group_bootstrap
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Regime(StrEnum):
+    """What a success rate says about knowledge that reaches the action."""
+
+    KNOWLEDGE = "evidence of usable knowledge"
+    NO_RELIABLE_KNOWLEDGE = "no reliable usable knowledge"
+    FAILURE = "instruction or perceptual failure"
+
+
+@dataclass(frozen=True)
+class PairedItems:
+    """Items that ran in both layouts, by how many of the two were right.
+
+    both, one, none: numbers of items. both_wrong: items that chose the wrong picture twice, part of `none`.
+    p: exact one-sided p of `both` against `both_wrong`. A side bias of any strength makes them equally likely.
+    """
+
+    both: int
+    one: int
+    none: int
+    both_wrong: int
+    p: float
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
+
+    ci: 95 % interval of `sr`, whole items resampled. sr_original, sr_swapped: per layout, and layout_mean their
+    mean. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
+    guessing explains, for N = episodes; delta_items: the same for N = items, conservative. side_preference:
+    share placed left among episodes placed in a zone. A rate over no episodes is None.
+    """
+
+    n_episodes: int
+    n_items: int
+    sr: float
+    ci: tuple[float, float]
+    sr_original: float | None
+    sr_swapped: float | None
+    layout_mean: float | None
+    sr_left: float | None
+    sr_right: float | None
+    p_wrong: float
+    p_oob: float
+    delta: float
+    delta_items: float
+    regime: Regime
+    reason: str
+    side_preference: float | None
+    paired: PairedItems
+
+
+def chance_margin(n: int, alpha: float = 0.05) -> float:
+    """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
+    if n < 1:
+        raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
+    return NormalDist().inv_cdf(1 - alpha / 2) * sqrt(0.25 / n)
+
+
+def regime(sr: float, delta: float, p_wrong: float, p_oob: float) -> tuple[Regime, str]:
+    """The regime of a success rate, and why in a few words."""
+    if sr > 0.5 + delta:
+        return Regime.KNOWLEDGE, f"SR {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
+    if sr >= 0.5 - delta:
+        return Regime.NO_RELIABLE_KNOWLEDGE, f"SR {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
+    cause = (
+        f"the cube ends outside both zones in {p_oob:.0%} of episodes"
+        if p_oob >= p_wrong
+        else f"the wrong picture is chosen in {p_wrong:.0%} of episodes"
+    )
+    return Regime.FAILURE, f"SR {sr:.3f} is below 0.5 − Δ = {0.5 - delta:.3f}: {cause}"
+
+
+def normalised_score(success_rates: Sequence[float]) -> float:
+    """Mean success rate over categories on a scale where guessing is 0 and perfection 100."""
+    if not success_rates:
+        raise UsageError("the normalised score needs the success rate of at least one category")
+    return (100 * fmean(success_rates) - 50) / 50 * 100
+
+
+def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
+    """Success rate and its companions for a table of episodes.
+
+    episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`.
+    Raises UsageError for an empty table.
+    """
+    if episodes.empty:
+        raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
+    correct = episodes["outcome"] == "correct"
+    sr, p_wrong = float(correct.mean()), float((episodes["outcome"] == "wrong").mean())
+    p_oob = float((episodes["outcome"] == "oob").mean())
+    n_items = int(episodes["item_id"].nunique())
+    delta = chance_margin(len(episodes))
+    name, reason = regime(sr, delta, p_wrong, p_oob)
+    low, high = group_bootstrap(correct.to_numpy()[:, None], episodes["item_id"].to_numpy(dtype=str), seed)
+    original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
+    placed = episodes["side_placed"][episodes["outcome"] != "oob"]
+    return SuccessRate(
+        n_episodes=len(episodes),
+        n_items=n_items,
+        sr=sr,
+        ci=(float(low[0]), float(high[0])),
+        sr_original=original,
+        sr_swapped=swapped,
+        layout_mean=None if original is None or swapped is None else (original + swapped) / 2,
+        sr_left=_rate(correct[episodes["side_correct"] == "left"]),
+        sr_right=_rate(correct[episodes["side_correct"] == "right"]),
+        p_wrong=p_wrong,
+        p_oob=p_oob,
+        delta=delta,
+        delta_items=chance_margin(n_items),
+        regime=name,
+        reason=reason,
+        side_preference=_rate(placed == "left"),
+        paired=paired_items(episodes),
+    )
+
+
+def paired_items(episodes: "pd.DataFrame") -> PairedItems:
+    """Items that ran in both layouts, by outcome; others are left out."""
+    outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
+    outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
+    right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)
+    both, both_wrong = int((right == 2).sum()), int((wrong == 2).sum())
+    return PairedItems(
+        both=both,
+        one=int((right == 1).sum()),
+        none=int((right == 0).sum()),
+        both_wrong=both_wrong,
+        p=_sign_test(both, both + both_wrong),
+    )
+
+
+def _sign_test(successes: int, trials: int) -> float:
+    """P(at least `successes` heads in `trials` fair tosses)."""
+    return float(sum(comb(trials, heads) for heads in range(successes, trials + 1)) / 2**trials)
+
+
+def _rate(values: "pd.Series[bool]") -> float | None:
+    return float(values.mean()) if len(values) else None

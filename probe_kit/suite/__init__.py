@@ -1,0 +1,25 @@
+"""Suites: items with an instruction, a correct and a wrong picture, and how they are built, kept and checked."""
+
+from probe_kit.suite.build import build_suite, default_suite
+from probe_kit.suite.categories import CATEGORIES, Category
+from probe_kit.suite.contact_sheet import contact_sheets
+from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
+from probe_kit.suite.manifest import load_suite
+from probe_kit.suite.pictures import load_picture
+from probe_kit.suite.suite import Suite
+
+__all__ = [
+    "CATEGORIES",
+    "LAYOUTS",
+    "Category",
+    "Episode",
+    "Item",
+    "Layout",
+    "Side",
+    "Suite",
+    "build_suite",
+    "contact_sheets",
+    "default_suite",
+    "load_picture",
+    "load_suite",
+]

@@ -1,0 +1,108 @@
+"""Building the embedded suite `a2a-embedded`: no downloads, the same bytes for the same options.
+
+Its items are procedural. They follow Act2Answer's procedure with pictures of our own, so results on them must
+never be mixed with, or called, the paper's numbers.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import UsageError
+from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.suite.card import new_suite
+from probe_kit.suite.categories import CATEGORIES, check_categories
+from probe_kit.suite.generators import GENERATORS
+from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION
+from probe_kit.suite.generators.twins import draw_twins
+from probe_kit.suite.grouping import with_groups
+from probe_kit.suite.items import Item
+from probe_kit.suite.manifest import load_suite, refuse_foreign_folder, save_suite
+from probe_kit.suite.suite import Suite
+
+Progress = Callable[[int, int], None]
+
+
+def build_suite(
+    folder: Path | str,
+    categories: Sequence[str] | None = None,
+    items_per_category: int = 150,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Suite:
+    """The embedded suite, drawn and written to `folder`.
+
+    categories: slugs, all embedded ones by default. Which others are built changes no item of a category, and
+    fewer items per category are the beginning of more. progress: called with items done and items in all.
+    Raises UnknownCategoryError, UsageError for a number of items that is not a positive even one, and SuiteError
+    if `folder` holds anything but this very suite.
+    """
+    folder = Path(folder)
+    options = _options(categories, items_per_category, seed)
+    refuse_foreign_folder(folder)
+    items: list[Item] = []
+    pictures: dict[str, bytes] = {}
+    for category in options["categories"]:
+        for twins in draw_twins(category, items_per_category // 2, seed):
+            items += twins.items
+            pictures |= {picture.file_name: picture.png for picture in twins.pictures}
+            if progress:
+                progress(len(items), items_per_category * len(options["categories"]))
+    suite = new_suite(SUITE_NAME, SUITE_VERSION, with_groups(items), options)
+    return save_suite(suite, pictures, _stats(suite), folder)
+
+
+def default_suite(
+    categories: Sequence[str] | None = None,
+    items_per_category: int = 150,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Suite:
+    """The embedded suite, built on first use and kept in `$PROBE_KIT_CACHE` or `~/.cache/probe_kit`.
+
+    Arguments and errors are those of `build_suite`.
+    """
+    options = _options(categories, items_per_category, seed)
+    key = sha256_json({"options": options, "code": _drawing_code()})[:12]
+    folder = _cache_folder() / "suites" / f"{SUITE_NAME}-{SUITE_VERSION}-{key}"
+    if folder.is_dir():
+        return load_suite(folder)
+    return build_suite(folder, categories, items_per_category, seed, progress)
+
+
+def _options(categories: Sequence[str] | None, items_per_category: int, seed: int) -> dict[str, Any]:
+    """The arguments in one spelling, checked."""
+    embedded = [slug for slug in CATEGORIES if slug in GENERATORS]
+    wanted = embedded if categories is None else check_categories(categories, embedded)
+    if not wanted:
+        raise UsageError("no category to build. Name at least one, or leave `categories` out for all.")
+    if items_per_category < 2 or items_per_category % 2:
+        raise UsageError(
+            f"items_per_category is {items_per_category}; expected a positive even number, because every pair of "
+            "pictures is asked for both ways."
+        )
+    return {
+        "categories": [slug for slug in embedded if slug in wanted],
+        "items_per_category": items_per_category,
+        "seed": seed,
+    }
+
+
+def _stats(suite: Suite) -> dict[str, dict[str, int]]:
+    """How many different pairs of concepts each category has, and how many items were made."""
+    return {
+        category: {"pool": len(GENERATORS[category].pairs), "emitted": emitted}
+        for category, emitted in suite.card["counts"].items()
+    }
+
+
+def _cache_folder() -> Path:
+    given = os.environ.get("PROBE_KIT_CACHE")
+    return Path(given) if given else Path.home() / ".cache" / "probe_kit"
+
+
+def _drawing_code() -> str:
+    """Hash of the generators' source, so that a changed drawing is never served from an old cache."""
+    sources = sorted((Path(__file__).parent / "generators").glob("*.py"))
+    return sha256_text("\n".join(source.read_text(encoding="utf-8") for source in sources))

@@ -1,0 +1,41 @@
+"""The identity card of a new suite: what `suite.json` says about it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL
+from PIL import features
+
+import probe_kit
+from probe_kit.suite.items import Item
+from probe_kit.suite.suite import Suite, content_sha256, count_by_category
+
+
+def new_suite(name: str, version: str, items: tuple[Item, ...], options: Mapping[str, Any]) -> Suite:
+    """A suite in memory, ready to be saved; `options` are what it was built or converted with.
+
+    The card holds no date: the same options give the same bytes.
+    """
+    card = {
+        "name": name,
+        "version": version,
+        "schema_version": "1.0",
+        "tool": {"probe_kit": probe_kit.__version__},
+        "options": dict(options),
+        "counts": count_by_category(items),
+        "sources": sorted({item.source["benchmark"] for item in items}),
+        "curation": sorted({item.curation_status for item in items}),
+        "licenses": sorted({item.license for item in items}),
+        "contains_real_faces": any(item.contains_real_face for item in items),
+        "environment": _environment(),
+        "content_sha256": content_sha256(items),
+    }
+    return Suite(name, version, items, Path(), card)
+
+
+def _environment() -> dict[str, str]:
+    """Versions that the pixels of a drawn picture can depend on."""
+    freetype = features.version("freetype2") or "none"
+    return {"pillow": PIL.__version__, "freetype": freetype, "numpy": np.__version__}

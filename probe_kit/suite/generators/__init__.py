@@ -1,0 +1,20 @@
+"""The embedded suite's categories, each with the concepts it asks for and the pictures it draws."""
+
+from typing import Any
+
+from probe_kit.suite.generators.color import COLOR
+from probe_kit.suite.generators.counting import COUNTING
+from probe_kit.suite.generators.generator import Concept, Generator, Tile
+from probe_kit.suite.generators.shape import SHAPE
+from probe_kit.suite.wording import instruction_for
+
+__all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]
+
+GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in (COLOR, SHAPE, COUNTING)}
+
+
+def vocabulary() -> list[str]:
+    """Every lower-case word that an instruction of the embedded suite can hold, sorted."""
+    concepts = [concept for generator in GENERATORS.values() for pair in generator.pairs for concept in pair]
+    sentences = {instruction_for(concept.phrase, "the") for concept in concepts}
+    return sorted({word for sentence in sentences for word in sentence.lower().split()})

@@ -1,0 +1,51 @@
+"""Which items belong together: folds must never separate items that share a picture or are twins."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from probe_kit.identity import sha256_json
+from probe_kit.suite.items import Item
+
+
+def ties(item: Item) -> tuple[str, ...]:
+    """What ties an item to others: its pictures by content, their source identity, and its twins."""
+    return (
+        f"picture {item.left_pixels_sha256}",
+        f"picture {item.right_pixels_sha256}",
+        f"image {item.left_image_id}",
+        f"image {item.right_image_id}",
+        f"pair {item.pair_id}",
+    )
+
+
+def with_groups(items: Sequence[Item]) -> tuple[Item, ...]:
+    """The items with `group_id` set to their connected component over shared ties.
+
+    The name of a group is a hash of its members' ids, so it does not depend on the order of the items.
+    """
+    forest = _Forest()
+    for item in items:
+        for tie in ties(item):
+            forest.join(item.item_id, tie)
+    members: dict[str, list[str]] = {}
+    for item in items:
+        members.setdefault(forest.root(item.item_id), []).append(item.item_id)
+    names = {root: f"g-{sha256_json(sorted(ids))[:12]}" for root, ids in members.items()}
+    return tuple(replace(item, group_id=names[forest.root(item.item_id)]) for item in items)
+
+
+class _Forest:
+    """Union-find over strings."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+
+    def root(self, node: str) -> str:
+        self._parent.setdefault(node, node)
+        while self._parent[node] != node:
+            self._parent[node] = self._parent[self._parent[node]]
+            node = self._parent[node]
+        return node
+
+    def join(self, one: str, other: str) -> None:
+        self._parent[self.root(one)] = self.root(other)

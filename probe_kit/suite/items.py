@@ -1,0 +1,102 @@
+"""Items and episodes: one question with two pictures, and one rollout of it in one layout."""
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+Side = Literal["left", "right"]
+Layout = Literal["original", "swapped"]
+LAYOUTS: tuple[Layout, Layout] = ("original", "swapped")
+
+
+def other_side(side: Side) -> Side:
+    """The side opposite to `side`, seen from the robot base (left is +y)."""
+    return "right" if side == "left" else "left"
+
+
+@dataclass(frozen=True)
+class Item:
+    """One question: an imperative instruction, a correct and a wrong picture.
+
+    `left` and `right` speak of the *original* layout; the swapped layout is derived, never stored.
+    `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
+    """
+
+    item_id: str
+    category: str
+    domain: str
+    transfer_type: str
+    construction: str
+    instruction: str
+    object_phrase: str
+    object_article: str
+    polarity: str
+    target_concept: str
+    distractor_concept: str
+    correct_side: Side
+    left_file_name: str
+    right_file_name: str
+    left_sha256: str
+    right_sha256: str
+    left_pixels_sha256: str
+    right_pixels_sha256: str
+    left_image_id: str
+    right_image_id: str
+    group_id: str
+    pair_id: str
+    rule_id: str
+    curation_status: str
+    license: str
+    attribution: str
+    redistributable: bool
+    contains_real_face: bool
+    split: str
+    source: dict[str, Any]
+    gen: dict[str, Any]
+    schema_version: str = "1.0"
+    folder: Path = field(default=Path(), compare=False)
+
+    def file_name(self, side: Side) -> str:
+        """Name, relative to `folder`, of the picture that lies on `side` in the original layout."""
+        return self.left_file_name if side == "left" else self.right_file_name
+
+    def file_sha256(self, side: Side) -> str:
+        """Hex sha256 of the bytes of that file."""
+        return self.left_sha256 if side == "left" else self.right_sha256
+
+    def picture(self, side: Side) -> Path:
+        """Absolute path of the picture that lies on `side` in the original layout."""
+        return self.folder / self.file_name(side)
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any], folder: Path) -> "Item":
+        """The item that `to_json` gave; fields that a later 1.x schema may add are left out."""
+        names = {f.name for f in fields(cls)} - {"folder"}
+        return cls(**{name: value for name, value in record.items() if name in names}, folder=folder)
+
+    def to_json(self) -> dict[str, Any]:
+        """The item as one line of `metadata.jsonl`."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "folder"}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One rollout of an item in one layout."""
+
+    item: Item
+    layout: Layout
+
+    @property
+    def episode_id(self) -> str:
+        """`<item_id>:o` or `<item_id>:s`."""
+        return f"{self.item.item_id}:{self.layout[0]}"
+
+    @property
+    def side_correct(self) -> Side:
+        """Side on which the correct picture lies in this layout."""
+        side = self.item.correct_side
+        return side if self.layout == "original" else other_side(side)
+
+    def picture(self, side: Side) -> Path:
+        """Absolute path of the picture that lies on `side` in this layout."""
+        return self.item.picture(side if self.layout == "original" else other_side(side))

@@ -1,0 +1,207 @@
+"""Suites on disk: written aside and then renamed, checked whenever they are read.
+
+    suite.json            identity card
+    items/metadata.jsonl  one line per item; `datasets.load_dataset("imagefolder", data_dir=".../items")` reads it
+    items/images/<xx>/<first 16 of the pixel hash>.png
+    LICENSES.md  ATTRIBUTION.csv  stats.json
+
+Nothing written depends on the clock or the machine's name: the same suite is the same bytes.
+"""
+
+import csv
+import errno
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.suite.items import Item
+from probe_kit.suite.suite import Suite
+from probe_kit.suite.validation import (
+    LOADING_RULES,
+    Finding,
+    check_card,
+    check_record,
+    check_schema,
+    parse_line,
+    report,
+)
+
+CARD = "suite.json"
+ITEMS = "items"
+METADATA = "metadata.jsonl"
+
+
+# -- writing -----------------------------------------------------------------------------------------
+
+
+def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> Suite:
+    """The suite as read back from `folder`, where it now lies.
+
+    pictures: PNG bytes by file name. stats: per category, how many candidates each stage left.
+    The folder appears complete or not at all. If it is there already and holds this very suite, it is left
+    alone; that is also how the slower of two processes building at once ends.
+    Raises SuiteError if the folder holds anything else.
+    """
+    if not _is_taken(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as aside:
+            draft = Path(aside) / "suite"
+            _write(suite, pictures, stats, draft)
+            _rename_unless_taken(draft, folder)
+    return _load_same(suite, folder)
+
+
+def refuse_foreign_folder(folder: Path) -> None:
+    """Raises SuiteError if `folder` is in use for something that is not a suite."""
+    if _is_taken(folder) and not (folder / CARD).is_file():
+        raise SuiteError(
+            f"{folder} exists and holds no suite; expected a new folder. Choose another one, or delete it."
+        )
+
+
+def _is_taken(folder: Path) -> bool:
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+
+
+def _rename_unless_taken(draft: Path, folder: Path) -> None:
+    try:
+        draft.rename(folder)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
+
+
+def _load_same(suite: Suite, folder: Path) -> Suite:
+    refuse_foreign_folder(folder)
+    found = load_suite(folder)
+    if found.identity != suite.identity:
+        raise SuiteError(
+            f"{folder} already holds {found.identity}; expected {suite.identity} or a new folder. "
+            "Choose another folder, or delete this one if nothing was measured with it."
+        )
+    return found
+
+
+def _write(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> None:
+    for name, encoded in pictures.items():
+        path = folder / ITEMS / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encoded)
+    lines = [json.dumps(item.to_json(), sort_keys=True, ensure_ascii=False) for item in suite.items]
+    _write_text(folder / ITEMS / METADATA, "".join(f"{line}\n" for line in lines))
+    _write_text(folder / CARD, _pretty(suite.card))
+    _write_text(folder / "stats.json", _pretty(dict(stats)))
+    _write_text(folder / "LICENSES.md", _licenses(suite.items))
+    _write_attribution(folder / "ATTRIBUTION.csv", suite.items)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _pretty(value: Any) -> str:
+    return json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+
+
+def _licenses(items: Iterable[Item]) -> str:
+    counts = Counter((item.license, item.redistributable) for item in items)
+    rows = [
+        f"| {license_id} | {'yes' if redistributable else 'no'} | {count} |"
+        for (license_id, redistributable), count in sorted(counts.items())
+    ]
+    return "\n".join(
+        [
+            "# Licences of this suite's pictures",
+            "",
+            "| licence | redistributable | items |",
+            "|---|---|---|",
+            *rows,
+            "",
+        ]
+    )
+
+
+def _write_attribution(path: Path, items: Iterable[Item]) -> None:
+    rows = {
+        row
+        for item in items
+        for row in (
+            (item.left_file_name, item.left_image_id, item.license, item.attribution),
+            (item.right_file_name, item.right_image_id, item.license, item.attribution),
+        )
+    }
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(("file_name", "image_id", "license", "attribution"))
+        table.writerows(sorted(rows))
+
+
+# -- reading -----------------------------------------------------------------------------------------
+
+
+def load_suite(folder: Path | str) -> Suite:
+    """The suite in `folder`, with every file found to be what was written.
+
+    Raises UsageError if there is no suite, and SuiteError listing everything that is wrong with it.
+    """
+    suite, findings = read_suite(Path(folder).absolute())
+    _refuse(suite.folder, [finding for finding in findings if finding.severity == "error"])
+    return suite
+
+
+def read_suite(folder: Path) -> tuple[Suite, list[Finding]]:
+    """The suite as far as it can be read, and what is wrong with it.
+
+    Raises UsageError if there is no suite, and SuiteError if its card is unreadable.
+    """
+    card = _read_card(folder)
+    items, findings = _read_items(folder / ITEMS)
+    suite = Suite(card["name"], card["version"], items, folder, card)
+    findings += [finding for rule in LOADING_RULES for finding in rule(suite)]
+    return suite, findings
+
+
+def _read_card(folder: Path) -> dict[str, Any]:
+    path = folder / CARD
+    if not path.is_file():
+        raise UsageError(f"{folder} is not a suite: it holds no {CARD}. Name the folder a suite was written to.")
+    card = parse_line(path.read_bytes(), CARD)
+    if isinstance(card, Finding):
+        raise _invalid(folder, [card])
+    _refuse(folder, list(check_schema(card, CARD)) or list(check_card(card)))
+    return card
+
+
+def _read_items(folder: Path) -> tuple[tuple[Item, ...], list[Finding]]:
+    path = folder / METADATA
+    if not path.is_file():
+        return (), [Finding("E01", "error", METADATA, "the file is missing")]
+    items, findings = [], []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        where = f"{METADATA}:{number}"
+        record = parse_line(line, where)
+        if isinstance(record, Finding):
+            findings.append(record)
+            continue
+        wrong = list(check_schema(record, where)) or list(check_record(record, where))
+        findings += wrong
+        if not wrong:
+            items.append(Item.from_json(record, folder))
+    return tuple(items), findings
+
+
+def _refuse(folder: Path, errors: list[Finding]) -> None:
+    if errors:
+        raise _invalid(folder, errors)
+
+
+def _invalid(folder: Path, errors: list[Finding]) -> SuiteError:
+    noun = "error" if len(errors) == 1 else "errors"
+    return SuiteError(
+        f"the suite in {folder} has {len(errors)} {noun}:\n{report(errors)}\n"
+        "Restore the files, or delete the folder and build or convert the suite again."
+    )

@@ -1,0 +1,89 @@
+"""Pictures: their identity, how they are written, and how a foreign file becomes a square RGB tile."""
+
+import hashlib
+from io import BytesIO
+from pathlib import Path
+
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from probe_kit.errors import SuiteError
+
+WHITE = (255, 255, 255)
+
+# What Pillow raises for bytes that are no picture or only part of one; PNG reports bad chunks as SyntaxError.
+_DECODING_ERRORS = (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError)
+
+
+def pixels_sha256(image: Image.Image) -> str:
+    """Hex sha256 of `W,H,RGB;` and the raw RGB bytes: the same for every lossless encoding."""
+    rgb = image.convert("RGB")
+    digest = hashlib.sha256(f"{rgb.width},{rgb.height},RGB;".encode())
+    digest.update(rgb.tobytes())
+    return digest.hexdigest()
+
+
+def picture_file_name(pixels_sha256: str) -> str:
+    """Where a picture lies inside `items/`; its name gives away nothing but its content."""
+    return f"images/{pixels_sha256[:2]}/{pixels_sha256[:16]}.png"
+
+
+def encode_png(image: Image.Image) -> bytes:
+    """The picture as PNG bytes that depend on its RGB pixels alone; no metadata is kept."""
+    rgb = image.convert("RGB")
+    bare = Image.frombytes("RGB", rgb.size, rgb.tobytes())
+    buffer = BytesIO()
+    bare.save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def picture_size(encoded: bytes) -> tuple[int, int] | None:
+    """Width and height in pixels as the file's header states them, None if it is not a picture."""
+    try:
+        with Image.open(BytesIO(encoded)) as image:
+            return image.size
+    except _DECODING_ERRORS:
+        return None
+
+
+def load_picture(path: Path) -> Image.Image:
+    """A square RGB picture, upright, on white.
+
+    EXIF rotation is applied, transparency is laid over white, and the shorter side is padded with white.
+    Raises SuiteError naming the file if it is missing, is not a picture, is damaged, or has more than 8 bits per
+    channel.
+    """
+    if not path.is_file():
+        raise SuiteError(f"{path}: there is no such picture. Restore the suite's files or build it again.")
+    try:
+        with Image.open(path) as image:
+            image.verify()  # decoding alone does not compare the checksums
+        with Image.open(path) as image:
+            _refuse_deep(image, path)
+            return _letterboxed(_on_white(ImageOps.exif_transpose(image)))
+    except _DECODING_ERRORS as error:
+        raise SuiteError(
+            f"{path}: not a picture that Pillow can decode ({error}). Restore the suite's files or build it again."
+        ) from error
+
+
+def _refuse_deep(image: Image.Image, path: Path) -> None:
+    if image.mode.startswith(("I", "F")):  # Pillow would clip these at 255
+        raise SuiteError(f"{path}: has more than 8 bits per channel ({image.mode}). Convert it to 8-bit RGB.")
+
+
+def _on_white(image: Image.Image) -> Image.Image:
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    rgba = image.convert("RGBA")
+    flat = Image.new("RGB", rgba.size, WHITE)
+    flat.paste(rgba, mask=rgba.getchannel("A"))
+    return flat
+
+
+def _letterboxed(image: Image.Image) -> Image.Image:
+    side = max(image.size)
+    if image.size == (side, side):
+        return image
+    square = Image.new("RGB", (side, side), WHITE)
+    square.paste(image, ((side - image.width) // 2, (side - image.height) // 2))
+    return square

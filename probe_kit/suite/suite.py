@@ -1,0 +1,115 @@
+"""A suite: its items, its identity card, and what can be taken from it."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import UsageError
+from probe_kit.identity import canonical_json, sha256_text
+from probe_kit.suite.categories import CATEGORIES, check_categories
+from probe_kit.suite.items import LAYOUTS, Episode, Item
+
+# What makes two suites the same one: what is asked, what is seen, and what belongs together. File names,
+# encoders and licences may differ.
+_HASHED_FIELDS = (
+    "item_id",
+    "category",
+    "instruction",
+    "object_phrase",
+    "object_article",
+    "correct_side",
+    "left_pixels_sha256",
+    "right_pixels_sha256",
+    "target_concept",
+    "distractor_concept",
+    "group_id",
+)
+
+
+def content_sha256(items: Iterable[Item]) -> str:
+    """Hex sha256 over the meaning of the items, whatever their order."""
+    ordered = sorted(items, key=lambda item: item.item_id)
+    lines = (canonical_json({name: getattr(item, name) for name in _HASHED_FIELDS}) for item in ordered)
+    return sha256_text("\n".join(lines))
+
+
+def count_by_category(items: Iterable[Item]) -> dict[str, int]:
+    """Number of items per category slug, in the order of CATEGORIES."""
+    counts = Counter(item.category for item in items)
+    return {slug: counts[slug] for slug in CATEGORIES if slug in counts}
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Items with a name, a version and a content hash; `card` is what `suite.json` says about them."""
+
+    name: str
+    version: str
+    items: tuple[Item, ...]
+    folder: Path
+    card: dict[str, Any]
+
+    @cached_property
+    def content_sha256(self) -> str:
+        """Hex sha256 over the meaning of the items."""
+        return content_sha256(self.items)
+
+    @property
+    def identity(self) -> str:
+        """`name@version#first12`, as results name the suite they were made with."""
+        return f"{self.name}@{self.version}#{self.content_sha256[:12]}"
+
+    @property
+    def parent(self) -> str | None:
+        """Content hash of the suite this one was selected from, None for a whole suite."""
+        return self.card.get("parent")
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """Slugs of the categories that have items, in the order of CATEGORIES."""
+        return tuple(count_by_category(self.items))
+
+    def episodes(self) -> list[Episode]:
+        """Every item in both layouts, in the order of the items."""
+        return [Episode(item, layout) for item in self.items for layout in LAYOUTS]
+
+    def select(self, categories: Sequence[str] | None = None, items_per_category: int | None = None) -> "Suite":
+        """The first items of some categories, as a suite with its own hash and this one as its parent.
+
+        Raises UnknownCategoryError for a category the suite lacks, and UsageError for a number that is not
+        positive, exceeds what a category has, or would separate role-exchanged twins.
+        """
+        wanted = self.categories if categories is None else check_categories(categories, self.categories)
+        if not wanted:
+            raise UsageError("no category selected. Name at least one, or leave `categories` out for all.")
+        chosen = {item.item_id for category in wanted for item in self._first_items(category, items_per_category)}
+        if len(chosen) == len(self.items):
+            return self
+        items = tuple(item for item in self.items if item.item_id in chosen)
+        card = self.card | {
+            "parent": self.content_sha256,
+            "counts": count_by_category(items),
+            "content_sha256": content_sha256(items),
+        }
+        return Suite(self.name, self.version, items, self.folder, card)
+
+    def _first_items(self, category: str, count: int | None) -> list[Item]:
+        items = [item for item in self.items if item.category == category]
+        if count is None:
+            return items
+        if not 0 < count <= len(items):
+            raise UsageError(
+                f"items_per_category is {count}, but {category!r} has {len(items)} items; "
+                f"give a number from 1 to {len(items)}."
+            )
+        kept, dropped = items[:count], items[count:]
+        separated = {item.pair_id for item in kept} & {item.pair_id for item in dropped}
+        if separated:
+            raise UsageError(
+                f"items_per_category is {count}, which would keep one of the role-exchanged twins "
+                f"{min(separated)!r} of {category!r} and drop the other. Give an even number."
+            )
+        return kept

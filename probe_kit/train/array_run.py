@@ -1,0 +1,82 @@
+"""A run made of arrays you already have."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.identity import sha256_json
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class ArrayRun:
+    """A `RunReader` over features in memory, for activations that were not recorded by probe_kit.
+
+    path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
+    features: (E, D) per site and view, rows in the order of `episodes`.
+    Raises UsageError if an array has another number of rows or dimensions.
+    """
+
+    path: Path
+    model: str
+    suite: str
+    episodes: "pd.DataFrame"
+    features: Mapping[tuple[Site, str], NDArray[np.floating]]
+    random_weights: bool = False
+
+    def __post_init__(self) -> None:
+        for (site, view), array in self.features.items():
+            if array.ndim != 2 or len(array) != len(self.episodes):
+                raise UsageError(
+                    f"features of {site}, view {view!r}, have shape {array.shape}; "
+                    f"expected ({len(self.episodes)}, D), one row per episode"
+                )
+
+    @cached_property
+    def settings_sha256(self) -> str:
+        """Hash of all features: other arrays are another run."""
+        return sha256_json(
+            sorted(
+                [str(site), view, sha256(np.ascontiguousarray(array).tobytes()).hexdigest()]
+                for (site, view), array in self.features.items()
+            )
+        )
+
+    @property
+    def streams(self) -> Mapping[str, Stream]:
+        """Streams by name, as far as their sites are there."""
+        return {name: self._stream(name) for name in dict.fromkeys(site.stream for site, _ in self.features)}
+
+    def views(self, stream: str) -> Sequence[str]:
+        """Views of a stream."""
+        return list(dict.fromkeys(view for site, view in self.features if site.stream == stream))
+
+    def sites(self, stream: str) -> Sequence[Site]:
+        """Sites of a stream, in the order of `features`."""
+        return list(dict.fromkeys(site for site, _ in self.features if site.stream == stream))
+
+    def column(self, site: Site, view: str) -> NDArray[np.float32]:
+        """(E, D) features of one site. Raises UnknownSiteError."""
+        if (site, view) not in self.features:
+            raise UnknownSiteError(f"there are no features of {site}, view {view!r}")
+        return self.features[site, view].astype(np.float32)
+
+    def _stream(self, name: str) -> Stream:
+        found = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
+        steps = {site.iteration for site, _ in found} - {None}
+        return Stream(
+            name,
+            layers=1 + max(site.layer for site, _ in found),
+            width=found[0][1].shape[1],
+            iterations=len(steps) or None,
+        )

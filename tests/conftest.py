@@ -1,0 +1,67 @@
+"""What several test folders share: golden references where present, the embedded policy, one recorded run."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from probe_kit.extract import Run
+    from probe_kit.hooks import Observation
+    from probe_kit.hooks.pi0 import Pi0
+    from probe_kit.suite import Suite
+
+SHARED = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests neither read nor fill the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PROBE_KIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def golden_pi0() -> Path:
+    folder = SHARED / "golden" / "pi0"
+    if not folder.is_dir():
+        pytest.skip(f"no golden reference at {folder} (set PROBE_KIT_SHARED); it is not part of the repository")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pi0_tiny() -> "Pi0":
+    from probe_kit.hooks.pi0 import load_pi0_tiny
+
+    return load_pi0_tiny()
+
+
+@pytest.fixture
+def observation() -> "Observation":
+    from probe_kit.hooks import Observation
+
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    state = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+    return Observation(image, state, "Put the cube on the red shape")
+
+
+@pytest.fixture(scope="session")
+def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
+    """Twelve Color and twelve Shape items."""
+    from probe_kit.suite import build_suite
+
+    return build_suite(tmp_path_factory.mktemp("suite") / "small", ["color", "shape"], 12)
+
+
+@pytest.fixture(scope="session")
+def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
+    """A real run of pi0-tiny with all tokens: 48 episodes of four actions."""
+    from probe_kit.env import SceneSpec
+    from probe_kit.extract import ExtractSettings, extract_run
+
+    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all")
+    return extract_run(settings, tmp_path_factory.mktemp("runs") / "recorded")

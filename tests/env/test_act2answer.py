@@ -1,0 +1,220 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from probe_kit.env import ENV_ID, Act2AnswerEnv, SceneSpec
+from probe_kit.errors import ActionError, EpisodeOverError, SceneError, SuiteError
+
+STAY = np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
+INFO_KEYS = {
+    "outcome",
+    "is_success",
+    "cube_xy",
+    "cube_z",
+    "distance_correct",
+    "distance_wrong",
+    "tile_xy_correct",
+    "tile_xy_wrong",
+    "side_correct",
+    "side_placed",
+    "layout",
+    "is_grasped",
+    "cube_moved",
+    "on_tile",
+    "steps",
+    "clipped",
+    "ik_error",
+    "truncation_reason",
+}
+
+
+@pytest.mark.filterwarnings("error")
+def test_gymnasium_finds_nothing_to_complain_about():
+    env = gym.make(ENV_ID, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=False)
+    env.close()
+
+
+def test_gymnasium_makes_it_with_another_scene():
+    with gym.make(ENV_ID, spec=SceneSpec.preset("frontal")) as env:
+        assert env.unwrapped.scene_spec.name == "frontal"
+
+
+def test_observations_are_in_their_space(shared_env):
+    observation, _ = shared_env.reset(seed=0)
+    assert shared_env.observation_space.contains(observation)
+    assert observation["pixels"]["image"].shape == (480, 640, 3)
+    assert observation["agent_pos"].dtype == np.float32
+    np.testing.assert_allclose(observation["agent_pos"], [*shared_env.scene_spec.home, 0, 0, 0, 0, 1], atol=1e-5)
+
+
+def test_step_is_advance_and_observe(make_env):
+    stepped, advanced = make_env(), make_env()
+    action = np.array([0.03, 0.02, -0.05, 0, 0, 0.1, 0])
+    stepped.reset(seed=0)
+    advanced.reset(seed=0)
+    for _ in range(3):
+        observation, reward, terminated, truncated, info = stepped.step(action)
+        cheap = advanced.advance(action)
+    assert cheap[:3] == (reward, terminated, truncated)
+    np.testing.assert_array_equal(cheap[3]["cube_xy"], info["cube_xy"])
+    np.testing.assert_array_equal(advanced.observe()["pixels"]["image"], observation["pixels"]["image"])
+
+
+def test_a_picture_is_drawn_once_and_only_on_demand(shared_env, monkeypatch):
+    shared_env.reset(seed=0)
+    drawn = []
+    scene = shared_env.scene
+    monkeypatch.setattr(scene, "frame", lambda frame=scene.frame: drawn.append(1) or frame())
+    shared_env.advance(STAY)
+    assert drawn == []
+    shared_env.observe()
+    shared_env.render()
+    assert drawn == [1]
+
+
+def test_changing_a_returned_picture_changes_nothing_else(shared_env):
+    observation, _ = shared_env.reset(seed=0)
+    before = shared_env.render()
+    observation["pixels"]["image"][:] = 0
+    shared_env.render()[:] = 7
+    np.testing.assert_array_equal(shared_env.render(), before)
+
+
+def test_the_picture_for_the_policy_can_be_smaller_than_the_rendered_one(make_env):
+    env = make_env(picture_size=(224, 224))
+    observation, _ = env.reset(seed=0)
+    assert observation["pixels"]["image"].shape == (224, 224, 3)
+    assert env.observation_space.contains(observation)
+    assert env.render().shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize("preset", ["bridge", "frontal"])
+def test_both_pictures_are_fully_seen_in_the_first_frame(preset, make_env):
+    for seed in range(5):
+        env = make_env(preset, start_jitter=0.02, start_jitter_yaw=0.5)
+        visibility = env.reset(seed=seed)[1]["tile_visibility"]
+        assert min(visibility.values()) >= 0.99
+
+
+def test_the_gripper_hides_part_of_the_left_picture_at_the_home_of_vl_think(make_env):
+    visibility = make_env("vl-think").reset(seed=0)[1]["tile_visibility"]
+    assert visibility["left"] == pytest.approx(0.963, abs=0.005)
+    assert visibility["right"] == 1.0
+
+
+def test_both_pictures_have_the_same_size_on_screen_in_the_frontal_scene(make_env):
+    env = make_env("frontal")
+    env.reset(seed=0)
+    pixels = env.scene._tile_pixels
+    assert pixels["left"] == pytest.approx(pixels["right"], rel=0.005)
+
+
+def test_the_item_and_its_layout_arrive_on_the_table(shared_env, item):
+    image, info = shared_env.reset(seed=0, options={"item": item, "layout": "swapped"})
+    assert shared_env.task_description == "Put the cube on the red picture"
+    assert (shared_env.task, info["side_correct"], info["layout"]) == ("color-0001:s", "right", "swapped")
+    assert info["tile_xy_correct"].tolist() == list(shared_env.scene_spec.tile_right)
+    u, v = shared_env.scene.camera.project((*shared_env.scene_spec.tile_right, 0.006)).astype(int)
+    red, green, blue = image["pixels"]["image"][v, u].astype(int)
+    assert red > 2 * max(green, blue)
+
+
+def test_the_info_has_the_same_keys_at_every_step(shared_env):
+    _, info = shared_env.reset(seed=0)
+    assert set(info) == INFO_KEYS | {"tile_visibility"}
+    assert info["outcome"] is None
+    assert set(shared_env.advance(STAY)[3]) == INFO_KEYS
+
+
+def test_lerobot_finds_the_length_of_an_episode(make_env):
+    assert make_env(max_steps=17)._max_episode_steps == 17
+
+
+def test_a_bad_action_moves_nothing(shared_env):
+    shared_env.reset(seed=0)
+    before = shared_env.scene.arm.joints()
+    for bad in (np.full(7, np.nan), np.zeros(6)):
+        with pytest.raises(ActionError):
+            shared_env.step(bad)
+    np.testing.assert_array_equal(shared_env.scene.arm.joints(), before)
+    assert shared_env.advance(STAY)[3]["steps"] == 1
+
+
+def test_a_bad_action_is_a_value_error():
+    assert issubclass(ActionError, ValueError)
+
+
+def test_stepping_before_reset_or_after_the_end_is_an_error(make_env):
+    env = make_env(max_steps=1)
+    with pytest.raises(EpisodeOverError, match="call `reset` first"):
+        env.step(STAY)
+    env.reset(seed=0)
+    env.advance(STAY)
+    with pytest.raises(EpisodeOverError, match="ended after 1 steps"):
+        env.step(STAY)
+    env.reset()
+    env.advance(STAY)
+
+
+def test_there_is_no_outcome_before_the_first_action(make_env):
+    env = make_env()
+    with pytest.raises(EpisodeOverError):
+        env.outcome()
+    env.reset(seed=0)
+    with pytest.raises(EpisodeOverError, match="no action was carried out"):
+        env.outcome()
+
+
+def test_a_missing_picture_stops_the_reset_and_leaves_the_environment_usable(shared_env, item):
+    shared_env.reset(seed=0)
+    shared_env.advance(STAY)
+    (item.folder / "red.png").unlink()
+    with pytest.raises(SuiteError, match=r"red\.png"):
+        shared_env.reset(options={"item": item})
+    assert shared_env.advance(STAY)[3]["steps"] == 2
+    assert shared_env.task == "built-in:o"
+
+
+def test_unknown_options_are_refused(shared_env):
+    with pytest.raises(SceneError, match="'itme'"):
+        shared_env.reset(options={"itme": None})
+
+
+def test_an_unknown_render_mode_is_refused():
+    with pytest.raises(SceneError, match="rgb_array"):
+        Act2AnswerEnv(render_mode="human")
+
+
+def test_closing_twice_is_fine_and_use_after_it_is_an_error(make_env):
+    env = make_env()
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    for use in (lambda: env.reset(), lambda: env.step(STAY), lambda: env.render(), lambda: env.outcome()):
+        with pytest.raises(EpisodeOverError):
+            use()
+
+
+def test_closing_an_environment_that_was_never_used_is_fine():
+    Act2AnswerEnv().close()
+
+
+def test_two_environments_in_one_process_are_independent(make_env):
+    moving, still = make_env(), make_env()
+    moving.reset(seed=0)
+    observation, _ = still.reset(seed=0)
+    moving.advance(np.array([0, 0.1, 0, 0, 0, 0, 0]))
+    np.testing.assert_array_equal(still.observe()["agent_pos"], observation["agent_pos"])
+    moving.close()
+    still.advance(STAY)
+
+
+def test_worker_processes_give_the_same_observations_as_the_parent(shared_env):
+    envs = gym.vector.AsyncVectorEnv([Act2AnswerEnv, Act2AnswerEnv], context="forkserver")
+    images = envs.reset(seed=[0, 0])[0]["pixels"]["image"].copy()
+    envs.close()
+    expected = shared_env.reset(seed=0)[0]["pixels"]["image"]
+    for image in images:
+        np.testing.assert_array_equal(image, expected)

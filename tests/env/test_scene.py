@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from probe_kit.env import SceneSpec
+from probe_kit.env.scene import Scene
+from probe_kit.env.spec import LimitSpec
+from probe_kit.errors import SceneError
+
+PLAIN = {"left": Image.new("RGB", (8, 8), "red"), "right": Image.new("RGB", (8, 8), "blue")}
+START = (*SceneSpec().cube_xy, SceneSpec().cube_side / 2)
+
+
+@pytest.fixture
+def scene(shared_env):
+    shared_env.reset(seed=0)
+    return shared_env.scene
+
+
+@pytest.fixture
+def own_scene():
+    scene = Scene(SceneSpec())
+    yield scene
+    scene.close()
+
+
+def test_the_cube_rests_where_it_was_put(scene):
+    scene.reset(PLAIN, START, 0.3)
+    scene.advance(scene.home_q, scene.home_q, 1.0)
+    cube = scene.cube_state()
+    np.testing.assert_allclose(cube.position, START, atol=5e-4)
+    assert cube.speed < 1e-3
+
+
+def test_the_cube_weighs_what_the_spec_says(scene):
+    assert scene.client.getDynamicsInfo(scene.cube, -1)[0] == scene.spec.cube_mass
+
+
+def test_reset_brings_back_joints_cube_and_pictures(scene):
+    scene.reset(PLAIN, START, 0.0)
+    before = scene.picture(scene.frame())
+    far = scene.home_q + 0.2
+    scene.advance(scene.home_q, far, 0.0)
+    scene.reset({"left": PLAIN["right"], "right": PLAIN["left"]}, (0.2, 0.0, 0.1), 1.0)
+    assert (scene.picture(scene.frame()) != before).any()
+    scene.reset(PLAIN, START, 0.0)
+    np.testing.assert_array_equal(scene.picture(scene.frame()), before)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_tile_visibility_is_the_share_of_pixels_that_nothing_hides(scene, side):
+    scene.reset(PLAIN, START, 0.0)
+    assert scene.tile_visibility(scene.frame()) == {"left": 1.0, "right": 1.0}
+    scene.reset(PLAIN, (*scene.spec.tile_xy(side), 0.03), 0.0)
+    hidden = scene.tile_visibility(scene.frame())[side]
+    assert 0.75 < hidden < 0.98
+
+
+def test_touching_is_seen(scene):
+    scene.reset(PLAIN, (*scene.spec.tile_left, 0.022), 0.0)
+    scene.advance(scene.home_q, scene.home_q, 1.0)
+    assert scene.is_on_tile()
+    assert not scene.is_grasped()
+
+
+def test_a_cube_that_starts_in_the_hand_is_held(own_scene):
+    own_scene.reset(PLAIN, START, 0.0)
+    own_scene.put_cube_in_hand()
+    assert own_scene.is_grasped()
+    np.testing.assert_allclose(own_scene.cube_state().position, own_scene.spec.home, atol=2e-3)
+
+
+def test_a_state_that_is_not_finite_is_noticed_and_healed(own_scene):
+    own_scene.reset(PLAIN, START, 0.0)
+    own_scene.client.resetBasePositionAndOrientation(own_scene.cube, (np.nan,) * 3, (0, 0, 0, 1))
+    assert not own_scene.advance(own_scene.home_q, own_scene.home_q, 1.0)
+    own_scene.reset(PLAIN, START, 0.0)
+    assert own_scene.advance(own_scene.home_q, own_scene.home_q, 1.0)
+    np.testing.assert_allclose(own_scene.cube_state().position, START, atol=5e-4)
+
+
+def test_a_spent_texture_budget_reloads_the_scene(own_scene):
+    own_scene.reset(PLAIN, START, 0.0)
+    before = own_scene.picture(own_scene.frame())
+    own_scene.textures._budget = 3
+    for shade in range(0, 250, 50):
+        own_scene.reset({"left": Image.new("L", (8, 8), shade), "right": PLAIN["right"]}, START, 0.0)
+        assert len(own_scene.textures._ids) <= 3 or own_scene.textures._budget > 3
+    own_scene.reset(PLAIN, START, 0.0)
+    np.testing.assert_array_equal(own_scene.picture(own_scene.frame()), before)
+
+
+def test_a_home_out_of_reach_is_refused():
+    spec = SceneSpec(home=(2.0, 0.0, 0.2), limits=LimitSpec(high=(3.0, 3.0, 3.0)))
+    with pytest.raises(SceneError, match="cannot reach its home"):
+        Scene(spec)
+
+
+def resident_megabytes():
+    with open("/proc/self/statm") as statm:  # noqa: PTH123
+        return int(statm.read().split()[1]) * 4096 / 2**20
+
+
+@pytest.mark.parametrize("resets", [300, pytest.param(2000, marks=pytest.mark.slow)])
+def test_memory_stays_flat_over_many_resets(own_scene, resets):
+    pictures = [Image.new("RGB", (64, 64), (shade, 90, 90)) for shade in range(40)]
+    for i in range(100):
+        own_scene.reset({"left": pictures[i % 40], "right": pictures[(i + 1) % 40]}, START, 0.0)
+    before = resident_megabytes()
+    for i in range(resets):
+        own_scene.reset({"left": pictures[i % 40], "right": pictures[(i + 1) % 40]}, START, 0.0)
+    assert resident_megabytes() - before < 5.0

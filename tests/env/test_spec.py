@@ -1,0 +1,83 @@
+import json
+from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
+
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.env.spec import PRESETS, LightSpec
+from probe_kit.errors import SceneError
+
+
+@pytest.mark.parametrize(("side", "radius"), [(0.11, 0.065), (0.154, 0.087), (0.088, 0.054)])
+def test_the_zone_radius_follows_the_tile_size(side, radius):
+    assert SceneSpec(tile_side=side).zone_radius == pytest.approx(radius)
+
+
+def test_a_fixed_epsilon_does_not_follow_the_tile_size():
+    assert SceneSpec(tile_side=0.154, epsilon=0.06).zone_radius == 0.06
+
+
+def test_overlapping_zones_are_refused_with_both_numbers():
+    with pytest.raises(SceneError, match=r"radius 0\.155 m overlap.*0\.310 m apart"):
+        SceneSpec(epsilon=0.155)
+    SceneSpec(epsilon=0.1549)
+
+
+def test_a_cube_that_starts_in_a_zone_is_refused():
+    with pytest.raises(SceneError, match="without having been moved"):
+        SceneSpec(cube_xy=(0.33, 0.15))
+    with pytest.raises(SceneError, match="start_jitter"):
+        SceneSpec(start_jitter=0.1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"tile_side": 0.0},
+        {"cube_mass": -1.0},
+        {"max_steps": 0},
+        {"epsilon": float("nan")},
+        {"light": LightSpec(level=0.0)},
+        {"rendering": "raytraced"},
+        {"arm": "ur5"},
+        {"home": (0.6, 0.0, 0.2)},
+    ],
+)
+def test_values_that_make_no_sense_are_refused(changes):
+    with pytest.raises(SceneError, match=next(iter(changes))):
+        SceneSpec(**changes)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_valid_and_carries_its_name(name):
+    assert SceneSpec.preset(name).name == name
+
+
+def test_the_default_scene_is_the_bridge_preset():
+    assert SceneSpec() == SceneSpec.preset("bridge")
+
+
+def test_a_preset_takes_changes_and_names_what_it_does_not_know():
+    assert SceneSpec.preset("frontal", tile_side=0.154).tile_yaw == SceneSpec.preset("frontal").tile_yaw
+    with pytest.raises(SceneError, match="bridge, vl-think, frontal"):
+        SceneSpec.preset("sideways")
+    with pytest.raises(SceneError, match="no field 'tile_size'"):
+        SceneSpec.preset("bridge", tile_size=0.1)
+
+
+def test_the_record_is_json_and_tells_what_differs():
+    spec = SceneSpec(background=Path("kitchen.jpg"), rendering="visual-matching")
+    stored = json.loads(json.dumps(spec.to_json(), allow_nan=False))
+    assert stored["background"] == "kitchen.jpg"
+    assert stored["epsilon"] == spec.zone_radius
+    assert stored != replace(spec, max_steps=80).to_json()
+
+
+def test_the_record_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        SceneSpec().epsilon = 0.08
+
+
+def test_an_action_takes_a_fifth_of_a_second():
+    assert SceneSpec().control_period == pytest.approx(0.2)

@@ -1,0 +1,28 @@
+import pytest
+
+from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.sites import Site, Stream
+
+
+@pytest.mark.parametrize("name", ["backbone.07.residual", "expert.03.residual@4", "expert.120.residual@12"])
+def test_a_site_name_survives_parsing(name: str) -> None:
+    assert str(Site.parse(name)) == name
+
+
+@pytest.mark.parametrize("name", ["backbone", "backbone.7.residual", "backbone.07", "expert.03.residual@x", ""])
+def test_another_form_is_refused(name: str) -> None:
+    with pytest.raises(UnknownSiteError, match="expected <stream>"):
+        Site.parse(name)
+
+
+def test_a_stream_lists_its_sites_by_iteration_then_layer() -> None:
+    assert [str(site) for site in Stream("expert", layers=2, width=8, iterations=2).sites()] == [
+        "expert.00.residual@0",
+        "expert.01.residual@0",
+        "expert.00.residual@1",
+        "expert.01.residual@1",
+    ]
+    assert [str(site) for site in Stream("backbone", layers=2, width=8).sites()] == [
+        "backbone.00.residual",
+        "backbone.01.residual",
+    ]

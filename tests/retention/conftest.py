@@ -1,0 +1,115 @@
+"""Runs whose probe accuracies are set by hand: decisions are right with a given probability."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.hooks import Site
+from probe_kit.identity import derive_seed
+from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings
+from probe_kit.train.results import episodes_sha256
+
+
+def outcomes(correct: int, wrong: int, oob: int, category: str = "color") -> pd.DataFrame:
+    """Two layouts per item, with as many outcomes of each kind, in this order."""
+    outcome = ["correct"] * correct + ["wrong"] * wrong + ["oob"] * oob
+    rows = []
+    for number, result in enumerate(outcome):
+        item, swapped = divmod(number, 2)
+        side = ("left", "right")[(item + swapped) % 2]
+        other = {"left": "right", "right": "left"}[side]
+        rows.append(
+            {
+                "episode_id": f"{category}-{item}:{'os'[swapped]}",
+                "item_id": f"{category}-{item}",
+                "group_id": f"{category}-{item}",
+                "category": category,
+                "layout": ("original", "swapped")[swapped],
+                "side_correct": side,
+                "outcome": result,
+                "side_placed": {"correct": side, "wrong": other, "oob": "none"}[result],
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def curve(
+    episodes: pd.DataFrame, backbone: Sequence[float], expert: Sequence[Sequence[float]], null_top: float = 0.6
+) -> Curve:
+    """One backbone accuracy per layer and one expert accuracy per iteration and layer; nulls up to `null_top`."""
+    sites = [Site("backbone", layer) for layer in range(len(backbone))]
+    sites += [
+        Site("expert", layer, "residual", step) for step, row in enumerate(expert) for layer in range(len(row))
+    ]
+    share = np.array([*backbone, *(value for row in expert for value in row)])
+    labels = (episodes["side_correct"] == "left").to_numpy()
+    generator = np.random.default_rng(derive_seed("decisions", len(episodes)))
+    # The same number of right decisions for the same share, so that accuracies are exactly as asked.
+    rank = generator.permuted(np.tile(np.arange(len(episodes)), (len(sites), 1)), axis=1)
+    right = rank < np.round(share * len(episodes))[:, None]
+    return Curve(
+        sites=tuple(sites),
+        labels=labels,
+        episodes=episodes["episode_id"].to_numpy(dtype=str),
+        items=episodes["item_id"].to_numpy(dtype=str),
+        groups=episodes["group_id"].to_numpy(dtype=str),
+        fold_of=np.arange(len(episodes)) // 2 % 5,
+        decisions=np.where(right == labels, 1.0, -1.0),
+        strengths=np.ones((len(sites), 5)),
+        null=np.tile(np.linspace(1 - null_top, null_top, 99), (len(sites), 1)),
+    )
+
+
+@pytest.fixture
+def curve_of() -> Callable[..., Curve]:
+    return curve
+
+
+@pytest.fixture
+def outcome_table() -> Callable[..., pd.DataFrame]:
+    return outcomes
+
+
+@pytest.fixture
+def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
+    """Makes a run with stored probes.
+
+    accuracies: per category, the backbone's per layer and the expert's per iteration and layer.
+    """
+
+    def make(
+        accuracies: dict[str, tuple[list[float], list[list[float]]]],
+        model: str = "pi0",
+        *,
+        random_weights: bool = False,
+        suite: str = "suite@1#0123456789ab",
+    ) -> ArrayRun:
+        tables = {category: outcomes(120, 60, 20, category) for category in accuracies}
+        episodes = pd.concat(tables.values(), ignore_index=True)
+        blank = np.zeros((len(episodes), 1))
+        features = {(Site("backbone", 0), "mean"): blank, (Site("expert", 0, "residual", 0), "mean"): blank}
+        run = ArrayRun(tmp_path / model, model, suite, episodes, features, random_weights)
+        settings = ProbeSettings(
+            model=model,
+            random_weights=random_weights,
+            suite=suite,
+            run_settings=run.settings_sha256,
+            episodes=episodes_sha256(run),
+            categories=tuple(accuracies),
+            views=("mean",),
+            target="correct",
+            permutations=99,
+            seed=0,
+        )
+        curves = {
+            (category, "mean"): curve(tables[category], backbone, expert)
+            for category, (backbone, expert) in accuracies.items()
+        }
+        layers = {"backbone": 3, "expert": 2}
+        ProbeResults(settings, curves, layers).save(run.path)
+        return run
+
+    return make

@@ -1,0 +1,85 @@
+from collections.abc import Callable
+
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from probe_kit.errors import UsageError
+from probe_kit.retention import Regime, chance_margin, normalised_score, success_rate
+from probe_kit.retention.success import paired_items, regime
+
+Outcomes = Callable[..., pd.DataFrame]
+
+
+@pytest.mark.parametrize(("n", "margin"), [(300, 0.0566), (140, 0.0828), (150, 0.0800)])
+def test_the_margin_around_chance_matches_the_published_figures(n: int, margin: float) -> None:
+    assert chance_margin(n) == pytest.approx(margin, abs=5e-5)
+
+
+def test_the_normalised_score_matches_the_published_magma_row() -> None:
+    magma = [0.72, 0.63, 0.59, 0.89, 0.81, 0.37, 0.51, 0.77, 0.88, 0.80, 0.94, 0.77]
+    assert normalised_score(magma) == pytest.approx(44.67, abs=0.005)
+    assert normalised_score([0.5]) == 0
+    assert normalised_score([1.0, 1.0]) == 100
+
+
+@pytest.mark.parametrize(
+    ("sr", "wrong", "oob", "expected", "reason"),
+    [
+        (0.60, 0.30, 0.10, Regime.KNOWLEDGE, "above"),
+        (0.55, 0.45, 0.00, Regime.NO_RELIABLE_KNOWLEDGE, "within"),
+        (0.45, 0.15, 0.40, Regime.NO_RELIABLE_KNOWLEDGE, "within"),
+        (0.20, 0.10, 0.70, Regime.FAILURE, "outside both zones in 70%"),
+        (0.20, 0.70, 0.10, Regime.FAILURE, "wrong picture is chosen in 70%"),
+    ],
+)
+def test_the_regime_says_why(sr: float, wrong: float, oob: float, expected: Regime, reason: str) -> None:
+    name, why = regime(sr, 0.0566, wrong, oob)
+    assert name is expected
+    assert reason in why
+
+
+def test_rates_add_up_and_split_by_layout_and_side(outcome_table: Outcomes) -> None:
+    success = success_rate(outcome_table(correct=101, wrong=49, oob=50))
+    assert (success.sr, success.p_wrong, success.p_oob) == (0.505, 0.245, 0.25)
+    assert (success.n_episodes, success.n_items) == (200, 100)
+    assert (success.sr_original, success.sr_swapped, success.layout_mean) == (0.51, 0.5, 0.505)
+    assert success.sr_left is not None
+    assert success.sr_right is not None
+    assert (success.sr_left + success.sr_right) / 2 == pytest.approx(0.505)
+    assert success.ci[0] < 0.505 < success.ci[1]
+    assert success.delta < success.delta_items
+
+
+def test_a_policy_that_always_goes_left_is_half_right_but_never_twice(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(correct=100, wrong=0, oob=0)
+    episodes["side_placed"] = "left"
+    episodes["outcome"] = (episodes["side_correct"] == "left").map({True: "correct", False: "wrong"})
+    success = success_rate(episodes)
+    assert success.sr == 0.5
+    assert success.side_preference == 1.0
+    assert (success.paired.both, success.paired.one, success.paired.none) == (0, 50, 0)
+    assert (success.sr_left, success.sr_right) == (1.0, 0.0)
+
+
+def test_items_right_twice_are_tested_against_items_wrong_twice(outcome_table: Outcomes) -> None:
+    paired = paired_items(outcome_table(correct=28, wrong=12, oob=6))
+    assert (paired.both, paired.one, paired.none, paired.both_wrong) == (14, 0, 9, 6)
+    assert paired.p == pytest.approx(binomtest(14, 20, alternative="greater").pvalue)
+
+
+def test_items_that_ran_in_one_layout_are_not_paired(outcome_table: Outcomes) -> None:
+    assert paired_items(outcome_table(correct=3, wrong=0, oob=0)).both == 1
+
+
+def test_a_layout_that_did_not_run_has_no_rate(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(correct=10, wrong=0, oob=0)
+    success = success_rate(episodes[episodes["layout"] == "original"])
+    assert success.sr_original == 1.0
+    assert success.sr_swapped is None
+    assert success.layout_mean is None
+
+
+def test_no_episodes_have_no_success_rate(outcome_table: Outcomes) -> None:
+    with pytest.raises(UsageError, match="no finished episodes"):
+        success_rate(outcome_table(correct=1, wrong=0, oob=0)[:0])

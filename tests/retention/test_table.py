@@ -1,0 +1,89 @@
+import csv
+import io
+import json
+from collections.abc import Callable
+
+import pytest
+
+from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.train import ArrayRun
+
+ProbedRun = Callable[..., ArrayRun]
+
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
+WEAK = ([0.5, 0.8, 0.6], [[0.5, 0.8]])
+NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
+CONTRACT_KEYS = {
+    "model", "category", "view", "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "p_wrong", "p_oob",
+    "delta", "regime", "chance", "prefix_accuracy", "prefix_layer", "action_accuracy", "action_layer",
+    "action_iteration", "retention", "retention_debiased", "retention_ci", "prefix_p_fwe", "gap",
+}  # fmt: skip
+
+
+@pytest.fixture
+def table(probed_run: ProbedRun) -> RetentionTable:
+    return retention([probed_run({"color": SIGNAL, "shape": WEAK, "counting": NONE})])
+
+
+def test_a_row_joins_behaviour_peaks_and_retention(table: RetentionTable) -> None:
+    row = table.rows[0]
+    assert (row.category, row.view, row.n_episodes, row.n_items, row.n_groups) == ("color", "mean", 200, 100, 100)
+    assert (row.sr, row.p_wrong, row.p_oob) == (0.6, 0.3, 0.1)
+    assert (row.prefix_accuracy, row.prefix_layer, row.prefix_depth) == (0.9, 1, 0.5)
+    assert (row.action_accuracy, row.action_layer, row.action_iteration) == (0.7, 1, 0)
+    assert row.retention == pytest.approx(0.5)
+    assert row.gap == pytest.approx(0.3)
+
+
+def test_the_mean_averages_ratios_and_names_the_categories_left_out(table: RetentionTable) -> None:
+    (mean,) = table.means
+    assert mean.retention == pytest.approx((0.2 / 0.4 + 0.3 / 0.3) / 2)
+    assert mean.prefix_accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
+    assert mean.categories == ("color", "shape", "counting")
+    assert mean.left_out == ("counting",)
+    assert mean.retention_note == "without counting"
+
+
+def test_an_undefined_ratio_stays_in_the_machine_readable_output(table: RetentionTable) -> None:
+    row = json.loads(table.to_json())[2]
+    assert row["retention"] == pytest.approx(0.08 / 0.05)
+    assert row["retention_defined"] is False
+    assert row["retention_note"] == "n/a (no backbone signal)"
+
+
+def test_json_rows_have_the_keys_of_the_contract(table: RetentionTable) -> None:
+    rows = json.loads(table.to_json())
+    assert [row["category"] for row in rows] == ["color", "shape", "counting", "mean"]
+    assert all(set(row) >= CONTRACT_KEYS for row in rows)
+
+
+def test_csv_has_one_line_per_row_and_numbers_in_every_interval_column(table: RetentionTable) -> None:
+    rows = list(csv.DictReader(io.StringIO(table.to_csv())))
+    assert len(rows) == 4
+    assert float(rows[0]["retention_ci_low"]) < float(rows[0]["retention_ci_high"])
+    assert rows[0]["prefix_layer"] == "1"
+    assert rows[3]["categories"] == "color shape counting"
+
+
+def test_a_run_without_activations_shows_success_rates_only(probed_run: ProbedRun) -> None:
+    probed = probed_run({"color": SIGNAL})
+    scripted = ArrayRun(probed.path.parent / "scripted", "expert", probed.suite, probed.episodes, {})
+    (row,) = retention([scripted]).rows
+    assert (row.sr, row.view, row.prefix_accuracy, row.retention_note) == (0.6, None, None, "n/a (no probes)")
+
+
+def test_runs_are_never_averaged_with_each_other(probed_run: ProbedRun) -> None:
+    first = probed_run({"color": SIGNAL}, "pi0")
+    second = probed_run({"color": WEAK}, "smolvla", suite="other@1#ba9876543210")
+    means = retention([first, second]).means
+    assert [(mean.model, mean.suite) for mean in means] == [("pi0", first.suite), ("smolvla", second.suite)]
+    assert [mean.retention for mean in means] == pytest.approx([0.5, 1.0])
+
+
+def test_views_and_keys_that_are_not_there_are_errors(probed_run: ProbedRun) -> None:
+    run = probed_run({"color": SIGNAL})
+    with pytest.raises(UnknownSiteError, match="has probes of mean, not of last"):
+        retention([run], views=["last"])
+    with pytest.raises(UsageError, match="no probe results"):
+        retention([run], keys=["ffffffffffff"])

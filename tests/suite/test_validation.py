@@ -1,0 +1,93 @@
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import SuiteError
+from probe_kit.suite import load_suite
+from probe_kit.suite.validation import Finding, report
+
+Record = dict[str, Any]
+EditRecords = Callable[[Callable[[list[Record]], None]], Any]
+
+
+def set_field(name: str, value: Any) -> Callable[[list[Record]], None]:
+    """Gives the first record another value."""
+
+    def change(records: list[Record]) -> None:
+        records[0][name] = value
+
+    return change
+
+
+def drop_field(records: list[Record]) -> None:
+    del records[0]["pair_id"]
+
+
+def repeat_id(records: list[Record]) -> None:
+    records[1]["item_id"] = records[0]["item_id"]
+
+
+def show_one_picture_twice(records: list[Record]) -> None:
+    records[0]["right_pixels_sha256"] = records[0]["left_pixels_sha256"]
+
+
+def ask_for_both(records: list[Record]) -> None:
+    records[0]["distractor_concept"] = records[0]["target_concept"]
+
+
+@pytest.mark.parametrize(
+    ("change", "finding"),
+    [
+        (drop_field, r"E02 metadata.jsonl:1: field 'pair_id' is missing"),
+        (set_field("gen", "none"), r"E02 metadata.jsonl:1: field 'gen' is 'none'; expected a dict"),
+        (set_field("correct_side", "centre"), r"E02 .*'correct_side' is 'centre'; expected one of left, right"),
+        (set_field("category", "colour"), r"E02 .*'category' is 'colour'; expected one of emotion, "),
+        (set_field("schema_version", "2.0"), r"E03 metadata.jsonl:1: uses schema 2.0; this tool reads 1.x"),
+        (repeat_id, r"E04 item a2a-embedded-color-\w+: the id appears 2 times"),
+        (set_field("left_file_name", "images/no.png"), r"E05 item .*: picture 'images/no.png' not found"),
+        (set_field("left_file_name", "../x.png"), r"E05 item .*: the path '../x.png' leaves the suite folder"),
+        (set_field("left_file_name", "/x.png"), r"E05 item .*: the path '/x.png' leaves the suite folder"),
+        (set_field("left_sha256", "ab" * 32), r"E06 .*left picture changed.*expected abababababab, found"),
+        (show_one_picture_twice, r"E08 item .*: both sides are the same picture"),
+        (ask_for_both, r"E11 item .*: target and distractor concept are both '\w+'"),
+        (set_field("group_id", "g-other"), r"E12 items .* share picture \w+ but have groups g-other, g-"),
+        (list.pop, r"E13 suite.json: count per category differs: .*'shape': 12.*'shape': 11"),
+        (set_field("instruction", "Put the cube on me"), r"E13 suite.json: content hash differs"),
+    ],
+)
+def test_each_rule_finds_its_violation(edit_records: EditRecords, change: Any, finding: str) -> None:
+    folder = edit_records(change)
+    with pytest.raises(SuiteError, match=finding):
+        load_suite(folder)
+
+
+def test_an_untouched_copy_passes_all_rules(edit_records: EditRecords) -> None:
+    folder = edit_records(lambda _: None)
+    assert len(load_suite(folder).items) == 24
+
+
+def test_fields_of_a_later_minor_schema_are_left_out(edit_records: EditRecords) -> None:
+    def from_the_future(records: list[Record]) -> None:
+        records[0] |= {"schema_version": "1.7", "mood": "sunny"}
+
+    assert load_suite(edit_records(from_the_future)).items[0].schema_version == "1.7"
+
+
+def test_all_findings_are_reported_at_once(edit_records: EditRecords) -> None:
+    def change(records: list[Record]) -> None:
+        ask_for_both(records)
+        records[3]["left_file_name"] = "images/no.png"
+
+    with pytest.raises(SuiteError) as caught:
+        load_suite(edit_records(change))
+    assert all(rule in str(caught.value) for rule in ("E05", "E11", "E13"))
+
+
+def test_a_report_holds_at_most_twenty_findings_of_a_rule() -> None:
+    findings = [Finding("E06", "error", f"item {n}", "changed") for n in range(23)]
+    findings.append(Finding("E05", "error", "item x", "not found"))
+    lines = report(findings).splitlines()
+    assert lines[0] == "E05 item x: not found"
+    assert len(lines) == 1 + 20 + 1
+    assert lines[-1] == "E06: and 3 more"

@@ -1,0 +1,63 @@
+"""Runs in memory with a signal planted where a test wants it."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.hooks import Site, Stream
+from probe_kit.identity import derive_seed
+from probe_kit.train import ArrayRun
+
+PlantedRun = Callable[..., ArrayRun]
+
+
+def episode_table(n_items: int, category: str, seed: int = 0) -> pd.DataFrame:
+    """Both layouts of `n_items` items; items 2k and 2k+1 share a picture."""
+    generator = np.random.default_rng(derive_seed(category, seed))
+    rows = []
+    for number in range(n_items):
+        left_first = bool(generator.random() < 0.5)
+        for layout in ("original", "swapped"):
+            side = "left" if left_first == (layout == "original") else "right"
+            placed = str(generator.choice(["left", "right", "none"], p=[0.45, 0.35, 0.2]))
+            outcome = "oob" if placed == "none" else "correct" if placed == side else "wrong"
+            rows.append(
+                {
+                    "episode_id": f"{category}-{number}:{layout[0]}",
+                    "item_id": f"{category}-{number}",
+                    "category": category,
+                    "group_id": f"{category}-group-{number // 2}",
+                    "layout": layout,
+                    "side_correct": side,
+                    "side_placed": placed,
+                    "outcome": outcome,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+@pytest.fixture
+def planted_run(tmp_path: Path) -> PlantedRun:
+    """Makes a run: a backbone of 5 layers and an expert of 2 layers × 2 iterations, noise except where planted.
+
+    planted: per site, how strongly the side of the correct picture moves one feature.
+    """
+
+    def make(
+        planted: Mapping[Site, float] | None = None, n_items: int = 40, categories: tuple[str, ...] = ("color",)
+    ) -> ArrayRun:
+        episodes = pd.concat([episode_table(n_items, name) for name in categories], ignore_index=True)
+        sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
+        features = {}
+        for stream in (Stream("backbone", 5, 20), Stream("expert", 2, 8, iterations=2)):
+            for site in stream.sites():
+                noise = np.random.default_rng(derive_seed(str(site)))
+                array = noise.standard_normal((len(episodes), stream.width))
+                array[:, 3] += (planted or {}).get(site, 0.0) * sign
+                features[site, "mean"] = array
+        return ArrayRun(tmp_path / "run", "planted", "noise@1#0123456789ab", episodes, features)
+
+    return make

@@ -1,0 +1,71 @@
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.hooks import Site
+from probe_kit.train import ArrayRun, load_results, train_probes
+
+PlantedRun = Callable[..., ArrayRun]
+
+
+def test_stored_results_equal_the_fitted_ones(planted_run: PlantedRun) -> None:
+    run = planted_run({Site("backbone", 1): 1.0}, categories=("color", "shape"))
+    fitted = train_probes(run, permutations=4)
+    stored = load_results(run, fitted.key)
+    assert stored.settings == fitted.settings
+    pd.testing.assert_frame_equal(stored.scores, fitted.scores)
+    for pair, curve in fitted.curves.items():
+        for name, value in vars(curve).items():
+            np.testing.assert_array_equal(getattr(stored.curves[pair], name), value)
+
+
+def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    results = train_probes(run, permutations=2)
+    folder = run.path / "probes" / results.key
+    assert sorted(path.name for path in folder.iterdir()) == ["decisions.npz", "scores.csv", "settings.json"]
+    scores = pd.read_csv(folder / "scores.csv")
+    np.testing.assert_allclose(scores["accuracy"], results.scores["accuracy"])
+    assert (scores["settings"] == results.key).all()
+
+
+def test_the_newest_results_for_the_target_are_loaded(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    train_probes(run, permutations=1)
+    newest = train_probes(run, permutations=2)
+    control = train_probes(run, permutations=1, target="shuffled")
+    assert load_results(run).key == newest.key
+    assert load_results(run, target="shuffled").key == control.key
+
+
+def test_results_of_fewer_episodes_are_not_taken_for_current(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    train_probes(run, permutations=1)
+    shorter = ArrayRun(
+        run.path,
+        run.model,
+        run.suite,
+        run.episodes[:60],
+        {pair: array[:60] for pair, array in run.features.items()},
+    )
+    with pytest.raises(NoProbesError, match="probe-kit train"):
+        load_results(shorter)
+
+
+def test_an_unknown_key_lists_the_known_ones(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    known = train_probes(run, permutations=0).key
+    with pytest.raises(UsageError, match=known):
+        load_results(run, "ffffffffffff")
+
+
+def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    results = train_probes(run, permutations=0)
+    file = run.path / "probes" / results.key / "scores.csv"
+    file.write_text("edited by hand")
+    results.save(run.path)
+    assert file.read_text() == "edited by hand"

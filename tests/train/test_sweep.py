@@ -1,0 +1,134 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import (
+    NonFiniteActivationError,
+    NoProbesError,
+    TooFewGroupsError,
+    UnknownCategoryError,
+    UnknownSiteError,
+)
+from probe_kit.hooks import Site
+from probe_kit.train import ArrayRun, train_probes
+
+PLANTED = Site("backbone", 3)
+PLANTED_EXPERT = Site("expert", 1, "residual", 0)
+
+PlantedRun = Callable[..., ArrayRun]
+
+
+def test_the_curve_peaks_exactly_where_the_answer_was_planted(planted_run: PlantedRun) -> None:
+    scores = train_probes(planted_run({PLANTED: 2.0, PLANTED_EXPERT: 2.0}), permutations=60).scores
+    for stream, site in (("backbone", PLANTED), ("expert", PLANTED_EXPERT)):
+        curve = scores[scores["stream"] == stream].set_index("site")
+        assert curve["accuracy"].idxmax() == str(site)
+        assert curve.index[curve["p_fwe"] < 0.05].tolist() == [str(site)]
+
+
+def test_nothing_is_significant_with_shuffled_labels(planted_run: PlantedRun) -> None:
+    scores = train_probes(planted_run({PLANTED: 2.0}), permutations=60, target="shuffled").scores
+    assert (scores["p_fwe"] > 0.05).all()
+    assert (scores["target"] == "shuffled").all()
+
+
+def test_every_site_has_a_complete_row(planted_run: PlantedRun) -> None:
+    run = planted_run({PLANTED: 2.0}, categories=("color", "shape"))
+    scores = train_probes(run, permutations=5).scores
+    assert len(scores) == 2 * (5 + 4)
+    assert (scores[["n", "items", "groups"]] == [80, 40, 20]).all(axis=None)
+    assert (scores["chance"] == 0.5).all()
+    assert ((scores["ci_low"] <= scores["accuracy"]) & (scores["accuracy"] <= scores["ci_high"])).all()
+    best = scores[(scores["category"] == "color") & (scores["layer"] == 3)].iloc[0]
+    assert best["depth"] == 0.75
+    assert best["auc"] > 0.95
+    assert len(best["C"].split()) == len(best["fold_accuracy"].split()) == 5
+
+
+def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    curve = train_probes(run, permutations=10, target="chosen").curves["color", "mean"]
+    in_zone = run.episodes[run.episodes["side_placed"] != "none"]
+    assert curve.episodes.tolist() == in_zone["episode_id"].tolist()
+    assert (curve.labels == (in_zone["side_placed"] == "left")).all()
+    assert curve.chance > 0.5
+
+
+def test_results_do_not_depend_on_the_number_of_jobs(planted_run: PlantedRun, tmp_path: Path) -> None:
+    run = planted_run({PLANTED: 1.0})
+    twin = ArrayRun(tmp_path / "twin", run.model, run.suite, run.episodes, run.features)
+    one = train_probes(run, permutations=3, jobs=1).curves["color", "mean"]
+    two = train_probes(twin, permutations=3, jobs=2).curves["color", "mean"]
+    assert one.sites == two.sites
+    np.testing.assert_array_equal(one.decisions, two.decisions)
+
+
+def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    finished: list[str] = []
+
+    def interrupt(done: int, _: int, site: str) -> None:
+        finished.append(site)
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_probes(run, permutations=2, jobs=1, progress=interrupt)
+    assert not list((run.path / "probes").glob("[!.]*"))
+
+    read = watch_columns(run)
+    train_probes(run, permutations=2, jobs=1)
+    assert len(read) <= 9 - 4
+    assert not list((run.path / "probes").glob(".*"))
+
+
+def test_the_same_settings_are_read_back_and_others_are_fitted(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    first = train_probes(run, permutations=2)
+    read = watch_columns(run)
+    assert train_probes(run, permutations=2).created == first.created
+    assert not read
+    assert train_probes(run, permutations=3).key != first.key
+
+
+def test_progress_counts_every_site(planted_run: PlantedRun) -> None:
+    seen: list[tuple[int, int]] = []
+    train_probes(planted_run(), permutations=0, progress=lambda done, total, _: seen.append((done, total)))
+    assert seen == [(done, 9) for done in range(1, 10)]
+
+
+def test_wrong_requests_name_what_there_is(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    with pytest.raises(UnknownCategoryError, match="it has: color"):
+        train_probes(run, ["colour"])
+    with pytest.raises(UnknownSiteError, match="it has: mean"):
+        train_probes(run, views=["last"])
+    with pytest.raises(NoProbesError, match="no activations"):
+        train_probes(ArrayRun(run.path, "expert", run.suite, run.episodes, {}))
+
+
+def test_too_few_items_name_the_category(planted_run: PlantedRun) -> None:
+    with pytest.raises(TooFewGroupsError, match=r"category 'color'.*2 independent groups"):
+        train_probes(planted_run(n_items=4))
+
+
+def test_a_broken_activation_names_its_site_and_episode(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    run.features[PLANTED, "mean"][7, 2] = np.nan
+    with pytest.raises(NonFiniteActivationError, match=r"backbone\.03\.residual.*'color-3:s'"):
+        train_probes(run, permutations=0)
+
+
+def watch_columns(run: ArrayRun) -> list[Site]:
+    """Sites whose features are read from now on."""
+    read: list[Site] = []
+    original = run.column
+
+    def column(site: Site, view: str) -> np.ndarray:
+        read.append(site)
+        return original(site, view)
+
+    object.__setattr__(run, "column", column)
+    return read
