@@ -18,7 +18,6 @@ from PIL import Image, ImageDraw
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
 from probe_kit.env.camera import Picture
 from probe_kit.env.scene import FLOOR_COLOR, INVISIBLE, TABLE_COLOR, Scene
-from probe_kit.env.spec import LightSpec
 
 SPEC = SceneSpec(start_jitter=0.02, start_jitter_yaw=1.5, early_stop=True)
 OBSERVE_EVERY = 5
@@ -120,7 +119,9 @@ def sheet(path: Path) -> None:
         for rendering in ("raw", "visual-matching"):
             cells[f"{preset}, {rendering}"] = SceneSpec.preset(preset, rendering=rendering)
     for level in (0.7, 1.3):
-        cells[f"light {level:.0%}"] = SceneSpec(light=LightSpec(level=level))
+        cells[f"light {level:.0%}"] = SceneSpec(light_level=level)
+    for preset in ("bridge", "frontal", "vl-think"):
+        cells[f"{preset}, widowx"] = SceneSpec.preset(preset, arm="widowx")
     for side in (0.088, 0.154):
         cells[f"tile {side / 0.11:.0%}"] = SceneSpec(tile_side=side)
     columns = 4

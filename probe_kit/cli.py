@@ -2,14 +2,15 @@
 
 import json
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
+import typer.core
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -27,7 +28,30 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 
+out, err = Console(), Console(stderr=True)
+
+
+class Commands(typer.core.TyperGroup):
+    """Turns errors and interruptions of any command into messages and exit codes."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            err.print("[yellow]interrupted[/]; everything finished so far is kept, the same command continues")
+            raise typer.Exit(INTERRUPTED) from None
+        except ProbeKitError as error:
+            err.print(
+                f"[bold red]{type(error).__name__}[/]: {escape(str(error))}", highlight=False, soft_wrap=True
+            )
+            for note in getattr(error, "__notes__", []):
+                err.print(f"  {escape(note)}", highlight=False, soft_wrap=True)
+            raise typer.Exit(error.exit_code) from error
+
+
 app = typer.Typer(
+    cls=Commands,
     help="What does a robot policy still know, where inside it, and where on the way to the action is it lost?",
     epilog="Start with `probe-kit demo`. Exit codes: 0 done, 1 not what was asked, 2 wrong usage, 3 refused, "
     "130 interrupted with everything finished so far kept.",
@@ -38,25 +62,11 @@ app = typer.Typer(
 suite_app = typer.Typer(help="Build and look at suites of questions.", no_args_is_help=True)
 app.add_typer(suite_app, name="suite")
 
-out, err = Console(), Console(stderr=True)
 
-
-def main() -> NoReturn:
-    """Entry point: turns errors into messages and exit codes."""
+def main() -> None:
+    """Entry point; a SIGTERM counts as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        app(standalone_mode=False)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        err.print("[yellow]interrupted[/]; everything finished so far is kept, the same command continues")
-        sys.exit(INTERRUPTED)
-    except ProbeKitError as error:
-        err.print(f"[bold red]{type(error).__name__}[/]: {error}", highlight=False, soft_wrap=True)
-        for note in getattr(error, "__notes__", []):
-            err.print(f"  {note}", highlight=False, soft_wrap=True)
-        sys.exit(error.exit_code)
-    sys.exit(0)
+    app()
 
 
 # -- demo ------------------------------------------------------------------------------------------------------

@@ -7,13 +7,29 @@ Importing this module loads neither the simulator nor torch.
 from gymnasium.envs.registration import register, registry
 
 from probe_kit.env.act2answer import Act2AnswerEnv
+from probe_kit.env.adapters import to_lerobot, to_openpi
 from probe_kit.env.expert import ScriptedExpert
 from probe_kit.env.outcome import Outcome, success_by_radius
-from probe_kit.env.spec import SceneSpec
+from probe_kit.env.recording import save_gif
+from probe_kit.env.spec import CameraSpec, LightSpec, LimitSpec, PhysicsSpec, SceneSpec
 
 ENV_ID = "probe_kit/Act2Answer-v0"
 
 if ENV_ID not in registry:
     register(ENV_ID, entry_point="probe_kit.env.act2answer:Act2AnswerEnv")
 
-__all__ = ["ENV_ID", "Act2AnswerEnv", "Outcome", "SceneSpec", "ScriptedExpert", "success_by_radius"]
+__all__ = [
+    "ENV_ID",
+    "Act2AnswerEnv",
+    "CameraSpec",
+    "LightSpec",
+    "LimitSpec",
+    "Outcome",
+    "PhysicsSpec",
+    "SceneSpec",
+    "ScriptedExpert",
+    "save_gif",
+    "success_by_radius",
+    "to_lerobot",
+    "to_openpi",
+]

@@ -1,6 +1,6 @@
 """The environment: two pictures on a table, a cube, an arm, and an instruction that names one picture."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -38,25 +38,22 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     simulator holds Python's lock while it works: run in parallel with processes, not with threads.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(self, spec: SceneSpec | None = None, render_mode: str | None = "rgb_array") -> None:
         if render_mode not in (None, "rgb_array"):
             raise SceneError(f"render mode {render_mode!r} does not exist; use 'rgb_array'.")
-        self.scene_spec = spec or SceneSpec()
+        spec = spec or SceneSpec()
+        self.scene_spec = spec
         self.render_mode = render_mode
-        limits = self.scene_spec.limits
-        width, height = self.scene_spec.picture_size or (
-            self.scene_spec.camera.width,
-            self.scene_spec.camera.height,
+        largest = [spec.limits.translation] * 3 + [spec.limits.rotation] * 3
+        self.action_space = spaces.Box(
+            np.array([*np.negative(largest), 0.0], np.float32), np.array([*largest, 1.0], np.float32)
         )
-        high = np.array([limits.translation] * 3 + [limits.rotation] * 3 + [1.0], np.float32)
-        self.action_space = spaces.Box(np.append(-high[:6], np.float32(0.0)), high, dtype=np.float32)
+        width, height = spec.picture_size or (spec.camera.width, spec.camera.height)
+        image = spaces.Box(0, 255, (height, width, 3), np.uint8)
         self.observation_space = spaces.Dict(
-            {
-                "pixels": spaces.Dict({"image": spaces.Box(0, 255, (height, width, 3), np.uint8)}),
-                "agent_pos": spaces.Box(-10.0, 10.0, (8,), np.float32),
-            }
+            {"pixels": spaces.Dict({"image": image}), "agent_pos": spaces.Box(-10.0, 10.0, (8,), np.float32)}
         )
         self._question = Question.built_in()
         self._scene: Scene | None = None
@@ -116,11 +113,9 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     def observe(self) -> Observation:
         """The observation now; draws the picture unless it was drawn since the last action."""
-        picture = self.render()
-        if self.scene_spec.picture_size is not None:
-            picture = np.asarray(
-                Image.fromarray(picture).resize(self.scene_spec.picture_size, Image.Resampling.LANCZOS)
-            )
+        picture, size = self.render(), self.scene_spec.picture_size
+        if size is not None:
+            picture = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
         arm = self.scene.arm
         agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}

@@ -6,11 +6,11 @@ the naive rendering bit for bit; under visual matching a photo takes the place o
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit.env.bullet import BulletClient
 from probe_kit.env.rotations import Array
 from probe_kit.env.spec import CameraSpec, LightSpec
 
@@ -63,6 +63,12 @@ class Camera:
         spec = self.spec
         return Camera(replace(spec, width=factor * spec.width, height=factor * spec.height))
 
+    def widened(self) -> "Camera":
+        """The same view at the same scale, twice as wide and high: with what lies just outside of it."""
+        spec = self.spec
+        fov = 2 * float(np.degrees(np.arctan(2 * np.tan(np.radians(spec.fov) / 2))))
+        return Camera(replace(spec, width=2 * spec.width, height=2 * spec.height, fov=fov))
+
     def view_matrix(self) -> list[float]:
         """World to camera, column-major as OpenGL wants it."""
         right, up, forward = self.axes
@@ -82,8 +88,8 @@ class Camera:
         matrix[3, 2] = -1
         return [float(x) for x in matrix.T.ravel()]
 
-    def render(self, client: Any, light: LightSpec) -> Frame:
-        """Draw what is visible in the server behind `client` (about 130 ms for a full 640x480 scene)."""
+    def render(self, client: BulletClient, light: LightSpec, level: float) -> Frame:
+        """Draw what is visible in the server behind `client`, with all light scaled by `level`."""
         width, height = self.spec.width, self.spec.height
         _, _, rgba, depth, bodies = client.getCameraImage(
             width,
@@ -93,9 +99,9 @@ class Camera:
             lightDirection=light.direction,
             lightColor=(1.0, 1.0, 1.0),
             shadow=0,
-            lightAmbientCoeff=light.ambient * light.level,
-            lightDiffuseCoeff=light.diffuse * light.level,
-            lightSpecularCoeff=light.specular * light.level,
+            lightAmbientCoeff=light.ambient * level,
+            lightDiffuseCoeff=light.diffuse * level,
+            lightSpecularCoeff=light.specular * level,
             renderer=client.ER_TINY_RENDERER,
         )
         # np.asarray with reshape is right for both builds of pybullet, with numpy and without.

@@ -123,18 +123,18 @@ class Scene:
 
     def frame(self) -> Frame:
         """Robot, cube and tiles as the camera sees them, without the table."""
-        return self.camera.render(self.client, self.spec.light)
+        return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
     def picture(self, frame: Frame) -> Picture:
         """The finished picture (H, W, 3) of a frame."""
         return self.backdrop.under(frame)
 
     def tile_visibility(self, frame: Frame) -> dict[Side, float]:
-        """Share of each tile's pixels that neither robot nor cube hides in `frame`."""
+        """Share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
         return {side: float((frame.bodies == self.quads[side]).sum() / self._tile_pixels[side]) for side in SIDES}
 
     def _build(self) -> None:
-        """Load everything, in the order in which less and less of the scene is behind what follows."""
+        """Load the table, whose picture is kept; the tiles, whose pixels are counted; the cube and the arm."""
         client, spec, folder = self.client, self.spec, Path(self._folder.name)
         client.resetSimulation()
         client.setGravity(0, 0, -9.81)
@@ -175,7 +175,7 @@ class Scene:
             photo = wooden_table(self.camera)
         else:
             photo = load_photo(spec.background, spec.camera.width, spec.camera.height)
-        return np.clip(photo * spec.light.level, 0, 255).astype(np.uint8)
+        return np.clip(photo * spec.light_level, 0, 255).astype(np.uint8)
 
     def _load_tiles(self) -> None:
         spec = self.spec
@@ -194,7 +194,7 @@ class Scene:
             self.quads[side] = self.client.createMultiBody(
                 0, -1, shape, (x, y, spec.tile_height + QUAD_LIFT), turn
             )
-        bodies = self.frame().bodies
+        bodies = self.camera.widened().render(self.client, spec.light, spec.light_level).bodies
         self._tile_pixels = {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
 
     def _box(

@@ -5,6 +5,7 @@ kilograms. The gripper's bar and propeller belong to one rigid link here, and in
 """
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from math import pi, radians
 from pathlib import Path
 
@@ -87,14 +88,13 @@ def write_urdf(folder: Path) -> Path:
 
 
 def _find_meshes() -> Path:
-    try:
-        import rtbdata  # type: ignore[import-not-found]
-    except ImportError as error:
+    package = find_spec("rtbdata")
+    if package is None or package.origin is None:
         raise SceneError(
             "the WidowX needs the meshes of the package `rtb-data` (45 MB). Install `probe-kit[widowx]`, give a "
             "description of your own with `arm_urdf`, or use the default arm, `panda`."
-        ) from error
-    folder = Path(rtbdata.__file__).parent / MESH_FOLDER
+        )
+    folder = Path(package.origin).parent / MESH_FOLDER
     if not folder.is_dir():
         raise SceneError(f"{folder} does not exist; this `rtb-data` is not version 2. Install `rtb-data>=2,<3`.")
     return folder

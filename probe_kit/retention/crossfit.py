@@ -51,19 +51,20 @@ class Crossfit:
 def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: int) -> Crossfit:
     """Choose each stream's best site on four fifths of the groups, score both on the rest, ten times over.
 
-    The covariance is that of a single cross-fit, not of the average of ten: averaging over different chosen
-    sites looks more precise than choosing is.
+    The means are averages over the ten. The covariance is that of a single one: within it, from group to group,
+    plus between them, from choosing other sites. The average of ten looks more precise than choosing is
+    (`benchmarks/retention_null.py` has the coverage of both).
     """
-    covariance, means = np.zeros((2, 2)), np.zeros(2)
+    n_groups, n_episodes = backbone.sizes.size, backbone.sizes.sum()
+    means, within = np.zeros((REPEATS, 2)), np.zeros((2, 2))
     for repeat in range(REPEATS):
-        n_groups = backbone.sizes.size
         fold_of = assign_folds(np.zeros(n_groups), np.arange(n_groups), FOLDS, seed + repeat)
         sums = np.array([_held_out(expert, fold_of), _held_out(backbone, fold_of)])
-        mean = sums.sum(axis=1) / backbone.sizes.sum()
-        rest = sums - mean[:, None] * backbone.sizes
-        means += mean / REPEATS
-        covariance += rest @ rest.T * n_groups / (n_groups - 1) / backbone.sizes.sum() ** 2 / REPEATS
-    return Crossfit(float(means[0]) - chance, float(means[1]) - chance, covariance)
+        means[repeat] = sums.sum(axis=1) / n_episodes
+        rest = sums - means[repeat][:, None] * backbone.sizes
+        within += rest @ rest.T * n_groups / (n_groups - 1) / n_episodes**2 / REPEATS
+    above = means.mean(axis=0) - chance
+    return Crossfit(float(above[0]), float(above[1]), within + np.cov(means.T))
 
 
 def _held_out(scores: GroupScores, fold_of: NDArray[np.intp]) -> Matrix:

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from probe_kit.env import Act2AnswerEnv, Outcome, SceneSpec, ScriptedExpert
+from probe_kit.env.arm_models import ARMS
 from probe_kit.suite.items import Item
 
 
@@ -19,12 +20,24 @@ def shared_env() -> Iterator[Act2AnswerEnv]:
     env.close()
 
 
+@pytest.fixture(scope="session", params=ARMS)
+def arm_env(request: pytest.FixtureRequest) -> Iterator[Act2AnswerEnv]:
+    """The default scene with each arm in turn; the WidowX needs the extra `widowx`."""
+    if request.param == "widowx":
+        pytest.importorskip("rtbdata")
+    env = Act2AnswerEnv(SceneSpec(arm=request.param))
+    yield env
+    env.close()
+
+
 @pytest.fixture
 def make_env() -> Iterator[Callable[..., Act2AnswerEnv]]:
     """Makes environments with fields of the default scene replaced, and closes them after the test."""
     made: list[Act2AnswerEnv] = []
 
     def make(preset: str = "bridge", **changes: object) -> Act2AnswerEnv:
+        if changes.get("arm") == "widowx":
+            pytest.importorskip("rtbdata")
         made.append(Act2AnswerEnv(SceneSpec.preset(preset, **changes)))
         return made[-1]
 

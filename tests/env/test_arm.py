@@ -8,44 +8,44 @@ STAY_OPEN = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 
 @pytest.fixture
-def arm(shared_env):
-    shared_env.reset(seed=0)
-    return shared_env.scene.arm
+def arm(arm_env):
+    arm_env.reset(seed=0)
+    return arm_env.scene.arm
 
 
-def test_the_home_pose_is_where_the_spec_says_and_points_down(arm, shared_env):
-    np.testing.assert_allclose(arm.tool_state(), [*shared_env.scene_spec.home, 0, 0, 0], atol=1e-5)
+def test_the_home_pose_is_where_the_spec_says_and_points_down(arm, arm_env):
+    np.testing.assert_allclose(arm.tool_state(), [*arm_env.scene_spec.home, 0, 0, 0], atol=1e-5)
 
 
-def test_the_measured_angles_are_roll_pitch_yaw_relative_to_pointing_down(arm, shared_env):
+def test_the_measured_angles_are_roll_pitch_yaw_relative_to_pointing_down(arm, arm_env):
     for _ in range(3):
-        shared_env.advance(np.array([0, 0, 0, 0.1, -0.05, 0.15, 1.0]))
-    shared_env.advance(STAY_OPEN)
+        arm_env.advance(np.array([0, 0, 0, 0.1, -0.05, 0.15, 1.0]))
+    arm_env.advance(STAY_OPEN)
     turn = np.linalg.matrix_power(from_rpy([0.1, -0.05, 0.15]), 3)
     np.testing.assert_allclose(from_rpy(arm.tool_state()[3:]), turn, atol=5e-3)
 
 
-def test_the_tool_follows_a_command_within_a_millimetre(arm, shared_env):
+def test_the_tool_follows_a_command_within_a_millimetre(arm, arm_env):
     for _ in range(4):
-        shared_env.advance(np.array([0.01, 0.02, -0.01, 0, 0, 0, 1.0]))
-    shared_env.advance(STAY_OPEN)
-    expected = np.add(shared_env.scene_spec.home, [0.04, 0.08, -0.04])
+        arm_env.advance(np.array([0.01, 0.02, -0.01, 0, 0, 0, 1.0]))
+    arm_env.advance(STAY_OPEN)
+    expected = np.add(arm_env.scene_spec.home, [0.04, 0.08, -0.04])
     np.testing.assert_allclose(arm.tool_state()[:3], expected, atol=1e-3)
 
 
-def test_the_gripper_closes_and_opens(arm, shared_env):
+def test_the_gripper_closes_and_opens(arm, arm_env):
     assert arm.opening() == pytest.approx(1.0, abs=0.01)
     for _ in range(3):
-        shared_env.advance(np.zeros(7))
+        arm_env.advance(np.zeros(7))
     assert arm.opening() == pytest.approx(0.0, abs=0.02)
     for _ in range(3):
-        shared_env.advance(STAY_OPEN)
+        arm_env.advance(STAY_OPEN)
     assert arm.opening() == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_fingers_stay_symmetric(arm, shared_env):
-    shared_env.advance(np.zeros(7))
-    left, right = (shared_env.scene.client.getJointState(arm.body, f)[0] for f in arm.model.fingers)
+def test_the_fingers_stay_symmetric(arm, arm_env):
+    arm_env.advance(np.zeros(7))
+    left, right = (arm_env.scene.client.getJointState(arm.body, f)[0] for f in arm.model.fingers)
     assert left == pytest.approx(right, abs=1e-3)
 
 

@@ -4,7 +4,7 @@ from PIL import Image
 
 from probe_kit.env.background import load_photo, wooden_table
 from probe_kit.env.camera import Camera
-from probe_kit.env.spec import CameraSpec, LightSpec
+from probe_kit.env.spec import CameraSpec
 from probe_kit.errors import SceneError
 
 
@@ -31,7 +31,7 @@ def test_visual_matching_changes_the_table_and_nothing_on_it(make_env):
 
 def test_a_photo_of_ones_own_is_squeezed_behind_the_scene(make_env, tmp_path):
     Image.new("RGB", (100, 300), (10, 200, 30)).save(tmp_path / "photo.png")
-    env = make_env(rendering="visual-matching", background=tmp_path / "photo.png", light=LightSpec(level=0.7))
+    env = make_env(rendering="visual-matching", background=tmp_path / "photo.png", light_level=0.7)
     corner = env.reset(seed=0)[0]["pixels"]["image"][-5:, :5].reshape(-1, 3)
     assert np.unique(corner, axis=0).tolist() == [[7, 140, 21]]
 

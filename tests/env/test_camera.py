@@ -4,7 +4,7 @@ import pytest
 
 from probe_kit.env.camera import Camera
 from probe_kit.env.scene import FLOOR_COLOR, TABLE_COLOR
-from probe_kit.env.spec import CameraSpec, SceneSpec
+from probe_kit.env.spec import CameraSpec
 
 
 def test_matrices_equal_those_of_pybullet():
@@ -31,6 +31,12 @@ def test_the_focal_length_is_that_of_the_bridge_camera():
 )
 def test_points_project_to_the_pixels_measured_in_the_reference_camera(point, pixel):
     np.testing.assert_allclose(Camera(CameraSpec()).project(point), pixel, atol=0.7)
+
+
+def test_the_widened_view_shows_the_same_scene_with_a_margin():
+    camera = Camera(CameraSpec())
+    point = (0.35, 0.1, 0.02)
+    np.testing.assert_allclose(camera.widened().project(point), np.add(camera.project(point), [320, 240]))
 
 
 def test_rays_go_through_the_points_that_project_there():
@@ -67,15 +73,14 @@ def test_the_layered_picture_equals_the_naive_rendering_bit_for_bit(preset, make
 
 @pytest.mark.parametrize("level", [0.7, 1.3])
 def test_the_light_level_scales_the_brightness_of_the_table(level, make_env):
-    light = SceneSpec().light
-    plain, changed = make_env(), make_env(light=type(light)(level=level))
+    plain, changed = make_env(), make_env(light_level=level)
     corner = np.s_[400:, :100]
     means = [env.reset(seed=0)[0]["pixels"]["image"][corner].mean() for env in (plain, changed)]
     assert means[1] / means[0] == pytest.approx(level, abs=0.02)
 
 
 def test_a_white_picture_does_not_clip_at_the_brightest_light(make_env):
-    env = make_env(light=type(SceneSpec().light)(level=1.3))
+    env = make_env(light_level=1.3)
     env.reset(seed=0)
     frame = env.scene.frame()
     tile = frame.rgb[frame.bodies == env.scene.tiles["left"]]

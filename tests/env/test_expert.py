@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.env import ScriptedExpert
+from probe_kit.env.arm_models import ARMS
 from probe_kit.errors import EpisodeOverError
 
 RANDOM_START = {"start_jitter": 0.02, "start_jitter_yaw": np.pi, "early_stop": True}
@@ -20,8 +21,9 @@ def play_many(make_env, play):
 
 @pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("preset", ["bridge", "frontal"])
-def test_the_expert_puts_every_cube_in_the_middle_of_the_correct_tile(count, preset, play_many):
-    outcomes = play_many(count, preset=preset)
+@pytest.mark.parametrize("arm", ARMS)
+def test_the_expert_puts_every_cube_in_the_middle_of_the_correct_tile(count, preset, arm, play_many):
+    outcomes = play_many(count, preset=preset, arm=arm)
     assert [o.zone for o in outcomes] == ["correct"] * count
     # The cliff: a grip that is too strong for the solver squeezes the cube out or drops it beside its place.
     assert max(o.distance_correct for o in outcomes) < 0.005
@@ -29,8 +31,9 @@ def test_the_expert_puts_every_cube_in_the_middle_of_the_correct_tile(count, pre
 
 
 @pytest.mark.slow
-def test_a_hundred_random_episodes_are_all_correct(play_many):
-    outcomes = play_many(100)
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_hundred_random_episodes_are_all_correct(arm, play_many):
+    outcomes = play_many(100, arm=arm)
     assert sum(o.is_success for o in outcomes) == 100
     assert max(o.distance_correct for o in outcomes) < 0.005
 
@@ -47,8 +50,9 @@ def test_the_expert_succeeds_on_smaller_and_larger_tiles(tile_side, play_many):
     assert all(o.is_success for o in play_many(2, tile_side=tile_side))
 
 
-def test_an_episode_that_starts_with_the_cube_in_hand_is_half_as_long(play_many):
-    grasped, plain = play_many(4, start_grasped=True), play_many(4)
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_episode_that_starts_with_the_cube_in_hand_is_half_as_long(arm, play_many):
+    grasped, plain = play_many(4, arm=arm, start_grasped=True), play_many(4, arm=arm)
     assert all(o.is_success and o.distance_correct < 0.005 for o in grasped)
     assert np.mean([o.steps for o in grasped]) < 0.7 * np.mean([o.steps for o in plain])
 

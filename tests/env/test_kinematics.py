@@ -5,13 +5,13 @@ from probe_kit.env.kinematics import Pose, SerialChain
 from probe_kit.env.rotations import from_rpy
 
 
-@pytest.fixture(scope="module")
-def arm(shared_env):
-    shared_env.reset(seed=0)
-    return shared_env.scene.arm
+@pytest.fixture
+def arm(arm_env):
+    arm_env.reset(seed=0)
+    return arm_env.scene.arm
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def postures(arm):
     random = np.random.default_rng(1)
     return random.uniform(arm.chain.lower, arm.chain.upper, (20, len(arm.model.joints)))
@@ -31,8 +31,8 @@ def test_a_planar_arm_of_two_links_agrees_with_trigonometry():
     np.testing.assert_allclose(pose.rotation, from_rpy([0, 0, 1.1]), atol=1e-12)
 
 
-def test_forward_kinematics_equal_those_of_pybullet(arm, postures, shared_env):
-    client = shared_env.scene.client
+def test_forward_kinematics_equal_those_of_pybullet(arm, postures, arm_env):
+    client = arm_env.scene.client
     for q in postures:
         arm.place(q, 1.0)
         state = client.getLinkState(arm.body, arm.model.tool, computeForwardKinematics=True)
@@ -53,8 +53,8 @@ def test_jacobian_equals_finite_differences(arm, postures):
         np.testing.assert_allclose(column[3:], [spin[2, 1], spin[0, 2], spin[1, 0]], atol=1e-6)
 
 
-def test_inverse_kinematics_reach_every_place_of_the_workspace(arm, shared_env):
-    home, posture = shared_env.scene.home_q, np.array(arm.model.posture)
+def test_inverse_kinematics_reach_every_place_of_the_workspace(arm, arm_env):
+    home, posture = arm_env.scene.home_q, np.array(arm.model.posture)
     random = np.random.default_rng(2)
     for position in random.uniform([0.2, -0.25, 0.02], [0.45, 0.25, 0.3], (20, 3)):
         turn = from_rpy([0, 0, random.uniform(-0.7, 0.7)])
@@ -65,15 +65,15 @@ def test_inverse_kinematics_reach_every_place_of_the_workspace(arm, shared_env):
         np.testing.assert_allclose(reached.rotation, target.rotation, atol=2e-5)
 
 
-def test_a_small_step_needs_only_a_few_iterations(arm, shared_env):
-    home, posture = shared_env.scene.home_q, np.array(arm.model.posture)
+def test_a_small_step_needs_only_a_few_iterations(arm, arm_env):
+    home, posture = arm_env.scene.home_q, np.array(arm.model.posture)
     pose = arm.chain.pose(home)
     target = Pose(np.add(pose.position, [0.01, 0.02, -0.01]), pose.rotation)
     assert arm.chain.solve(target, home, posture, iterations=4).error < 1e-5
 
 
-def test_an_unreachable_place_is_reported_by_its_error(arm, shared_env):
-    home = shared_env.scene.home_q
+def test_an_unreachable_place_is_reported_by_its_error(arm, arm_env):
+    home = arm_env.scene.home_q
     target = Pose(np.array([5.0, 0.0, 0.3]), np.array(arm.model.down))
     solution = arm.chain.solve(target, home, np.array(arm.model.posture))
     assert solution.error > 3.5

@@ -4,7 +4,7 @@ from PIL import Image
 
 from probe_kit.env import SceneSpec
 from probe_kit.env.scene import Scene
-from probe_kit.env.spec import LimitSpec
+from probe_kit.env.spec import CameraSpec, LimitSpec
 from probe_kit.errors import SceneError
 
 PLAIN = {"left": Image.new("RGB", (8, 8), "red"), "right": Image.new("RGB", (8, 8), "blue")}
@@ -54,6 +54,13 @@ def test_tile_visibility_is_the_share_of_pixels_that_nothing_hides(scene, side):
     scene.reset(PLAIN, (*scene.spec.tile_xy(side), 0.03), 0.0)
     hidden = scene.tile_visibility(scene.frame())[side]
     assert 0.75 < hidden < 0.98
+
+
+def test_a_picture_that_leaves_the_screen_counts_as_partly_hidden(make_env):
+    turned = CameraSpec(forward=(1.0, 0.85, -1.085))
+    visibility = make_env(camera=turned).reset(seed=0)[1]["tile_visibility"]
+    assert visibility["left"] == 1.0
+    assert 0.3 < visibility["right"] < 0.9
 
 
 def test_touching_is_seen(scene):

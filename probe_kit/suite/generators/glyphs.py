@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probe_kit.suite.generators.canvas import Pen, Points, ellipse
-from probe_kit.suite.generators.palette import COLORS, RGB
+from probe_kit.suite.generators.canvas import Pen, ellipse, polygon
+from probe_kit.suite.generators.palette import COLORS, RGB, darker
 
 _DARK = (52, 40, 36)
 _WOOD = (118, 76, 40)
@@ -29,17 +29,8 @@ class Glyph:
         return f"{number_word} {self.singular if number_word == 'one' else self.plural}"
 
 
-def _points(*corners: tuple[float, float]) -> Points:
-    return np.array(corners, dtype=np.float64)
-
-
-def _darker(color: RGB) -> RGB:
-    red, green, blue = color
-    return red * 6 // 10, green * 6 // 10, blue * 6 // 10
-
-
 def _apple(pen: Pen, color: RGB) -> None:
-    pen.line(_points((0, -0.4), (0.08, -0.9)), _WOOD, 0.15)
+    pen.line(polygon((0, -0.4), (0.08, -0.9)), _WOOD, 0.15)
     pen.fill(ellipse(0.42, -0.68, 0.36, 0.18), _LEAF)
     pen.fill(ellipse(-0.3, 0.12, 0.6, 0.66), color)
     pen.fill(ellipse(0.3, 0.12, 0.6, 0.66), color)
@@ -54,9 +45,9 @@ def _lemon(pen: Pen, color: RGB) -> None:
 
 
 def _fish(pen: Pen, color: RGB) -> None:
-    pen.fill(_points((0.35, 0), (0.95, -0.55), (0.82, 0), (0.95, 0.55)), color)
+    pen.fill(polygon((0.35, 0), (0.95, -0.55), (0.82, 0), (0.95, 0.55)), color)
     pen.fill(ellipse(-0.2, 0, 0.76, 0.52), color)
-    pen.line(ellipse(-0.55, 0, 0.3, 0.4, -70, 70), _darker(color), 0.08)
+    pen.line(ellipse(-0.55, 0, 0.3, 0.4, -70, 70), darker(color), 0.08)
     pen.fill(ellipse(-0.58, -0.12, 0.13, 0.13), _WHITE)
     pen.fill(ellipse(-0.6, -0.12, 0.07, 0.07), _DARK)
 
@@ -65,26 +56,26 @@ def _flower(pen: Pen, color: RGB) -> None:
     for angle in np.deg2rad(np.arange(0, 360, 72) - 90):
         pen.fill(ellipse(0.56 * np.cos(angle), 0.56 * np.sin(angle), 0.4, 0.4), color)
     pen.fill(ellipse(0, 0, 0.34, 0.34), COLORS["yellow"])
-    pen.outline(ellipse(0, 0, 0.34, 0.34), _darker(COLORS["yellow"]), 0.06)
+    pen.outline(ellipse(0, 0, 0.34, 0.34), darker(COLORS["yellow"]), 0.06)
 
 
 def _leaf(pen: Pen, color: RGB) -> None:
     upper, lower = ellipse(0.1, 0.35, 0.9, 1.0, 200, 340), ellipse(0.1, -0.35, 0.9, 1.0, 20, 160)
     pen.fill(np.vstack([upper, lower]), color)
-    pen.line(_points((-0.95, 0), (0.6, 0)), _darker(color), 0.12)
+    pen.line(polygon((-0.95, 0), (0.6, 0)), darker(color), 0.12)
     for x in (-0.35, 0.1):
-        pen.line(_points((x + 0.25, -0.35), (x, 0), (x + 0.25, 0.35)), _darker(color), 0.09)
+        pen.line(polygon((x + 0.25, -0.35), (x, 0), (x + 0.25, 0.35)), darker(color), 0.09)
 
 
 def _balloon(pen: Pen, color: RGB) -> None:
-    pen.line(_points((0, 0.4), (0.1, 0.62), (-0.06, 0.8), (0.04, 0.97)), _DARK, 0.08)
-    pen.fill(_points((0, 0.3), (-0.18, 0.56), (0.18, 0.56)), _darker(color))
+    pen.line(polygon((0, 0.4), (0.1, 0.62), (-0.06, 0.8), (0.04, 0.97)), _DARK, 0.08)
+    pen.fill(polygon((0, 0.3), (-0.18, 0.56), (0.18, 0.56)), darker(color))
     pen.fill(ellipse(0, -0.26, 0.6, 0.68), color)
     pen.line(ellipse(0, -0.26, 0.36, 0.44, 190, 250), _WHITE, 0.1)
 
 
 def _mushroom(pen: Pen, color: RGB) -> None:
-    stem = _points((-0.22, 0), (0.22, 0), (0.3, 0.85), (-0.3, 0.85))
+    stem = polygon((-0.22, 0), (0.22, 0), (0.3, 0.85), (-0.3, 0.85))
     pen.fill(stem, _CREAM)
     pen.outline(stem, _DARK, 0.06)
     pen.fill(ellipse(0, 0.12, 0.92, 0.9, 180, 360), color)
@@ -93,15 +84,15 @@ def _mushroom(pen: Pen, color: RGB) -> None:
 
 
 def _house(pen: Pen, color: RGB) -> None:
-    pen.fill(_points((-0.62, -0.1), (0.62, -0.1), (0.62, 0.75), (-0.62, 0.75)), color)
-    pen.fill(_points((-0.9, -0.05), (0, -0.9), (0.9, -0.05)), _darker(COLORS["red"]))
-    pen.fill(_points((-0.16, 0.2), (0.2, 0.2), (0.2, 0.75), (-0.16, 0.75)), _DARK)
+    pen.fill(polygon((-0.62, -0.1), (0.62, -0.1), (0.62, 0.75), (-0.62, 0.75)), color)
+    pen.fill(polygon((-0.9, -0.05), (0, -0.9), (0.9, -0.05)), darker(COLORS["red"]))
+    pen.fill(polygon((-0.16, 0.2), (0.2, 0.2), (0.2, 0.75), (-0.16, 0.75)), _DARK)
 
 
 def _cup(pen: Pen, color: RGB) -> None:
     pen.outline(ellipse(0.5, -0.02, 0.36, 0.34), color, 0.16)
-    pen.fill(_points((-0.75, -0.62), (0.55, -0.62), (0.38, 0.68), (-0.58, 0.68)), color)
-    pen.fill(ellipse(-0.1, -0.62, 0.65, 0.18), _darker(color))
+    pen.fill(polygon((-0.75, -0.62), (0.55, -0.62), (0.38, 0.68), (-0.58, 0.68)), color)
+    pen.fill(ellipse(-0.1, -0.62, 0.65, 0.18), darker(color))
 
 
 def _butterfly(pen: Pen, color: RGB) -> None:
@@ -109,22 +100,22 @@ def _butterfly(pen: Pen, color: RGB) -> None:
         pen.fill(ellipse(side * 0.48, -0.32, 0.46, 0.5), color)
         pen.fill(ellipse(side * 0.4, 0.42, 0.36, 0.38), color)
         pen.fill(ellipse(side * 0.52, -0.34, 0.18, 0.2), _WHITE)
-        pen.line(_points((0, -0.5), (side * 0.24, -0.92)), _DARK, 0.07)
-    pen.line(_points((0, -0.5), (0, 0.68)), _DARK, 0.2)
+        pen.line(polygon((0, -0.5), (side * 0.24, -0.92)), _DARK, 0.07)
+    pen.line(polygon((0, -0.5), (0, 0.68)), _DARK, 0.2)
 
 
 def _tree(pen: Pen, color: RGB) -> None:
-    pen.fill(_points((-0.15, 0.1), (0.15, 0.1), (0.2, 0.95), (-0.2, 0.95)), _WOOD)
-    pen.fill(_points((0, -0.95), (-0.5, -0.2), (0.5, -0.2)), color)
-    pen.fill(_points((0, -0.6), (-0.66, 0.22), (0.66, 0.22)), color)
-    pen.fill(_points((0, -0.2), (-0.76, 0.6), (0.76, 0.6)), color)
+    pen.fill(polygon((-0.15, 0.1), (0.15, 0.1), (0.2, 0.95), (-0.2, 0.95)), _WOOD)
+    pen.fill(polygon((0, -0.95), (-0.5, -0.2), (0.5, -0.2)), color)
+    pen.fill(polygon((0, -0.6), (-0.66, 0.22), (0.66, 0.22)), color)
+    pen.fill(polygon((0, -0.2), (-0.76, 0.6), (0.76, 0.6)), color)
 
 
 def _boat(pen: Pen, color: RGB) -> None:
-    pen.line(_points((0, 0.4), (0, -0.88)), _DARK, 0.1)
-    pen.fill(_points((0.08, -0.8), (0.08, 0.22), (0.68, 0.22)), color)
-    pen.fill(_points((-0.08, -0.5), (-0.08, 0.22), (-0.52, 0.22)), color)
-    pen.fill(_points((-0.88, 0.34), (0.88, 0.34), (0.5, 0.8), (-0.5, 0.8)), _WOOD)
+    pen.line(polygon((0, 0.4), (0, -0.88)), _DARK, 0.1)
+    pen.fill(polygon((0.08, -0.8), (0.08, 0.22), (0.68, 0.22)), color)
+    pen.fill(polygon((-0.08, -0.5), (-0.08, 0.22), (-0.52, 0.22)), color)
+    pen.fill(polygon((-0.88, 0.34), (0.88, 0.34), (0.5, 0.8), (-0.5, 0.8)), _WOOD)
 
 
 GLYPHS: dict[str, Glyph] = {

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from probe_kit.suite.generators.canvas import Points, ellipse
+from probe_kit.suite.generators.canvas import Points, ellipse, polygon
 
 _AREA = 0.95**2  # in drawing units; the most that keeps every placement of every outline on its tile
 
@@ -25,13 +25,9 @@ def _heart() -> Points:
     return np.stack([x, -y], axis=1)
 
 
-def _polygon(*corners: tuple[float, float]) -> Points:
-    return np.array(corners, dtype=np.float64)
-
-
 def _cross(arm: float = 0.38) -> Points:
-    quarter = _polygon((arm, arm), (1, arm), (1, -arm))
-    turn = _polygon((0, -1), (1, 0))
+    quarter = polygon((arm, arm), (1, arm), (1, -arm))
+    turn = polygon((0, -1), (1, 0))
     corners = [quarter]
     for _ in range(3):
         corners.append(corners[-1] @ turn)
@@ -52,17 +48,17 @@ _DRAWN: dict[str, Points] = {
     "circle": ellipse(0, 0, 1, 1)[:-1],
     "oval": ellipse(0, 0, 1.6, 1)[:-1],
     "triangle": _regular(3),
-    "right triangle": _polygon((-1, 1), (1, 1), (-1, -0.9)),
-    "square": _polygon((-1, -1), (1, -1), (1, 1), (-1, 1)),
-    "rectangle": _polygon((-1.75, -1), (1.75, -1), (1.75, 1), (-1.75, 1)),
-    "trapezoid": _polygon((-0.5, -0.65), (0.5, -0.65), (1.1, 0.65), (-1.1, 0.65)),
-    "parallelogram": _polygon((-0.6, -0.65), (1.3, -0.65), (0.6, 0.65), (-1.3, 0.65)),
-    "diamond": _polygon((0, -1.45), (1, 0), (0, 1.45), (-1, 0)),
+    "right triangle": polygon((-1, 1), (1, 1), (-1, -0.9)),
+    "square": polygon((-1, -1), (1, -1), (1, 1), (-1, 1)),
+    "rectangle": polygon((-1.75, -1), (1.75, -1), (1.75, 1), (-1.75, 1)),
+    "trapezoid": polygon((-0.5, -0.65), (0.5, -0.65), (1.1, 0.65), (-1.1, 0.65)),
+    "parallelogram": polygon((-0.6, -0.65), (1.3, -0.65), (0.6, 0.65), (-1.3, 0.65)),
+    "diamond": polygon((0, -1.45), (1, 0), (0, 1.45), (-1, 0)),
     "pentagon": _regular(5),
     "hexagon": _regular(6),
     "star": _star(),
     "heart": _heart(),
     "cross": _cross(),
-    "arrow": _polygon((-1.1, -0.36), (0.1, -0.36), (0.1, -0.9), (1.1, 0), (0.1, 0.9), (0.1, 0.36), (-1.1, 0.36)),
+    "arrow": polygon((-1.1, -0.36), (0.1, -0.36), (0.1, -0.9), (1.1, 0), (0.1, 0.9), (0.1, 0.36), (-1.1, 0.36)),
 }
 OUTLINES: dict[str, Points] = {name: _matched(points) for name, points in _DRAWN.items()}

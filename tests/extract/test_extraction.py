@@ -1,0 +1,206 @@
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import (
+    ActionError,
+    DiskSpaceError,
+    RunIncompleteError,
+    SettingsMismatchError,
+    SuiteError,
+    UnknownCategoryError,
+    UnknownModelError,
+    UsageError,
+)
+from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract.controllers import ScriptedController
+from probe_kit.suite import Suite, build_suite
+
+SHORT = SceneSpec(max_steps=2)
+
+
+def files(run: Path) -> dict[str, str]:
+    """Hash of every file that belongs to the run's identity."""
+    return {
+        str(path.relative_to(run)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(run.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def two_items(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
+
+
+class CrashError(Exception):
+    """Stands for a crash between two episodes."""
+
+
+def stop_after(count: int):
+    def progress(done: int, _total: int, _outcome: str) -> None:
+        if done == count:
+            raise CrashError
+
+    return progress
+
+
+def test_a_run_that_was_interrupted_continues_to_the_same_bytes(two_items: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT, tokens="all")
+    extract_run(settings, tmp_path / "whole")
+    with pytest.raises(CrashError):
+        extract_run(settings, tmp_path / "resumed", stop_after(1))
+    assert len(open_run(tmp_path / "resumed", allow_partial=True).episodes) == 1
+    extract_run(settings, tmp_path / "resumed")
+    assert files(tmp_path / "resumed") == files(tmp_path / "whole")
+
+
+def test_an_unfinished_run_does_not_read_as_whole(two_items: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("expert", suite=two_items.folder)
+    with pytest.raises(CrashError):
+        extract_run(settings, tmp_path / "run", stop_after(1))
+    with pytest.raises(RunIncompleteError, match="1 of 4 episodes"):
+        open_run(tmp_path / "run")
+
+
+def test_other_settings_in_the_same_folder_are_refused_by_name(two_items: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("expert", suite=two_items.folder, scene=SHORT)
+    extract_run(settings, tmp_path / "run")
+    before = files(tmp_path / "run")
+    other = ExtractSettings("expert", suite=two_items.folder, scene=SceneSpec(max_steps=3), seed=1)
+    with pytest.raises(
+        SettingsMismatchError, match=r"scene\.max_steps: stored 2, asked 3\n  seed: stored 0, asked 1"
+    ):
+        extract_run(other, tmp_path / "run")
+    assert files(tmp_path / "run") == before
+
+
+def test_a_folder_that_is_no_run_is_left_alone(two_items: Suite, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("do not touch")
+    with pytest.raises(SettingsMismatchError, match="is not a run"):
+        extract_run(ExtractSettings("expert", suite=two_items.folder), tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "do not touch"
+
+
+def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(two_items: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("expert", suite=two_items.folder, scene=SHORT)
+    run = extract_run(settings, tmp_path / "run")
+    (run.path / "run.json").unlink()
+    shutil.rmtree(run.path / "commits")
+    (run.path / "certificate.json").unlink()
+    assert len(extract_run(settings, tmp_path / "run").episodes) == 4
+
+
+def test_a_nan_action_stops_the_run_and_commits_nothing(
+    two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ScriptedController, "next_actions", lambda _self: np.full((1, 7), np.nan, np.float32))
+    with pytest.raises(ActionError) as caught:
+        extract_run(ExtractSettings("expert", suite=two_items.folder), tmp_path / "run")
+    assert "in episode a2a-embedded-color" in caught.value.__notes__[0]
+    assert caught.value.exit_code == 1
+    assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
+
+
+def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suite: Suite, tmp_path: Path) -> None:
+    for model, outcome in (("expert", "correct"), ("expert-mirrored", "wrong")):
+        run = extract_run(ExtractSettings(model, suite=small_suite.folder, items=4), tmp_path / model)
+        assert (run.episodes["outcome"] == outcome).all()
+        assert len(run.episodes) == 16
+
+
+@pytest.mark.slow
+def test_sixty_expert_episodes_prove_environment_and_scoring(small_suite: Suite, tmp_path: Path) -> None:
+    for model, rate in (("expert", 1.0), ("expert-mirrored", 0.0)):
+        run = extract_run(ExtractSettings(model, suite=small_suite.folder), tmp_path / model)
+        chosen = run.episodes.iloc[:60]
+        assert (chosen["outcome"] == "correct").mean() == rate
+
+
+def test_both_layouts_of_an_item_start_from_the_same_scene_with_their_own_noise(two_items: Suite) -> None:
+    plan = prepare(ExtractSettings("expert", suite=two_items.folder)).plan
+    first, second = plan.episodes[:2]
+    assert first.episode.item == second.episode.item
+    assert first.scene_seed == second.scene_seed
+    assert first.policy_seed != second.policy_seed
+
+
+def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite) -> None:
+    whole = prepare(ExtractSettings("expert", suite=small_suite.folder)).plan.episodes
+    part = prepare(ExtractSettings("expert", suite=small_suite.folder, categories=("shape",))).plan.episodes
+    seeds = {planned.episode.episode_id: planned.policy_seed for planned in whole}
+    assert all(seeds[planned.episode.episode_id] == planned.policy_seed for planned in part)
+
+
+def test_the_certificate_names_weights_fires_and_versions(recorded_run) -> None:
+    certificate = recorded_run.certificate
+    assert certificate["policy"]["weights_sha256"] == recorded_run.settings["weights_sha256"]
+    assert certificate["policy"]["random_weights"] is True
+    assert certificate["hooks_on_equals_hooks_off"] is True
+    assert certificate["fires_per_inference"]["backbone.04.residual"] == 1
+    assert certificate["fires_per_inference"]["expert.00.residual"] == 10
+    assert certificate["versions"]["lerobot"]
+
+
+def test_a_machine_path_is_in_no_stored_setting(recorded_run) -> None:
+    assert str(Path.home()) not in json.dumps(recorded_run.settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"model": "pi0-tyni"}, UnknownModelError, "Did you mean 'pi0-tiny'"),
+        ({"model": "expert", "categories": ("colour",)}, UnknownCategoryError, "Did you mean 'color'"),
+        ({"model": "expert", "items": 3}, UsageError, "3"),
+        ({"model": "expert", "items": 1000}, UsageError, "1000"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_written(
+    small_suite: Suite, tmp_path: Path, settings: dict, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        extract_run(ExtractSettings(suite=small_suite.folder, **settings), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "field", [{"tokens": "some"}, {"codec": "gzip"}, {"video": "last"}, {"captured_calls": 0}]
+)
+def test_settings_out_of_range_are_refused(field: dict) -> None:
+    with pytest.raises(UsageError, match="expected"):
+        ExtractSettings("expert", **field)
+
+
+def test_a_picture_that_changed_on_disk_stops_everything(two_items: Suite, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(two_items.folder, tmp_path / "suite"))
+    next(copy.rglob("*.png")).write_bytes(b"not a picture")
+    with pytest.raises(SuiteError, match="changed"):
+        extract_run(ExtractSettings("expert", suite=copy), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_does_not_fit_the_disk_is_refused_unless_forced(
+    two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extraction = prepare(ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT))
+    full = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: full)
+    with pytest.raises(DiskSpaceError, match="--force"):
+        extraction.run(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    assert len(extraction.run(tmp_path / "run", force=True).episodes) == 4
+
+
+def test_the_first_episode_can_be_filmed(two_items: Suite, tmp_path: Path) -> None:
+    from PIL import Image
+
+    run = extract_run(ExtractSettings("expert", suite=two_items.folder, video="first"), tmp_path / "run")
+    (film,) = (run.path / "videos").glob("*.gif")
+    assert "color-correct" in film.name
+    with Image.open(film) as gif:
+        assert gif.n_frames > 10

@@ -1,0 +1,158 @@
+"""The command line as a user meets it: a process, its output, its exit code."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from probe_kit.suite import Suite
+
+# The keys of `retention --format json` are part of the contract (architecture, command line).
+KEYS = set(
+    "model category view n_episodes n_items sr sr_original sr_swapped p_wrong p_oob delta regime chance "  # noqa: SIM905
+    "prefix_accuracy prefix_layer action_accuracy action_layer action_iteration retention retention_debiased "
+    "retention_ci prefix_p_fwe gap".split()
+)
+
+
+def probe_kit(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "probe_kit", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=300)
+
+
+def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    made = probe_kit(
+        "extract", "--model", "pi0-tiny", "--suite", small_suite.folder, "--categories", "color,shape",
+        "--max-steps", 2, "--out", run,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    assert "RANDOM" in made.stderr
+    assert made.stdout.strip() == str(run)
+    trained = probe_kit("train", run, "--permutations", 20)
+    assert trained.returncode == 0, trained.stderr
+    printed = probe_kit("retention", run, "--format", "json")
+    assert printed.returncode == 0, printed.stderr
+    rows = json.loads(printed.stdout)
+    assert {row["category"] for row in rows} == {"color", "shape", "mean"}
+    assert all(row.keys() >= KEYS for row in rows)
+    for style in ("table", "csv", "markdown", "latex"):
+        assert "random" in probe_kit("retention", run, "--format", style).stdout.lower()
+    again = probe_kit(
+        "extract", "--model", "pi0-tiny", "--suite", small_suite.folder, "--max-steps", 3, "--out", run
+    )
+    assert again.returncode == 3
+    assert "scene.max_steps: stored 2, asked 3" in again.stderr
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shown = probe_kit("extract", "--model", "expert", "--suite", small_suite.folder, "--out", run, "--dry-run")
+    assert shown.returncode == 0
+    assert "48 (24 items in both layouts)" in shown.stderr
+    assert not run.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["extract", "--model", "pi0-tyni"], 2, "Did you mean 'pi0-tiny'"),
+        (["extract", "--model", "expert", "--categories", "colour"], 2, "Did you mean 'color'"),
+        (["extract", "--model", "expert", "--suite", "nowhere"], 2, "nowhere"),
+        (["extract", "--model", "expert", "--scene", "moon"], 2, "moon"),
+        (["extract"], 2, "--model"),
+        (["train", "nowhere"], 2, "is not a run"),
+        (["retention", "nowhere"], 2, "is not a run"),
+        (["retention", "nowhere", "--format", "xml"], 2, "xml"),
+        (["models", "pi9"], 2, "unknown model 'pi9'"),
+        (["extract", "--model", "pi0", "--checkpoint", "./nowhere"], 3, "does not exist"),
+        (["suite", "build", "out", "--n", "7"], 2, "7"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_a_clear_error_with_the_contracts_exit_code(
+    arguments: list[str], code: int, message: str, small_suite: Suite, tmp_path: Path
+) -> None:
+    if arguments[0] == "extract" and "--suite" not in arguments and "--model" in arguments:
+        arguments = [*arguments, "--suite", str(small_suite.folder)]
+    answer = probe_kit(*arguments, cwd=tmp_path)
+    assert answer.returncode == code, answer.stderr
+    assert message in answer.stderr
+    assert "Traceback" not in answer.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(small_suite.folder, tmp_path / "suite"))
+    next(copy.rglob("*.png")).write_bytes(b"not a picture")
+    answer = probe_kit("extract", "--model", "expert", "--suite", copy, "--out", tmp_path / "run")
+    assert answer.returncode == 1
+    assert "changed" in answer.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suite: Suite, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]
+    command += ["--suite", str(small_suite.folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while len(list(run.glob("commits/*.json"))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "the same command continues" in messages
+    kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
+    assert 3 <= len(kept) < 48
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
+    assert len(now) == 48
+    assert all(now[name] == stamp for name, stamp in kept.items())
+
+
+def test_help_is_there_in_under_a_second() -> None:
+    start = time.monotonic()
+    answer = probe_kit("--help")
+    assert time.monotonic() - start < 3  # generous for a busy machine; what matters is the next test
+    assert "demo" in answer.stdout
+
+
+def test_importing_the_command_line_loads_nothing_heavy() -> None:
+    heavy = ("torch", "lerobot", "transformers", "pybullet", "sklearn", "pandas", "xarray", "zarr", "matplotlib")
+    code = f"import sys, probe_kit.cli; print([m for m in {heavy} if m in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert loaded.stdout.strip() == "[]"
+
+
+def test_models_lists_families_and_scripted_policies_as_json() -> None:
+    rows = json.loads(probe_kit("models", "--json").stdout)
+    assert {row["model"] for row in rows} >= {"pi0-tiny", "pi0", "expert", "expert-mirrored"}
+
+
+def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
+    built = probe_kit("suite", "build", tmp_path / "suite", "--categories", "color", "--n", 4)
+    assert built.returncode == 0, built.stderr
+    listed = probe_kit("suite", "list", tmp_path / "suite", "--json")
+    assert json.loads(listed.stdout)["items"] == {"color": 4}
+    shown = probe_kit("suite", "show", tmp_path / "suite", "--out", tmp_path / "sheets")
+    assert shown.returncode == 0
+    assert [Path(line).is_file() for line in shown.stdout.split()] == [True]
+
+
+@pytest.mark.slow
+def test_the_demo_makes_everything_it_promises(tmp_path: Path) -> None:
+    answer = probe_kit("demo", "--out", tmp_path / "demo")
+    assert answer.returncode == 0, answer.stderr
+    assert "random weights" in answer.stdout
+    for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif"):
+        assert (tmp_path / "demo" / name).is_file()
+
+
+def test_the_environment_of_a_test_is_not_the_users() -> None:
+    assert "pytest" in os.environ["PROBE_KIT_CACHE"]

@@ -1,0 +1,63 @@
+"""The instrument as a whole: what was planted is found where it was planted, and nothing else is found."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from probe_kit.extract import Run, open_run
+from probe_kit.hooks.sites import Site
+from probe_kit.retention import retention
+from probe_kit.train import train_probes
+
+PLANTED = Site("backbone", 2)
+
+
+@pytest.fixture
+def planted_run(recorded_run: Run, tmp_path: Path) -> Run:
+    """The recorded run with the answer added along one direction of one layer's mean."""
+    copy = Path(shutil.copytree(recorded_run.path, tmp_path / "planted"))
+    pooled = zarr.open_array(copy / "data.zarr/backbone/pooled", mode="r+")
+    answer = np.where(recorded_run.episodes["side_correct"] == "left", 1.0, -1.0)
+    direction = np.random.default_rng(0).normal(size=pooled.shape[-1])
+    view = recorded_run.views("backbone").index("mean")
+    values = pooled[:]
+    values[:, 0, PLANTED.layer, view] += answer[:, None] * direction
+    for row, content in enumerate(values):
+        pooled[row] = content
+    for commit in (copy / "commits").glob("*.json"):
+        _accept_new_sizes(copy, commit)
+    return open_run(copy)
+
+
+def _accept_new_sizes(run: Path, commit: Path) -> None:
+    """What an instrument would refuse, this test does on purpose."""
+    import json
+
+    content = json.loads(commit.read_text())
+    for key, record in content["objects"].items():
+        record[0] = (run / "data.zarr" / key).stat().st_size
+    commit.write_text(json.dumps(content))
+
+
+def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> None:
+    results = train_probes(planted_run, permutations=40, jobs=1)
+    for category in ("color", "shape"):
+        scores = results.scores.query(f"category == '{category}'").set_index("site")
+        best = scores["accuracy"].idxmax()
+        assert best == str(PLANTED)
+        assert scores.loc[best, "accuracy"] == 1.0
+        assert scores.loc[best, "p_fwe"] < 0.05
+        others = scores.drop(index=best).query("stream == 'backbone'")
+        assert (others["p_fwe"] >= 0.05).all()
+    for row in retention([planted_run]).rows:
+        assert row.retention_defined
+        assert row.prefix_layer == PLANTED.layer
+        assert row.random_weights
+
+
+def test_with_shuffled_labels_nothing_is_significant(planted_run: Run) -> None:
+    results = train_probes(planted_run, permutations=40, target="shuffled", jobs=1)
+    assert (results.scores["p_fwe"] >= 0.05).all()

@@ -1,0 +1,43 @@
+"""Calibration of the p-values, on real nested probes of features without signal."""
+
+import numpy as np
+import pytest
+
+from probe_kit.train.permutation import family_p, flip_items, site_p
+from probe_kit.train.probe import nested_folds, probe_site
+from probe_kit.train.scores import correctness
+
+ITEMS = np.repeat(np.arange(20), 2)
+LABELS = np.tile([True, False], 20)
+
+
+def p_values(seed: int, sites: int, relabellings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Per-site and family-wise p of `sites` correlated sites of noise."""
+    generator = np.random.default_rng(seed)
+    shared = generator.standard_normal((40, 6))
+    columns = flip_items(LABELS, ITEMS, relabellings, seed)
+    folds = nested_folds(LABELS, ITEMS, seed)
+    probes = [
+        probe_site(shared + generator.standard_normal((40, 6)), LABELS, columns, folds) for _ in range(sites)
+    ]
+    accuracy = np.array([correctness(probe.decisions, LABELS).mean() for probe in probes])
+    null = np.stack([probe.null for probe in probes])
+    return site_p(accuracy, null), family_p(accuracy, null)
+
+
+def test_p_values_without_signal_are_uniform_or_larger() -> None:
+    """Ties between accuracies make p larger, never smaller."""
+    p = np.sort([p_values(seed, 1, 19)[0][0] for seed in range(60)])
+    for level in (0.1, 0.25, 0.5, 0.75):
+        allowed = level + 4 * np.sqrt(level * (1 - level) / p.size)
+        assert (p <= level).mean() <= allowed
+    assert (p <= 0.5).mean() >= 0.2
+
+
+@pytest.mark.slow
+def test_family_wise_error_stays_below_its_level() -> None:
+    draws = [p_values(seed, 4, 59) for seed in range(300)]
+    some_site = np.mean([site.min() < 0.05 for site, _ in draws])
+    some_family = np.mean([family.min() < 0.05 for _, family in draws])
+    assert some_family <= 0.06
+    assert some_site > 0.08  # which is why the family-wise p exists
