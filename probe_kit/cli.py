@@ -1,34 +1,24 @@
 """The `probe-kit` command. It parses, calls the library and prints; tables go to stdout, progress to stderr."""
 
-import json
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 import typer.core
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
+from probe_kit.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import ProbeKitError, UsageError
+from probe_kit.extract.commands import extract
+from probe_kit.suite.commands import app as suite_app
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Extraction, Run
+    from probe_kit.extract import Run
+    from probe_kit.hooks.verify import Verification
     from probe_kit.train import ProbeResults, Target
 
 INTERRUPTED = 130
-
-out, err = Console(), Console(stderr=True)
 
 
 class Commands(typer.core.TyperGroup):
@@ -59,8 +49,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-suite_app = typer.Typer(help="Build and look at suites of questions.", no_args_is_help=True)
 app.add_typer(suite_app, name="suite")
+app.command()(extract)
 
 
 def main() -> None:
@@ -84,8 +74,8 @@ def demo(
     """
     from probe_kit.demo import run_demo
 
-    with _progress() as bar:
-        made = run_demo(out_folder, lambda stage: _counter(bar, stage))
+    with progress() as bar:
+        made = run_demo(out_folder, lambda stage: counter(bar, stage))
     out.print(made.table.to_rich())
     out.print(made.next_steps(), highlight=False, soft_wrap=True)
 
@@ -96,189 +86,90 @@ def demo(
 @app.command()
 def models(
     name: Annotated[str | None, typer.Argument(help="Show one model only.")] = None,
+    run: Annotated[Path | None, typer.Option(help="Show the certificate of this run instead.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
-    """List the models that can be run, their default checkpoints and what they need."""
-    from rich.table import Table
+    """List the models that can be run: checkpoints, streams, what this machine lacks for them."""
+    if run is not None:
+        from probe_kit.extract import open_run
 
+        print_json(open_run(run, allow_partial=True).certificate)
+        return
+    rows = _model_rows(name)
+    if as_json:
+        print_json(rows)
+        return
+    for row in rows:
+        out.print(f"[bold]{row['model']}[/]  {escape(row['description'])}", highlight=False)
+        for key in ("checkpoint", "streams", "embodiment", "ready", "notes"):
+            if row[key]:
+                out.print(f"  [dim]{key:10}[/] {escape(row[key])}", highlight=False, soft_wrap=True)
+
+
+def _model_rows(name: str | None) -> list[dict[str, str]]:
     from probe_kit.extract.controllers import SCRIPTED
     from probe_kit.hooks.registry import families, find_family
 
-    if name is None:
-        chosen = list(families().values())
-    else:
+    chosen = list(families().values())
+    if name is not None:
         chosen = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
     rows = [
-        {"model": f.name, "checkpoint": f.default_checkpoint or "embedded", "description": f.description}
-        | {"streams": "backbone, expert", "notes": f.notes}
-        for f in chosen
+        {
+            "model": family.name,
+            "description": family.description,
+            "checkpoint": family.default_checkpoint or "embedded",
+            "streams": family.streams,
+            "embodiment": family.embodiment,
+            "ready": f"needs {family.missing()}" if family.missing() else "yes",
+            "notes": family.notes,
+        }
+        for family in chosen
     ]
+    scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
     rows += [
-        {"model": scripted, "checkpoint": "-", "description": text, "streams": "none", "notes": "no activations"}
-        for scripted, text in SCRIPTED.items()
-        if name in (None, scripted)
+        {"model": model, "description": text, **scripted}
+        for model, text in SCRIPTED.items()
+        if name in (None, model)
     ]
-    if as_json:
-        _print_json(rows)
-        return
-    table = Table("model", "default checkpoint", "what it is", "streams", "notes")
-    for row in rows:
-        table.add_row(row["model"], row["checkpoint"], row["description"], row["streams"], row["notes"])
-    out.print(table)
+    return rows
 
 
-# -- suite -----------------------------------------------------------------------------------------------------
-
-
-@suite_app.command("build")
-def suite_build(
-    folder: Annotated[Path, typer.Argument(help="New folder for the suite.")],
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all embedded ones.")] = None,
-    n: Annotated[int, typer.Option("--n", help="Items per category, even: items come as twins.")] = 150,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-) -> None:
-    """Draw the embedded suite into FOLDER."""
-    from probe_kit.suite import build_suite
-
-    with _progress() as bar:
-        suite = build_suite(folder, _split(categories), n, seed, progress=_counter(bar, "drawing items"))
-    out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
-
-
-@suite_app.command("show")
-def suite_show(
-    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
-    out_folder: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("suite-sheets"),
-) -> None:
-    """Write a contact sheet per category: pairs, instructions, the correct picture framed."""
-    from probe_kit.suite import contact_sheets, default_suite, load_suite
-
-    suite = default_suite() if folder is None else load_suite(folder)
-    for path in contact_sheets(suite, out_folder):
-        out.print(str(path), highlight=False, soft_wrap=True)
-
-
-@suite_app.command("list")
-def suite_list(
-    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> None:
-    """List the categories of a suite with their item counts."""
-    from rich.table import Table
-
-    from probe_kit.suite import CATEGORIES, default_suite, load_suite
-
-    suite = default_suite() if folder is None else load_suite(folder)
-    counts = {c: sum(item.category == c for item in suite.items) for c in suite.categories}
-    if as_json:
-        _print_json({"suite": suite.identity, "items": counts})
-        return
-    table = Table("category", "title", "domain", "items", "episodes", title=suite.identity)
-    for slug, count in counts.items():
-        category = CATEGORIES[slug]
-        table.add_row(slug, category.title, category.domain, str(count), str(2 * count))
-    out.print(table)
-
-
-# -- extract ---------------------------------------------------------------------------------------------------
+# -- verify ----------------------------------------------------------------------------------------------------
 
 
 @app.command()
-def extract(
-    model: Annotated[str, typer.Option(help="A model of `probe-kit models`, or expert, expert-mirrored.")],
-    out_folder: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default runs/<model>-<settings hash>.")
-    ] = None,
-    checkpoint: Annotated[str | None, typer.Option(help="Folder or hub id; default the family's.")] = None,
-    random_weights: Annotated[
-        bool, typer.Option("--random-weights", help="Untrained twin of the same architecture, as a control.")
-    ] = False,
-    suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
-    items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
-    scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal or vl-think.")] = "bridge",
-    max_steps: Annotated[int | None, typer.Option(help="Actions per episode, at 5 Hz.")] = None,
-    tokens: Annotated[str, typer.Option(help="pooled: views only. all: every token too (large).")] = "pooled",
-    captured_calls: Annotated[int, typer.Option(help="Inferences captured per episode.")] = 1,
-    execute: Annotated[
-        int | None, typer.Option(help="Actions executed per inference; default the model's.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of cube places and policy noise.")] = 0,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
-    dtype: Annotated[str | None, typer.Option(help="float32 or bfloat16; default the checkpoint's.")] = None,
-    codec: Annotated[str, typer.Option(help="zstd, fast or none.")] = "zstd",
-    video: Annotated[str, typer.Option(help="GIF of the first episode, of all, or none.")] = "none",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Start even if the disk looks too small.")] = False,
+def verify(
+    family: Annotated[str, typer.Argument(help="A family of `probe-kit models`.")],
+    folder: Annotated[Path | None, typer.Argument(help="Golden reference: checkpoint/ and reference.npz.")] = None,
+    keys: Annotated[Path | None, typer.Option(help="Recorded key list of the full-size model.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
-    """Let a model act in every episode and store its residual streams.
+    """Compare an adapter with outputs recorded from the model's original implementation.
 
-    The same command continues an interrupted run; other settings in the same folder are refused.
+    Exit code 1 if anything is over its tolerance. What the adapter cannot produce is listed, never passed.
     """
-    from probe_kit.env import SceneSpec
-    from probe_kit.extract import ExtractSettings, prepare
+    from probe_kit.hooks.verify import verify_keys, verify_reference
 
-    changes = {} if max_steps is None else {"max_steps": max_steps}
-    settings = ExtractSettings(
-        model=model,
-        checkpoint=checkpoint,
-        random_weights=random_weights,
-        suite=suite,
-        categories=_split(categories),
-        items=items,
-        scene=SceneSpec.preset(scene, **changes),
-        seed=seed,
-        tokens=tokens,
-        captured_calls=captured_calls,
-        execute=execute,
-        codec=codec,
-        device=device,
-        dtype=dtype,
-        video=video,
-    )
-    with err.status("loading suite and model"):
-        extraction = prepare(settings)
-    folder = out_folder or Path("runs") / extraction.default_name()
-    _print_plan(extraction, folder)
-    if dry_run:
-        return
-    with _progress() as bar:
-        run = extraction.run(folder, force=force, progress=_counter(bar, "episodes"))
-    _print_outcomes(run)
+    if (folder is None) == (keys is None):
+        raise UsageError("give either a golden reference folder or --keys FILE")
+    verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))
+    if as_json:
+        print_json(verification.to_json())
+    else:
+        _print_verification(verification)
+    raise typer.Exit(0 if verification.passed else 1)
 
 
-def _print_plan(extraction: "Extraction", folder: Path) -> None:
+def _print_verification(verification: "Verification") -> None:
     from rich.table import Table
 
-    plan, identity = extraction.plan, extraction.identity()
-    weights = (identity["weights_sha256"] or "scripted")[:12]
-    rows = {
-        "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
-        "suite": plan.suite.identity,
-        "categories": ", ".join(plan.suite.categories),
-        "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
-        "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
-        "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
-        "run": str(folder),
-    }
-    table = Table(show_header=False, title="plan", box=None)
-    for name, value in rows.items():
-        table.add_row(f"[dim]{name}[/]", value)
-    err.print(table)
-
-
-def _describe(stored: Any) -> str:
-    steps = f" x {stored.iterations} iterations" if stored.iterations else ""
-    return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
-
-
-def _print_outcomes(run: "Run") -> None:
-    counts = run.episodes["outcome"].value_counts()
-    text = ", ".join(f"{name} {count}" for name, count in counts.items())
-    err.print(f"{len(run.episodes)} episodes: {text}", highlight=False)
-    step = "retention" if not run.streams else "train"
-    err.print(f"next: [bold]probe-kit {step} {run.path}[/]", highlight=False, soft_wrap=True)
-    out.print(str(run.path), highlight=False, soft_wrap=True)
+    colours = {"ok": "green", "over": "red", "not compared": "yellow"}
+    table = Table("output", "max abs error", "tolerance", "", "note", title=f"{verification.family}")
+    for c in verification.comparisons:
+        error = "-" if c.error is None else f"{c.error:.2e}"
+        status = f"[{colours[c.status]}]{c.status}[/]"
+        table.add_row(c.output, error, f"{c.tolerance:.0e}", status, escape(c.note))
+    out.print(table)
 
 
 # -- train -----------------------------------------------------------------------------------------------------
@@ -305,19 +196,28 @@ def train(
     from probe_kit.train import train_probes
 
     opened = open_run(run, allow_partial=partial)
-    with _progress() as bar:
+    with progress() as bar:
         results = train_probes(
             opened,
-            _split(categories),
-            _split(views) or ("mean",),
+            split(categories),
+            split(views) or ("mean",),
             permutations=permutations,
             target=_target(target),
             seed=seed,
             jobs=jobs,
-            progress=_counter(bar, "sites"),
+            progress=counter(bar, "sites"),
         )
     _print_peaks(results, opened.random_weights)
     err.print(f"next: [bold]probe-kit retention {run}[/]", highlight=False, soft_wrap=True)
+
+
+def _target(name: str) -> "Target":
+    from probe_kit.train import TARGETS
+
+    for target in TARGETS:
+        if name == target:
+            return cast("Target", target)
+    raise UsageError(f"unknown target {name!r}; expected one of {', '.join(TARGETS)}")
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
@@ -355,7 +255,7 @@ def retention(
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
     opened = [open_run(path, allow_partial=partial) for path in runs]
-    table = make_table(opened, views=_split(views))
+    table = make_table(opened, views=split(views))
     if style == "table":
         out.print(table.to_rich())
     else:
@@ -377,46 +277,3 @@ def _save_figures(runs: "list[Run]", folder: Path) -> None:
             path = folder / f"{run.path.resolve().name}-layer-curves.png"
             layer_curve(load_results(run)).savefig(path)
             err.print(f"figure: {path}", highlight=False, soft_wrap=True)
-
-
-# -- what the commands share -------------------------------------------------------------------------------------
-
-
-def _split(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
-
-
-def _target(name: str) -> "Target":
-    from probe_kit.train import TARGETS
-
-    for target in TARGETS:
-        if name == target:
-            return cast("Target", target)
-    raise UsageError(f"unknown target {name!r}; expected one of {', '.join(TARGETS)}")
-
-
-def _print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=err) as bar:
-        yield bar
-
-
-def _counter(bar: Progress, description: str) -> Callable[..., None]:
-    """A callback (done, total, …) that moves one bar."""
-    task = bar.add_task(description, total=None)
-
-    def advance(done: int, total: int, *_: object) -> None:
-        bar.update(task, completed=done, total=total)
-
-    return advance

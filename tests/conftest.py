@@ -25,12 +25,21 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def golden_pi0() -> Path:
-    folder = SHARED / "golden" / "pi0"
+def _golden(family: str) -> Path:
+    folder = SHARED / "golden" / family
     if not folder.is_dir():
         pytest.skip(f"no golden reference at {folder} (set PROBE_KIT_SHARED); it is not part of the repository")
     return folder
+
+
+@pytest.fixture(scope="session")
+def golden_pi0() -> Path:
+    return _golden("pi0")
+
+
+@pytest.fixture(scope="session")
+def golden_smolvla() -> Path:
+    return _golden("smolvla")
 
 
 @pytest.fixture(scope="session")

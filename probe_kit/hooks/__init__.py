@@ -7,7 +7,7 @@ from probe_kit.hooks.registry import Family, families, load_policy
 from probe_kit.hooks.sites import Site, Stream
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.capture_context import Tape, capture
+    from probe_kit.hooks.capture_context import Tape, capture, edit
     from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
     from probe_kit.hooks.roles import Roles, pool
 
@@ -22,6 +22,7 @@ __all__ = [
     "Tap",
     "Tape",
     "capture",
+    "edit",
     "families",
     "load_policy",
     "pool",
@@ -35,6 +36,7 @@ _LAZY = {
     "Tap": "policy",
     "Tape": "capture_context",
     "capture": "capture_context",
+    "edit": "capture_context",
     "Roles": "roles",
     "pool": "roles",
 }

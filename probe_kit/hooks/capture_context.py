@@ -1,7 +1,10 @@
-"""The capture context: copies of chosen sites, taken at the moment they fire."""
+"""Listening and writing: contexts that read chosen sites while a policy acts, or replace them.
+
+Both leave the model exactly as found, also when the body raises.
+"""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
 from weakref import WeakSet
@@ -19,6 +22,8 @@ from probe_kit.errors import (
 from probe_kit.hooks.policy import Policy, Tap
 from probe_kit.hooks.sites import Site
 
+Reduce = Callable[[Site, Tensor], Tensor]
+Edit = Callable[[Tensor], Tensor]
 _listening: WeakSet[Policy] = WeakSet()
 
 
@@ -26,23 +31,22 @@ class Tape:
     """The captured activations of one inference: `tape[site]` is (B, T, D) on the model's device."""
 
     def __init__(self) -> None:
-        self._copies: dict[Site, Tensor] = {}
+        self._kept: dict[Site, Tensor] = {}
         self.fires: dict[str, int] = {}
 
     def __getitem__(self, site: Site) -> Tensor:
-        return self._copies[site]
+        return self._kept[site]
 
     def __len__(self) -> int:
-        return len(self._copies)
-
-    def _keep(self, site: Site, activation: Tensor) -> None:
-        self._copies[site] = activation.detach().clone()
+        return len(self._kept)
 
 
 @contextmanager
-def capture(policy: Policy, sites: Iterable[Site]) -> Iterator[Tape]:
-    """Listen to `sites` while the policy acts once; the model is left exactly as found.
+def capture(policy: Policy, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[Tape]:
+    """Listen to `sites` while the policy acts once.
 
+    reduce: what to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as a
+    pooled view; it must return a new tensor. None keeps a copy.
     Raises SiteNeverFiredError or SiteFiredTooOftenError if a site fired another number of times than its
     tap promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this policy
     is being captured already or a tapped module is compiled.
@@ -50,61 +54,100 @@ def capture(policy: Policy, sites: Iterable[Site]) -> Iterator[Tape]:
     if policy in _listening:
         raise CaptureError("this policy is being captured already; leave the first capture before the next")
     tape = Tape()
-    listeners = [
-        _Listener(policy.tap(group[0]), group, tape) for group in _by_module(dict.fromkeys(sites)).values()
-    ]
+
+    def keep(site: Site, activation: Tensor) -> None:
+        tape._kept[site] = activation.detach().clone() if reduce is None else reduce(site, activation.detach())
+
     with ExitStack() as stack:
         _listening.add(policy)
         stack.callback(_listening.discard, policy)
-        for listener in listeners:
-            stack.callback(listener.attach().remove)
+        listeners = _attach(policy, sites, keep, stack)
         yield tape
     for listener in listeners:
-        listener.check()
+        listener.check_count()
+        tape.fires[listener.name] = listener.count
+    _refuse_non_finite(tape)
 
 
-def _by_module(sites: Iterable[Site]) -> dict[Site, list[Site]]:
-    """Sites that differ only in the iteration share a hook."""
+@contextmanager
+def edit(policy: Policy, edits: Mapping[Site, Edit]) -> Iterator[None]:
+    """Replace activations while the policy acts once, at exactly the place where `capture` reads them.
+
+    edits: per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype.
+    A capture entered inside this context reads the replacements.
+    Raises CaptureError if a replacement has another shape or dtype, and for fires as `capture` does.
+    """
+
+    def write(site: Site, activation: Tensor) -> None:
+        new = edits[site](activation.detach().clone())
+        if new.shape != activation.shape or new.dtype != activation.dtype:
+            raise CaptureError(
+                f"the edit of {site} returned {new.dtype} {tuple(new.shape)}; "
+                f"expected {activation.dtype} {tuple(activation.shape)}"
+            )
+        activation.copy_(new)
+
+    with ExitStack() as stack:
+        listeners = _attach(policy, edits, write, stack)
+        yield
+    for listener in listeners:
+        listener.check_count()
+
+
+def _attach(
+    policy: Policy, sites: Iterable[Site], handle: Callable[[Site, Tensor], None], stack: ExitStack
+) -> "list[_Listener]":
+    """One listener per module; sites that differ only in the iteration share it."""
     groups: dict[Site, list[Site]] = defaultdict(list)
-    for site in sites:
+    for site in dict.fromkeys(sites):
         groups[Site(site.stream, site.layer, site.quantity)].append(site)
-    return groups
+    listeners = [_Listener(policy.tap(group[0]), group, handle) for group in groups.values()]
+    for listener in listeners:
+        stack.callback(listener.attach().remove)
+    return listeners
 
 
 class _Listener:
-    """Counts the calls of one module and keeps the asked ones."""
+    """Counts the calls of one module and hands the asked ones on."""
 
-    def __init__(self, tap: Tap, sites: list[Site], tape: Tape) -> None:
-        self.tap, self.sites, self.tape = tap, sites, tape
+    def __init__(self, tap: Tap, sites: list[Site], handle: Callable[[Site, Tensor], None]) -> None:
+        self.tap, self.first, self.handle = tap, sites[0], handle
         self.at_fire = {site.iteration or 0: site for site in sites}
         self.count = 0
+
+    @property
+    def name(self) -> str:
+        return str(self.first).partition("@")[0]
 
     def attach(self) -> RemovableHandle:
         if isinstance(self.tap.module, torch._dynamo.OptimizedModule):
             raise CaptureError(
-                f"{self.sites[0]} lies in a module compiled by torch.compile, which drops hooks; "
+                f"{self.first} lies in a module compiled by torch.compile, which drops hooks; "
                 "load the policy uncompiled to capture it"
             )
-        return self.tap.module.register_forward_pre_hook(self._hear)
+        if self.tap.end == "input":
+            return self.tap.module.register_forward_pre_hook(lambda _, inputs: self._hear(inputs))
+        return self.tap.module.register_forward_hook(lambda _, __, output: self._hear(output))
 
-    def _hear(self, _module: nn.Module, inputs: tuple[Any, ...]) -> None:
+    def _hear(self, passing: Any) -> None:
         site = self.at_fire.get(self.count)
-        if site is not None:
-            self.tape._keep(site, inputs[0])
         self.count += 1
+        if site is not None:
+            self.handle(site, passing[0] if isinstance(passing, tuple) else passing)
 
-    def check(self) -> None:
-        site = self.sites[0]
-        self.tape.fires[f"{site.stream}.{site.layer:02d}.{site.quantity}"] = self.count
-        if self.count != self.tap.fires:
-            wrong = SiteNeverFiredError if self.count < self.tap.fires else SiteFiredTooOftenError
-            raise wrong(
-                f"{site} fired {self.count} times in one inference; expected {self.tap.fires}. The model does "
-                "not call this module the way the adapter declares: correct the tap, or capture one act() "
-                "per context"
+    def check_count(self) -> None:
+        if self.count == self.tap.fires:
+            return
+        wrong = SiteNeverFiredError if self.count < self.tap.fires else SiteFiredTooOftenError
+        raise wrong(
+            f"{self.first} fired {self.count} times in one inference; expected {self.tap.fires}. The model does "
+            "not call this module the way the adapter declares: correct the tap, or act once per context"
+        )
+
+
+def _refuse_non_finite(tape: Tape) -> None:
+    for site, kept in tape._kept.items():
+        if not torch.isfinite(kept).all():
+            raise NonFiniteActivationError(
+                f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
             )
-        for kept in self.sites:
-            if not torch.isfinite(self.tape[kept]).all():
-                raise NonFiniteActivationError(
-                    f"{kept} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
-                )

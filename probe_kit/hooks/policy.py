@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +48,16 @@ class PolicyCard:
 
 @dataclass(frozen=True)
 class Tap:
-    """Where a site is read: the first input of `module`, called `fires` times per inference.
+    """Where a site is read and written: the first input or output of `module`, called `fires` times per inference.
 
-    Inputs and not outputs: some families drive their layers piecewise or add in place, and then a layer's
-    output is never seen or seen too late. The first submodule of a block is always called with the
-    residual stream.
+    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
+    place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
+    called with the residual stream itself, so writing into that tensor writes the stream.
     """
 
     module: nn.Module
     fires: int
+    end: Literal["input", "output"] = "input"
 
 
 class Policy(ABC):
@@ -84,8 +85,8 @@ class Policy(ABC):
 
     @abstractmethod
     def tap(self, site: Site) -> Tap:
-        """Where `site` is read. Raises UnknownSiteError."""
+        """Where `site` is read and written. Raises UnknownSiteError."""
 
-    def sites(self) -> list[Site]:
-        """All residual sites, stream by stream."""
-        return [site for stream in self.streams.values() for site in stream.sites()]
+    def sites(self, quantity: str = "residual") -> list[Site]:
+        """All sites of one quantity, stream by stream."""
+        return [site for stream in self.streams.values() for site in stream.sites(quantity)]

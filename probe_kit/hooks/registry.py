@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit.errors import UnknownModelError
+from probe_kit.errors import UnknownModelError, UsageError
 
 if TYPE_CHECKING:
     from probe_kit.hooks.policy import Policy
@@ -17,19 +17,50 @@ ENTRY_POINTS = "probe_kit.policies"
 
 @dataclass(frozen=True)
 class Family:
-    """A model family by name. `loader` is `module:function`, imported only when a policy is loaded."""
+    """A model family by name.
+
+    default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
+    loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
+    random_weights) gives a Policy; verifier(folder, recorded arrays) gives comparisons; full_size() gives the
+    network of the released size on the meta device.
+    """
 
     name: str
     description: str
     default_checkpoint: str | None
     loader: str
+    streams: str = ""
+    embodiment: str = "7-DoF end-effector delta"
     notes: str = ""
+    verifier: str | None = None
+    full_size: str | None = None
 
     def load(self, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool) -> "Policy":
         """Load a policy; `checkpoint` None means the default one."""
-        module, function = self.loader.split(":")
-        load: Callable[..., Policy] = getattr(import_module(module), function)
-        return load(checkpoint or self.default_checkpoint, device, dtype, random_weights)
+        policy: Policy = _import(self.loader)(checkpoint or self.default_checkpoint, device, dtype, random_weights)
+        return policy
+
+    def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
+        """The family's function for `purpose`. Raises UsageError if it has none."""
+        path = getattr(self, purpose)
+        if path is None:
+            raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
+        return _import(path)
+
+    def missing(self) -> str:
+        """What this machine lacks to load the default checkpoint; empty if it is ready."""
+        if self.default_checkpoint is None:
+            return ""
+        from huggingface_hub import try_to_load_from_cache
+
+        here = isinstance(try_to_load_from_cache(self.default_checkpoint, "config.json"), str)
+        return "" if here else f"download of {self.default_checkpoint}"
+
+
+def _import(path: str) -> Callable[..., Any]:
+    module, function = path.split(":")
+    imported: Callable[..., Any] = getattr(import_module(module), function)
+    return imported
 
 
 _EMBEDDED = (
@@ -38,14 +69,31 @@ _EMBEDDED = (
         "pi0 at 0.6 million parameters, the embedded default",
         None,
         "probe_kit.hooks.pi0:load_pi0_tiny",
-        "random weights; needs no download",
+        streams="backbone 5 layers, expert 5 layers x 10 iterations",
+        notes="random weights",
+        verifier="probe_kit.hooks.verify_flow:verify_pi0",
     ),
     Family(
         "pi0",
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "lerobot/pi0_base",
         "probe_kit.hooks.pi0:load_pi0",
-        "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
+        streams="backbone 19 layers, expert 19 layers x 10 iterations",
+        embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        notes="Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
+        verifier="probe_kit.hooks.verify_flow:verify_pi0",
+        full_size="probe_kit.models.pi0:full_size_pi0",
+    ),
+    Family(
+        "smolvla",
+        "SmolVLA (SmolVLM2 500M, 16 layers, + flow-matching expert) through lerobot",
+        "lerobot/smolvla_base",
+        "probe_kit.hooks.smolvla:load_smolvla",
+        streams="backbone 17 layers, expert 17 layers x 10 iterations",
+        embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
+        notes="Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+        verifier="probe_kit.hooks.verify_flow:verify_smolvla",
+        full_size="probe_kit.models.smolvla:full_size_smolvla",
     ),
 )
 

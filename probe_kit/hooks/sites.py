@@ -12,9 +12,11 @@ _PATTERN = re.compile(r"(?P<stream>[a-z_]+)\.(?P<layer>\d{2,})\.(?P<quantity>[a-
 class Site:
     """One named tensor: `backbone.07.residual`, `expert.03.residual@4`.
 
-    stream: `backbone` (VLM) or `expert` (action part).
-    layer: residual stream *entering* block `layer`; 0 is the embeddings, the last one enters the final norm.
-    iteration: flow-matching step, counted from 0 (pure noise); None where the stream runs once.
+    stream: `backbone` (VLM), `expert` (action part) or, where a family offers it, `vision`.
+    layer, quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters
+    the final norm. `attention` and `mlp` are what block `layer` adds to it. `final_norm` is its normed end.
+    iteration: flow-matching step, counted from 0 (pure noise); the camera, for `vision` with several of them;
+    None where the stream runs once.
     """
 
     stream: str
@@ -55,7 +57,19 @@ class Stream:
     width: int
     iterations: int | None = None
 
-    def sites(self) -> list[Site]:
-        """All residual sites, ordered by iteration, then layer."""
+    def sites(self, quantity: str = "residual") -> list[Site]:
+        """All sites of one quantity, ordered by iteration, then layer.
+
+        `attention` and `mlp` exist per block, `final_norm` once, behind the last block.
+        Raises UnknownSiteError for another quantity.
+        """
+        layers = {
+            "residual": range(self.layers),
+            "attention": range(self.layers - 1),
+            "mlp": range(self.layers - 1),
+            "final_norm": range(self.layers - 1, self.layers),
+        }
+        if quantity not in layers:
+            raise UnknownSiteError(f"no quantity {quantity!r}; expected one of {', '.join(layers)}")
         steps: list[int | None] = [None] if self.iterations is None else list(range(self.iterations))
-        return [Site(self.name, layer, "residual", step) for step in steps for layer in range(self.layers)]
+        return [Site(self.name, layer, quantity, step) for step in steps for layer in layers[quantity]]

@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -52,17 +53,22 @@ class WeightsAudit:
 
 
 def read_weights(folder: Path) -> Weights:
-    """Read `model.safetensors`, or every shard of `model.safetensors.index.json`.
+    """Read `model.safetensors`, every shard of `model.safetensors.index.json`, or the only `.pt` file.
 
+    A `.pt` file is read with `weights_only=True`: it cannot run code.
     Raises WeightsError if a file is missing or damaged, or if the index and the shards disagree.
     """
-    index = folder / INDEX_FILE
+    index, pickles = folder / INDEX_FILE, sorted(folder.glob("*.pt"))
     if (folder / SINGLE_FILE).is_file():
         shards: dict[str, set[str] | None] = {SINGLE_FILE: None}
     elif index.is_file():
         shards = _shards(index)
+    elif len(pickles) == 1:
+        return Weights(_read_pickle(pickles[0]), str(folder), random=False)
     else:
-        raise WeightsError(f"no weights in {folder}: neither {SINGLE_FILE} nor {INDEX_FILE} is there")
+        raise WeightsError(
+            f"no weights in {folder}: neither {SINGLE_FILE} nor {INDEX_FILE} nor one .pt file is there"
+        )
     tensors: dict[str, Tensor] = {}
     random = False
     for name, expected in shards.items():
@@ -92,6 +98,20 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except SafetensorError as error:
         raise WeightsError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+
+
+def _read_pickle(path: Path) -> dict[str, Tensor]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (UnpicklingError, RuntimeError, EOFError) as error:
+        raise WeightsError(
+            f"{path} cannot be read as plain tensors ({error}); it may be damaged or unsafe"
+        ) from error
+    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise WeightsError(
+            f"{path} holds {type(content).__name__} of something else than tensors; expected a state dict"
+        )
+    return content
 
 
 def load_weights(

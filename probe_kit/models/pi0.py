@@ -11,13 +11,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from lerobot.policies.pi0 import modeling_pi0
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
 from probe_kit.errors import CheckpointError
+from probe_kit.models.scoped import replaced
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,11 @@ def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu
     return cast(PI0Policy, policy)
 
 
+def full_size_pi0() -> PI0Policy:
+    """The released size, on the meta device."""
+    return build_pi0(PI0Config(device="cpu"), device="meta")
+
+
 @contextmanager
 def _resized(size: Pi0Size | None) -> Iterator[None]:
     if size is None:
@@ -98,14 +103,8 @@ def _resized(size: Pi0Size | None) -> Iterator[None]:
         "PaliGemmaForConditionalGenerationWithPiGemma": _sized_paligemma(size),
         "PiGemmaForCausalLM": _sized_expert(size),
     }
-    originals = {name: getattr(modeling_pi0, name) for name in replacements}
-    try:
-        for name, value in replacements.items():
-            setattr(modeling_pi0, name, value)
+    with replaced(modeling_pi0, replacements):
         yield
-    finally:
-        for name, value in originals.items():
-            setattr(modeling_pi0, name, value)
 
 
 def _sized_paligemma(size: Pi0Size) -> Callable[..., Any]:
@@ -134,25 +133,3 @@ def _sized_expert(size: Pi0Size) -> Callable[..., Any]:
         return real(config=config)
 
     return build
-
-
-@torch.no_grad()
-def initialise(policy: PI0Policy, seed: int) -> None:
-    """Fill every parameter with random numbers of a scale that keeps activations of order one.
-
-    Matrices N(0, 1/fan_in), residual outputs half of that, embeddings 1/sqrt(width), position embeddings
-    0.5, biases and norms untouched. Drawn by numpy in name order, so that a seed means the same bits
-    on every machine.
-    """
-    rng = np.random.Generator(np.random.PCG64(seed))
-    residual_outputs = ("o_proj.weight", "out_proj.weight", "down_proj.weight", "fc2.weight")
-    for name, parameter in sorted(policy.named_parameters()):
-        if parameter.ndim < 2:
-            continue
-        scale = 1 / float(np.sqrt(parameter[0].numel()))
-        if "position_embedding" in name:
-            scale = 0.5
-        elif name.endswith(residual_outputs):
-            scale /= 2
-        values = rng.standard_normal(tuple(parameter.shape), dtype=np.float32) * np.float32(scale)
-        parameter.copy_(torch.from_numpy(values))

@@ -15,7 +15,7 @@ _RENAMED = (
     ("time_mlp_out.", "action_time_mlp_out."),
 )
 # Statistics that old files kept among the weights; today they lie in the processor files.
-_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 _LM_HEAD = f"model.{_VLM}.lm_head.weight"
 _EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
 
@@ -25,7 +25,7 @@ def current_pi0_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     pi0_base holds the tied token embedding once, as `lm_head`; where both are present `embed_tokens` wins.
     """
-    renamed = {_current(name): tensor for name, tensor in tensors.items() if not name.startswith(_STATISTICS)}
+    renamed = {_current(name): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
     if _LM_HEAD in renamed:
         renamed.setdefault(_EMBEDDING, renamed[_LM_HEAD])
     return renamed

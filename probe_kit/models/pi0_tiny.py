@@ -23,7 +23,8 @@ from tokenizers.pre_tokenizers import Sequence, Split
 from tokenizers.processors import TemplateProcessing
 
 from probe_kit.identity import sha256_json
-from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0, initialise
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 from probe_kit.suite.generators import vocabulary
 
 _SPECIAL = ("<pad>", "<eos>", "<bos>", "<unk>", "\n")

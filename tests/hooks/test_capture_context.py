@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from probe_kit.errors import CaptureError, NonFiniteActivationError, SiteFiredTooOftenError, SiteNeverFiredError
-from probe_kit.hooks import Observation, Site, capture
+from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.pi0 import Pi0
 
 
@@ -102,3 +102,48 @@ def test_a_compiled_module_is_refused_with_the_remedy(pi0_tiny: Pi0, monkeypatch
     monkeypatch.setattr(pi0_tiny, "tap", lambda _site: compiled)
     with pytest.raises(CaptureError, match="uncompiled"), capture(pi0_tiny, [Site("backbone", 0)]):
         pass
+
+
+def test_attention_and_mlp_are_what_a_block_adds_to_the_residual(pi0_tiny: Pi0, observation: Observation) -> None:
+    quantities = ("residual", "attention", "mlp")
+    with capture(pi0_tiny, [site for quantity in quantities for site in pi0_tiny.sites(quantity)]) as tape:
+        pi0_tiny.act([observation], [0])
+    for stream, iteration in (("backbone", None), ("expert", 6)):
+        for layer in range(4):
+            added = [tape[Site(stream, layer, quantity, iteration)] for quantity in ("attention", "mlp")]
+            expected = tape[Site(stream, layer, "residual", iteration)] + added[0] + added[1]
+            after = tape[Site(stream, layer + 1, "residual", iteration)]
+            torch.testing.assert_close(after, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_reduction_runs_at_the_moment_of_firing_and_replaces_the_copy(
+    pi0_tiny: Pi0, observation: Observation
+) -> None:
+    sites = [Site("backbone", 2), Site("expert", 1, iteration=3)]
+    with capture(pi0_tiny, sites) as whole:
+        pi0_tiny.act([observation], [0])
+    with capture(pi0_tiny, sites, reduce=lambda _site, activation: activation.mean(1)) as reduced:
+        pi0_tiny.act([observation], [0])
+    for site in sites:
+        assert torch.equal(reduced[site], whole[site].mean(1))
+
+
+def test_an_edit_of_one_iteration_leaves_the_others_before_it_alone(
+    pi0_tiny: Pi0, observation: Observation
+) -> None:
+    site, before = Site("expert", 2, iteration=5), Site("expert", 2, iteration=4)
+    with capture(pi0_tiny, [before]) as plain:
+        untouched = pi0_tiny.act([observation], [0])
+    with edit(pi0_tiny, {site: torch.zeros_like}), capture(pi0_tiny, [before, site]) as edited:
+        changed = pi0_tiny.act([observation], [0])
+    assert torch.equal(plain[before], edited[before])
+    assert (edited[site] == 0).all()
+    assert np.abs(changed - untouched).max() > 0
+
+
+def test_an_edit_of_another_shape_is_refused(pi0_tiny: Pi0, observation: Observation) -> None:
+    with (
+        pytest.raises(CaptureError, match=r"backbone\.01\.residual"),
+        edit(pi0_tiny, {Site("backbone", 1): lambda activation: activation[:, :1]}),
+    ):
+        pi0_tiny.act([observation], [0])

@@ -40,17 +40,17 @@ def test_golden_statistics_turn_into_the_recorded_units(golden_pi0: Path) -> Non
     reference = np.load(golden_pi0 / "reference.npz")
     policy = load_pi0(str(golden_pi0 / "checkpoint"))
     np.testing.assert_allclose(
-        policy._state_units.normalise(reference["in_raw_state"]), reference["in_state"], atol=TOLERANCE
+        policy.state_units.normalise(reference["in_raw_state"]), reference["in_state"], atol=TOLERANCE
     )
     np.testing.assert_allclose(
-        policy._action_units.restore(reference["actions"]), reference["actions_unnormalized"], atol=TOLERANCE
+        policy.action_units.restore(reference["actions"]), reference["actions_unnormalized"], atol=TOLERANCE
     )
 
 
 def test_roles_describe_the_packing_the_model_really_uses(pi0_tiny: Pi0, observation: Observation) -> None:
     """Position ids count valid tokens, so they say which positions the model treats as padding."""
     seen: list[torch.Tensor] = []
-    layer = pi0_tiny._stacks["backbone"].layers[0]
+    layer = pi0_tiny.stacks["backbone"].layers[0]
     handle = layer.register_forward_pre_hook(lambda _m, _a, kw: seen.append(kw["position_ids"]), with_kwargs=True)
     longer = replace(observation, instruction="Put the cube on the picture with three apples")
     pi0_tiny.act([observation, longer], [0, 0])
@@ -89,8 +89,8 @@ def test_actions_have_the_shape_of_the_contract(pi0_tiny: Pi0, observation: Obse
 
 def test_every_instruction_of_the_embedded_suite_is_read_whole(pi0_tiny: Pi0, small_suite) -> None:
     for instruction in {item.instruction for item in small_suite.items}:
-        tokens, mask = pi0_tiny._tokenise([instruction])
-        words = pi0_tiny._tokenizer.convert_ids_to_tokens(tokens[0, mask[0]].tolist())
+        tokens, mask = pi0_tiny.tokenise([instruction])
+        words = pi0_tiny.tokenizer.convert_ids_to_tokens(tokens[0, mask[0]].tolist())
         assert words == ["<bos>", *instruction.lower().split(), "\n"]
 
 
@@ -141,4 +141,4 @@ def test_missing_statistics_are_an_error_and_not_an_identity(tmp_path: Path, pi0
     next(copy.glob("policy_postprocessor*.safetensors")).unlink()
     policy = load_pi0(str(copy))
     with pytest.raises(CheckpointError, match=r"action\.mean"):
-        _ = policy._action_units
+        _ = policy.action_units

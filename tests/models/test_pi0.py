@@ -7,7 +7,8 @@ import torch
 from lerobot.policies.pi0 import modeling_pi0
 
 from probe_kit.errors import CheckpointError
-from probe_kit.models.pi0 import Pi0Size, build_pi0, initialise
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_tiny import SIZE, _config
 
 

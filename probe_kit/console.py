@@ -1,0 +1,56 @@
+"""What the commands share: two consoles, progress bars, comma-separated lists."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+out = Console()
+"""Results: what a script would read."""
+err = Console(stderr=True)
+"""Progress, plans and notes."""
+
+
+def split(text: str | None) -> tuple[str, ...] | None:
+    """The parts of a comma-separated option; None stays None."""
+    return None if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def print_json(value: Any) -> None:
+    """Print `value` as JSON on stdout."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Progress bars on stderr."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=err) as bar:
+        yield bar
+
+
+def counter(bar: Progress, description: str) -> Callable[..., None]:
+    """A callback (done, total, …) that moves one bar."""
+    task = bar.add_task(description, total=None)
+
+    def advance(done: int, total: int, *_: object) -> None:
+        bar.update(task, completed=done, total=total)
+
+    return advance

@@ -1,0 +1,130 @@
+"""`probe-kit verify`: the ordinary adapter against outputs recorded from a model's original implementation."""
+
+import gzip
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.registry import find_family
+
+Status = Literal["ok", "over", "not compared"]
+Produce = Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One recorded output beside ours; `error` is the largest absolute difference, None if not compared."""
+
+    output: str
+    status: Status
+    error: float | None
+    tolerance: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All comparisons of one golden reference."""
+
+    family: str
+    source: str
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was compared and nothing is over its tolerance."""
+        statuses = {comparison.status for comparison in self.comparisons}
+        return "ok" in statuses and "over" not in statuses
+
+    def to_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {**asdict(self), "passed": self.passed}
+
+
+def compare(
+    recorded: Mapping[str, NDArray[Any]],
+    produced: Mapping[str, Produce],
+    tolerance: float,
+    valid: Mapping[str, NDArray[np.bool_]],
+) -> tuple[Comparison, ...]:
+    """Compare every recorded output but the inputs (`in_…`).
+
+    produced: how to make each output we can make. valid: per output a mask over its leading axes behind the
+    first, where only some positions mean anything.
+    """
+    comparisons = []
+    for name in sorted(recorded):
+        if name.startswith("in_"):
+            continue
+        if name not in produced:
+            comparisons.append(
+                Comparison(name, "not compared", None, tolerance, "the adapter does not produce it")
+            )
+            continue
+        ours, theirs = np.asarray(produced[name]()), recorded[name]
+        if ours.shape != theirs.shape:
+            note = f"shape {ours.shape}, recorded {theirs.shape}"
+            comparisons.append(Comparison(name, "over", None, tolerance, note))
+            continue
+        error = _largest_error(ours, theirs, valid.get(name))
+        comparisons.append(Comparison(name, "ok" if error <= tolerance else "over", error, tolerance))
+    return tuple(comparisons)
+
+
+def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.bool_] | None) -> float:
+    """NaN on either side counts as infinitely wrong."""
+    difference = np.abs(ours.astype(np.float64) - theirs.astype(np.float64))
+    if valid is not None:
+        difference = difference[..., valid, :]
+    worst = float(difference.max(initial=0.0))
+    return worst if np.isfinite(worst) else float("inf")
+
+
+def verify_reference(family: str, folder: Path) -> Verification:
+    """Load `folder/checkpoint` through the family's adapter and compare with `folder/reference.npz`.
+
+    Raises UsageError if the folder has no reference or the family no verifier, and whatever loading raises.
+    """
+    file = folder / "reference.npz"
+    if not file.is_file():
+        raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
+    with np.load(file) as arrays:
+        recorded = {name: arrays[name] for name in arrays.files}
+    run = find_family(family).function("verifier")
+    return Verification(family, str(folder), run(folder, recorded))
+
+
+def verify_keys(family: str, file: Path) -> Verification:
+    """Build the full-size model on the meta device and compare names, shapes and dtypes with a recorded list.
+
+    file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}.
+    """
+    if not file.is_file():
+        raise UsageError(f"key list {file} does not exist")
+    raw = file.read_bytes()
+    recorded = json.loads(gzip.decompress(raw) if file.suffix == ".gz" else raw)["keys"]
+    build = find_family(family).function("full_size")
+    ours = {name: _described(tensor) for name, tensor in build().state_dict().items()}
+    theirs = {name: (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
+    wrong = [f"{name}: missing here" for name in sorted(theirs.keys() - ours.keys())]
+    wrong += [f"{name}: not recorded" for name in sorted(ours.keys() - theirs.keys())]
+    wrong += [
+        f"{name}: {ours[name]}, recorded {theirs[name]}"
+        for name in sorted(ours.keys() & theirs.keys())
+        if ours[name] != theirs[name]
+    ]
+    whole = Comparison(
+        f"{len(theirs)} keys", "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8])
+    )
+    return Verification(family, str(file), (whole,))
+
+
+def _described(tensor: Tensor) -> tuple[tuple[int, ...], str]:
+    return tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")
