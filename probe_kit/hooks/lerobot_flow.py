@@ -259,7 +259,7 @@ class LerobotFlow(Policy):
         stack = self._vision if site.stream == "vision" else self.stacks.get(site.stream)
         if stack is None or site not in _stream(site.stream, stack).sites(site.quantity):
             raise UnknownSiteError(
-                f"{self.family} has no site {site}; it has {', '.join(map(str, self.streams.values()))}, and vision"
+                f"{self.family} has no site {site}; it has {', '.join(map(str, self.streams.values()))} and vision"
             )
         return stack.tap(site)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -83,8 +84,14 @@ def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
             f"the stream has {tokens.shape[-2]} tokens but the policy names roles for {len(roles)}; "
             "the adapter's roles() does not describe this model's packing"
         )
+    return _matrix(roles, tuple(views), tokens.device) @ tokens.float()
+
+
+@lru_cache(maxsize=256)
+def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tensor:
+    """(V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
     weights = np.stack([_weights(roles, view) for view in views]).astype(np.float32)
-    return torch.from_numpy(weights).to(tokens.device) @ tokens.float()
+    return torch.from_numpy(weights).to(device)
 
 
 def _weights(roles: Roles, view: str) -> NDArray[np.float64]:
