@@ -258,9 +258,8 @@ class LerobotFlow(Policy):
         """The first norm of the block the site enters, the stack's final norm, or a block's output."""
         stack = self._vision if site.stream == "vision" else self.stacks.get(site.stream)
         if stack is None or site not in _stream(site.stream, stack).sites(site.quantity):
-            raise UnknownSiteError(
-                f"{self.family} has no site {site}; it has {', '.join(map(str, self.streams.values()))} and vision"
-            )
+            streams = ", ".join(map(str, self.streams.values()))
+            raise UnknownSiteError(f"{self.family} has no site {site}; it has {streams} and vision")
         return stack.tap(site)
 
     @property

@@ -2,12 +2,14 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import WeightsError
-from probe_kit.hooks.pi0 import load_pi0
+from probe_kit.hooks import Observation
+from probe_kit.hooks.pi0 import Pi0, load_pi0
 from probe_kit.hooks.weights import INDEX_FILE, SINGLE_FILE, read_weights
 from probe_kit.models.pi0_tiny import random_checkpoint
 
@@ -114,3 +116,45 @@ def shard(checkpoint: Path) -> None:
     weight_map = {name: file for file, half in halves.items() for name in half}
     (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": weight_map}))
     (checkpoint / SINGLE_FILE).unlink()
+
+
+def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
+    checkpoint: Path, pi0_tiny: Pi0, observation: Observation
+) -> None:
+    """lerobot's own loader returns a random backbone for such a file."""
+    vlm = "model.paligemma_with_expert.paligemma"
+    tensors = load_file(checkpoint / SINGLE_FILE)
+    old = {
+        name.replace(f"{vlm}.model.language_model.", f"{vlm}.language_model.model.").replace(
+            f"{vlm}.model.vision_tower.", f"{vlm}.vision_tower."
+        ): tensor
+        for name, tensor in tensors.items()
+    }
+    assert old.keys() != tensors.keys()
+    save_file(old, checkpoint / SINGLE_FILE, metadata=RANDOM)
+    np.testing.assert_array_equal(
+        load_pi0(str(checkpoint)).act([observation], [1]), pi0_tiny.act([observation], [1])
+    )
+
+
+def test_a_file_that_holds_the_embedding_only_as_lm_head_loads_it_from_there(checkpoint: Path) -> None:
+    vlm = "model.paligemma_with_expert.paligemma"
+    embedding = f"{vlm}.model.language_model.embed_tokens.weight"
+    head = load_file(checkpoint / SINGLE_FILE)[f"{vlm}.lm_head.weight"]
+    rewrite(checkpoint, {embedding: None})
+    assert torch.equal(load_pi0(str(checkpoint)).network.state_dict()[embedding], head)
+
+
+def test_a_loaded_policy_is_in_eval_mode(checkpoint: Path) -> None:
+    assert not load_pi0(str(checkpoint)).network.training
+
+
+def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp_path: Path) -> None:
+    whole = load_pi0(str(checkpoint)).card.weights_sha256
+    tensors = load_file(checkpoint / SINGLE_FILE)
+    (checkpoint / SINGLE_FILE).unlink()
+    torch.save(tensors, checkpoint / "model.pt")
+    assert load_pi0(str(checkpoint)).card.weights_sha256 == whole
+    torch.save({"trap": Path(tmp_path)}, checkpoint / "model.pt")
+    with pytest.raises(WeightsError, match="plain tensors"):
+        load_pi0(str(checkpoint))
