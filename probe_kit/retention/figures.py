@@ -7,7 +7,8 @@ import numpy as np
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.retention.measure import SIGNIFICANCE
-from probe_kit.train.results import Curve, ProbeResults
+from probe_kit.train.curve import Curve
+from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +50,9 @@ def layer_curve(results: ProbeResults, view: str | None = None) -> "Figure":
         unused.set_visible(False)
         panels[panels.index(unused) - columns].tick_params(labelbottom=True)
     figure.supylabel(f"held-out accuracy (%), view {view}", fontsize=9)
-    figure.supxlabel(f"depth (0 enters the first block, 1 leaves the last)\n{_caption(results, view)}", fontsize=8)
+    figure.supxlabel(
+        f"depth (0 enters the first block, 1 leaves the last)\n{_caption(results, view, figure)}", fontsize=8
+    )
     _draw_legend(figure, panels[0])
     return figure
 
@@ -78,7 +81,7 @@ def _draw_panel(axes: "Axes", scores: "pd.DataFrame", curve: Curve) -> None:
 
 
 def _draw_stream(axes: "Axes", stream: str, scores: "pd.DataFrame") -> None:
-    colour, marker, label, sidestep = _STYLES[stream]
+    colour, marker, label, sidestep = _STYLES.get(stream, ("#009E73", "^", stream, 0.0))
     best = scores.loc[scores.groupby("depth")["accuracy"].idxmax()].sort_values("depth")
     depth, accuracy = best["depth"] + sidestep, 100 * best["accuracy"]
     if scores["iteration"].nunique() > 1:
@@ -99,10 +102,18 @@ def _draw_stream(axes: "Axes", stream: str, scores: "pd.DataFrame") -> None:
     axes.plot(depth[clear], accuracy[clear], color=colour, ls="none", marker=marker, ms=4.5)
 
 
-def _caption(results: ProbeResults, view: str) -> str:
+def _caption(results: ProbeResults, view: str, figure: "Figure") -> str:
+    """Model, suite, sizes and key, in as many lines as the figure is narrow."""
     settings = results.settings
     sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
-    n = f"n = {min(sizes)}" if min(sizes) == max(sizes) else f"n = {min(sizes)}–{max(sizes)}"
-    marked = " · RANDOM WEIGHTS" if settings.random_weights else ""
-    what = "" if settings.target == "correct" else f" · target {settings.target}"
-    return f"{settings.model}{marked} · {settings.suite} · {n} episodes per category{what} · probes {results.key}"
+    n = f"{min(sizes)}" if min(sizes) == max(sizes) else f"{min(sizes)}–{max(sizes)}"
+    parts = [settings.model, settings.suite, f"n = {n} episodes per category", f"probes {results.key}"]
+    if settings.random_weights:
+        parts.insert(1, "RANDOM WEIGHTS")
+    if settings.target != "correct":
+        parts.append(f"target {settings.target}")
+    lines = [parts[0]]
+    for part in parts[1:]:
+        joined = f"{lines[-1]} · {part}"
+        lines[-1:] = [joined] if len(joined) <= 15 * figure.get_figwidth() else [lines[-1], part]
+    return "\n".join(lines)

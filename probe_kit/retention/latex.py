@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from probe_kit.retention.rows import MEAN, RetentionRow
-from probe_kit.retention.writers import (
+from probe_kit.retention.cells import (
     debiased_value,
     model_name,
     number,
@@ -12,6 +11,7 @@ from probe_kit.retention.writers import (
     retention_value,
     title,
 )
+from probe_kit.retention.rows import MEAN, RetentionRow
 
 HEAT = (
     (0.2, "pkheat1", "FDE0DD"),

@@ -12,7 +12,7 @@ from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
-from probe_kit.train.results import Curve
+from probe_kit.train.curve import Curve
 
 SIGNIFICANCE = 0.05
 

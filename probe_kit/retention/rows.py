@@ -8,10 +8,11 @@ from typing import Any
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.identity import derive_seed
-from probe_kit.retention.measure import Iterations, best_site, measure_retention
+from probe_kit.retention.measure import Iterations, Peak, best_site, measure_retention
 from probe_kit.retention.success import SuccessRate, normalised_score, success_rate
+from probe_kit.train.curve import Curve
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import Curve, ProbeResults
+from probe_kit.train.results import ProbeResults
 
 MEAN = "mean"
 """Category of the rows that average over categories."""
@@ -92,17 +93,14 @@ def run_rows(
         success = success_rate(episodes, derive_seed("success", seed))
         for view in shown:
             curve = None if results is None or view is None else results.curves.get((str(category), view))
+            probes = {} if curve is None else _probes(curve, success, iterations, seed)
             rows.append(
                 RetentionRow(
                     **_identity(run, results),
                     category=str(category),
                     view=view,
                     **_behaviour(success),
-                    **(
-                        {}
-                        if curve is None or results is None
-                        else _probes(curve, results, success, iterations, seed)
-                    ),
+                    **probes,
                 )
             )
     return rows
@@ -112,7 +110,7 @@ def mean_row(rows: Sequence[RetentionRow]) -> RetentionRow:
     """The category average of rows of one run and view; retention over the categories where it is defined."""
     first = rows[0]
     counted = [row for row in rows if row.retention_defined]
-    left_out = tuple(row.category for row in rows if not row.retention_defined and row.retention is not None)
+    left_out = tuple(row.category for row in rows if row.view is not None and not row.retention_defined)
     note = f"without {', '.join(left_out)}" if left_out else ""
     return RetentionRow(
         run=first.run,
@@ -184,23 +182,13 @@ def _behaviour(success: SuccessRate) -> dict[str, Any]:
     }
 
 
-def _probes(
-    curve: Curve, results: ProbeResults, success: SuccessRate, iterations: Iterations, seed: int
-) -> dict[str, Any]:
+def _probes(curve: Curve, success: SuccessRate, iterations: Iterations, seed: int) -> dict[str, Any]:
     found: dict[str, Any] = {"n_groups": curve.n_groups, "chance": curve.chance}
-    for name, peak in (
-        ("prefix", best_site(curve, "backbone")),
-        ("action", best_site(curve, "expert", iterations)),
-    ):
-        if peak is not None:
-            found[f"{name}_accuracy"] = peak.accuracy
-            found[f"{name}_layer"] = peak.site.layer
-            found[f"{name}_depth"] = results.depth(peak.site)
-            found[f"{name}_p_fwe"] = _number(peak.p_fwe)
-            if name == "action":
-                found["action_iteration"] = peak.site.iteration
-            else:
-                found["gap"] = peak.accuracy - success.sr
+    prefix, action = best_site(curve, "backbone"), best_site(curve, "expert", iterations)
+    if prefix is not None:
+        found |= _peak("prefix", prefix, curve) | {"gap": prefix.accuracy - success.sr}
+    if action is not None:
+        found |= _peak("action", action, curve) | {"action_iteration": action.site.iteration}
     retention = measure_retention(curve, iterations, seed)
     if retention is None:
         return found | {"retention_note": "n/a (one stream only)"}
@@ -212,6 +200,15 @@ def _probes(
         "retention_ci": (
             (retention.interval.low, retention.interval.high) if retention.interval.bounded else (None, None)
         ),
+    }
+
+
+def _peak(name: str, peak: Peak, curve: Curve) -> dict[str, Any]:
+    return {
+        f"{name}_accuracy": peak.accuracy,
+        f"{name}_layer": peak.site.layer,
+        f"{name}_depth": curve.depth(peak.site),
+        f"{name}_p_fwe": _number(peak.p_fwe),
     }
 
 

@@ -9,7 +9,8 @@ from probe_kit.errors import NoProbesError
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.rows import RetentionRow, mean_row, run_rows
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, load_results
+from probe_kit.train.results import ProbeResults
+from probe_kit.train.store import load_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,7 +62,7 @@ class RetentionTable:
 
     def to_markdown(self) -> str:
         """Success rates and retention as two Markdown tables."""
-        from probe_kit.retention.writers import markdown
+        from probe_kit.retention.markdown import markdown
 
         return markdown(self.all_rows)
 
@@ -73,7 +74,7 @@ class RetentionTable:
 
     def to_rich(self) -> "Group":
         """Success rates and retention as two tables for a rich console."""
-        from probe_kit.retention.writers import rich_tables
+        from probe_kit.retention.console import rich_tables
 
         return rich_tables(self.all_rows)
 

@@ -99,7 +99,7 @@ def choose_strengths(features: NDArray[np.floating], labels: NDArray[np.bool_], 
         held_out, truth = coordinates(features[fold.test]), labels[fold.test]
         for step, weights in enumerate(LogisticSolver(coordinates.train).path(labels[fold.train], STRENGTHS)):
             loss[step] += np.logaddexp(0.0, np.where(truth, -1.0, 1.0) * (held_out @ weights)).sum(axis=0)
-    chosen: Matrix = STRENGTHS[loss.argmin(axis=0)]
+    chosen: Matrix = STRENGTHS[loss.round(9).argmin(axis=0)]  # rounded, so that equal losses are ties
     return chosen
 
 

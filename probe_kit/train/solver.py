@@ -38,8 +38,8 @@ class LogisticSolver:
     """Solves every column of a label matrix for one C after another, each warm-started by the one before.
 
     samples: (N, R) float64 with orthogonal columns, the last one all ones for the intercept.
-    tolerance: bound on ‖w − w*‖ / ‖w‖ of an accepted solution. The objective is 1-strongly convex in w, so
-    the norm of its gradient bounds the distance to the optimum.
+    tolerance: a solution is accepted when ‖gradient‖ ≤ tolerance · ‖w‖. The objective is 1-strongly convex in w,
+    so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
     """
 
     def __init__(self, samples: Matrix, tolerance: float = 1e-9) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit.hooks import Site
 from probe_kit.identity import derive_seed
-from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings
+from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings, save_results
 from probe_kit.train.results import episodes_sha256
 
 
@@ -108,8 +108,7 @@ def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
             (category, "mean"): curve(tables[category], backbone, expert)
             for category, (backbone, expert) in accuracies.items()
         }
-        layers = {"backbone": 3, "expert": 2}
-        ProbeResults(settings, curves, layers).save(run.path)
+        save_results(ProbeResults(settings, curves), run.path)
         return run
 
     return make

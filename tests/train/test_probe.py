@@ -77,3 +77,10 @@ def test_leaking_groups_on_purpose_inflates_accuracy() -> None:
 def test_too_few_groups_for_the_inner_folds_say_so() -> None:
     with pytest.raises(TooFewGroupsError, match="4 independent groups"):
         nested_folds(LABELS[:8], ITEMS[:8], seed=0)
+
+
+def test_ties_go_to_the_smaller_strength() -> None:
+    """Without any varying feature every C gives the same probe."""
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    _, strengths = cross_validate(np.ones((60, 5)), LABELS[:, None], folds)
+    assert (strengths == STRENGTHS[0]).all()

@@ -6,7 +6,7 @@ import pytest
 
 from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.hooks import Site
-from probe_kit.train import ArrayRun, load_results, train_probes
+from probe_kit.train import ArrayRun, load_results, save_results, train_probes
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -67,5 +67,5 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     results = train_probes(run, permutations=0)
     file = run.path / "probes" / results.key / "scores.csv"
     file.write_text("edited by hand")
-    results.save(run.path)
+    save_results(results, run.path)
     assert file.read_text() == "edited by hand"

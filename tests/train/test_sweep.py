@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,15 +55,6 @@ def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> N
     assert curve.chance > 0.5
 
 
-def test_results_do_not_depend_on_the_number_of_jobs(planted_run: PlantedRun, tmp_path: Path) -> None:
-    run = planted_run({PLANTED: 1.0})
-    twin = ArrayRun(tmp_path / "twin", run.model, run.suite, run.episodes, run.features)
-    one = train_probes(run, permutations=3, jobs=1).curves["color", "mean"]
-    two = train_probes(twin, permutations=3, jobs=2).curves["color", "mean"]
-    assert one.sites == two.sites
-    np.testing.assert_array_equal(one.decisions, two.decisions)
-
-
 def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run: PlantedRun) -> None:
     run = planted_run()
     finished: list[str] = []
@@ -75,11 +65,11 @@ def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_probes(run, permutations=2, jobs=1, progress=interrupt)
+        train_probes(run, permutations=2, progress=interrupt)
     assert not list((run.path / "probes").glob("[!.]*"))
 
     read = watch_columns(run)
-    train_probes(run, permutations=2, jobs=1)
+    train_probes(run, permutations=2)
     assert len(read) <= 9 - 4
     assert not list((run.path / "probes").glob(".*"))
 

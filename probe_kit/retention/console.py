@@ -1,0 +1,119 @@
+"""Retention tables on a console: one block per run, narrow enough for 80 columns."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit.retention.cells import (
+    Column,
+    debiased_value,
+    model_name,
+    number,
+    once_per_category,
+    percent,
+    probed,
+    success_interval,
+)
+from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.success import Regime
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
+
+_REGIMES: dict[str | None, str] = {
+    Regime.KNOWLEDGE: "knowledge",
+    Regime.NO_RELIABLE_KNOWLEDGE: "not reliable",
+    Regime.FAILURE: "failure",
+}
+
+
+def rich_tables(rows: Sequence[RetentionRow]) -> "Group":
+    """Success rates of every run, then its retention per view."""
+    from rich.console import Group
+
+    tables: list[Table] = []
+    for _, of_run in groupby(rows, key=lambda row: row.run):
+        found = list(of_run)
+        tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, []))
+        for view, of_view in groupby(probed(found), key=lambda row: row.view):
+            shown = list(of_view)
+            notes = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
+            legend = ["@ depth of the best layer/iteration", *notes]
+            tables.append(_table(f"Retention, view {view}", shown, _RETENTION_COLUMNS, legend))
+    return Group(*tables)
+
+
+def _whole(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f}"
+
+
+def _regime(row: RetentionRow) -> str:
+    return f"score {number(row.normalised_score, 1)}" if row.category == MEAN else _REGIMES[row.regime]
+
+
+def _peak(accuracy: float | None, *places: float | None) -> str:
+    """Accuracy in percent, then where: depth, and the iteration of an expert that has several."""
+    known = [f"{place:.2f}" if isinstance(place, float) else str(place) for place in places if place is not None]
+    return percent(accuracy) + (f" @{'/'.join(known)}" if known else "")
+
+
+def _retention(row: RetentionRow) -> str:
+    return number(row.retention) if row.retention_defined else "n/a"
+
+
+_SUCCESS_COLUMNS: list[Column] = [
+    ("category", lambda row: row.category),
+    ("SR % [95 %]", success_interval),
+    ("Δ", lambda row: percent(row.delta)),
+    ("wrong", lambda row: percent(row.p_wrong)),
+    ("outside", lambda row: percent(row.p_oob)),
+    ("left/right", lambda row: f"{_whole(row.sr_left)} / {_whole(row.sr_right)}"),
+    ("regime", _regime),
+]
+
+_RETENTION_COLUMNS: list[Column] = [
+    ("category", lambda row: row.category),
+    ("backbone", lambda row: _peak(row.prefix_accuracy, row.prefix_depth)),
+    ("p", lambda row: number(row.prefix_p_fwe, 3)),
+    ("expert", lambda row: _peak(row.action_accuracy, row.action_depth, row.action_iteration)),
+    ("retention", _retention),
+    ("debiased [95 %]", debiased_value),
+    ("gap", lambda row: _whole(row.gap)),
+]
+
+
+def _table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column], notes: Sequence[str]) -> "Table":
+    from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.title, table.title_justify = escape(f"{what}: {model_name(rows[0])} on {rows[0].suite}"), "left"
+    table.caption, table.caption_justify = escape("; ".join([_sizes(rows), *notes])), "left"
+    for name, _ in columns:
+        table.add_column(escape(name), no_wrap=name != "category", overflow="fold")
+    for row in rows:
+        table.add_row(*(escape(cell(row)) for _, cell in columns), style="bold" if row.category == MEAN else None)
+    return table
+
+
+def _sizes(rows: Sequence[RetentionRow]) -> str:
+    """What is the same, or nearly so, in all rows."""
+    single = [row for row in rows if row.category != MEAN]
+    parts = [
+        f"run {Path(rows[0].run).name}",
+        f"per category {_span([row.n_episodes for row in single])} episodes",
+        f"{_span([row.n_items for row in single])} items",
+    ]
+    if groups := [row.n_groups for row in single if row.n_groups is not None]:
+        parts.append(f"{_span(groups)} groups")
+    if chances := {percent(row.chance) for row in single if row.chance is not None}:
+        parts.append(f"chance {' or '.join(sorted(chances))} %")
+    return ", ".join(parts)
+
+
+def _span(numbers: Sequence[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low}–{high}"
