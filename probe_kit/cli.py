@@ -185,7 +185,7 @@ def train(
         str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
     ] = "correct",
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
-    jobs: Annotated[int | None, typer.Option(help="Sites probed at a time; default one per core.")] = None,
+    jobs: Annotated[int, typer.Option(help="Processes that share the sites.")] = 1,
     partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
 ) -> None:
     """Fit logistic probes at every site and store their scores in the run.
