@@ -22,10 +22,11 @@ from threadpoolctl import threadpool_limits
 from probe_kit.train.features import Coordinates
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site
+from probe_kit.train.samples import Samples
 
 WIDTH = 2048
 SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold
-Samples = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 
 
 def features(n_episodes: int) -> NDArray[np.float32]:
@@ -57,10 +58,10 @@ def probe_kit_seconds(n_episodes: int, permutations: int) -> float:
     relabellings = flip_items(labels, items, permutations, seed=0)
     folds = nested_folds(labels, items, seed=0)
     values = features(n_episodes)
-    return seconds(lambda: probe_site(values, labels, relabellings, folds))
+    return seconds(lambda: probe_site(Samples.pooled(values), labels, relabellings, folds))
 
 
-def scikit_learn_seconds(samples: Samples, columns: NDArray[np.bool_], tolerance: float) -> float:
+def scikit_learn_seconds(samples: Matrix, columns: NDArray[np.bool_], tolerance: float) -> float:
     """Seconds per problem, averaged over the C grid and `columns`."""
 
     def fit_all() -> None:

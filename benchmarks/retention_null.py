@@ -21,6 +21,7 @@ from probe_kit.retention.crossfit import GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
 from probe_kit.train.permutation import family_p, flip_items
 from probe_kit.train.probe import nested_folds, probe_site
+from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness
 
 LAYERS, ITERATIONS, ITEMS = 19, 10, 150
@@ -133,7 +134,7 @@ def false_alarms(draws: int) -> float:
         layers = correlated(generator, 4, 48 * 12).reshape(4, 48, 12)
         relabellings = flip_items(labels, items, 99, seed)
         folds = nested_folds(labels, items, seed)
-        probes = [probe_site(layer, labels, relabellings, folds) for layer in layers]
+        probes = [probe_site(Samples.pooled(layer), labels, relabellings, folds) for layer in layers]
         accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
         alarms += bool((family_p(accuracy, np.stack([probe.null for probe in probes])) < 0.05).any())
     return alarms / draws

@@ -8,8 +8,9 @@
 Data flows one way: suite → env → hooks → extract → train → retention.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from probe_kit.lazy import lazy_names
 
 __version__ = "0.1.0"
 
@@ -23,27 +24,6 @@ if TYPE_CHECKING:
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
     from probe_kit.train import load_results, train_probes
 
-# Everything is imported on first use: `import probe_kit` must not load torch.
-_HOME = {
-    "Act2AnswerEnv": "env",
-    "ExtractSettings": "extract",
-    "ProbeKitError": "errors",
-    "Run": "extract",
-    "SceneSpec": "env",
-    "Site": "hooks",
-    "Suite": "suite",
-    "build_suite": "suite",
-    "capture": "hooks",
-    "default_suite": "suite",
-    "extract_run": "extract",
-    "layer_curve": "retention.figures",
-    "load_policy": "hooks",
-    "load_results": "train",
-    "load_suite": "suite",
-    "open_run": "extract",
-    "retention_table": "retention",
-    "train_probes": "train",
-}
 __all__ = [
     "Act2AnswerEnv",
     "ExtractSettings",
@@ -65,9 +45,27 @@ __all__ = [
     "train_probes",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f"probe_kit.{_HOME[name]}")
-    return getattr(module, "retention" if name == "retention_table" else name)
+# `import probe_kit` must not load torch.
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Act2AnswerEnv": "env",
+        "ExtractSettings": "extract",
+        "ProbeKitError": "errors",
+        "Run": "extract",
+        "SceneSpec": "env",
+        "Site": "hooks",
+        "Suite": "suite",
+        "build_suite": "suite",
+        "capture": "hooks",
+        "default_suite": "suite",
+        "extract_run": "extract",
+        "layer_curve": "retention.figures",
+        "load_policy": "hooks",
+        "load_results": "train",
+        "load_suite": "suite",
+        "open_run": "extract",
+        "retention_table": "retention:retention",
+        "train_probes": "train",
+    },
+)

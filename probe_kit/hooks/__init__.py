@@ -1,10 +1,10 @@
 """Policies and how to listen to them: sites, taps, capture, weights audit, one adapter per family."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probe_kit.hooks.registry import Family, families, load_policy
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capture_context import Tape, capture, edit
@@ -29,20 +29,17 @@ __all__ = [
 ]
 
 # These import torch, which takes seconds; reading a run needs only sites.
-_LAZY = {
-    "Observation": "policy",
-    "Policy": "policy",
-    "PolicyCard": "policy",
-    "Tap": "policy",
-    "Tape": "capture_context",
-    "capture": "capture_context",
-    "edit": "capture_context",
-    "Roles": "roles",
-    "pool": "roles",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"probe_kit.hooks.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Observation": "policy",
+        "Policy": "policy",
+        "PolicyCard": "policy",
+        "Tap": "policy",
+        "Tape": "capture_context",
+        "capture": "capture_context",
+        "edit": "capture_context",
+        "Roles": "roles",
+        "pool": "roles",
+    },
+)

@@ -55,6 +55,17 @@ class Stack:
         return Tap(getattr(block, self.entry), fires)
 
 
+def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int, cameras: int) -> dict[str, Stack]:
+    """The three stacks of a flow policy; the vision tower runs once per camera, masked ones included."""
+    return {
+        "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
+        "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
+        "vision": Stack(
+            vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, cameras, "layer_norm1"
+        ),
+    }
+
+
 class LerobotFlow(Policy):
     """A lerobot flow-matching policy behind the Policy contract; subclasses say how it packs its sequence."""
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.lerobot_flow import LerobotFlow, Stack
+from probe_kit.hooks.lerobot_flow import LerobotFlow, Stack, flow_stacks
 from probe_kit.hooks.policy import Observation
 from probe_kit.hooks.roles import PADDING, Roles
 from probe_kit.models.pi0 import Pi0Size, build_pi0
@@ -55,13 +55,7 @@ class Pi0(LerobotFlow):
         backbone, expert = joint.paligemma.model.language_model, joint.gemma_expert.model
         vision = joint.paligemma.model.vision_tower.vision_model
         cameras = len(self.config.image_features)
-        return {
-            "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
-            "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, self.iterations),
-            "vision": Stack(
-                vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, cameras, "layer_norm1"
-            ),
-        }
+        return flow_stacks(backbone, expert, vision, self.iterations, cameras)
 
     @property
     def iterations(self) -> int:

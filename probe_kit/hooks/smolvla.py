@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.lerobot_flow import LerobotFlow, Stack
+from probe_kit.hooks.lerobot_flow import LerobotFlow, Stack, flow_stacks
 from probe_kit.hooks.policy import Observation
 from probe_kit.hooks.roles import PADDING, Roles
 from probe_kit.models.smolvla import build_smolvla, current_smolvla_keys
@@ -53,13 +53,7 @@ class SmolVLA(LerobotFlow):
         joint = self.network.model.vlm_with_expert
         backbone, expert, vision = joint.vlm.model.text_model, joint.lm_expert, joint.vlm.model.vision_model
         cameras = min(len(self.config.image_features), 1 + self.config.empty_cameras)
-        return {
-            "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
-            "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, self.iterations),
-            "vision": Stack(
-                vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, cameras, "layer_norm1"
-            ),
-        }
+        return flow_stacks(backbone, expert, vision, self.iterations, cameras)
 
     @property
     def iterations(self) -> int:

@@ -48,7 +48,7 @@ class AdapterContract:
     @pytest.fixture
     def policy(self) -> Policy:
         """The adapter under test, loaded from a small checkpoint."""
-        raise NotImplementedError("override the fixture `policy` with your loaded adapter")
+        pytest.fail("override the fixture `policy` with your loaded adapter")
 
     @pytest.fixture
     def observations(self) -> list[Observation]:

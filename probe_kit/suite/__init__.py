@@ -7,14 +7,18 @@ from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.suite.manifest import load_suite
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite
+from probe_kit.suite.validate import Report, validate_suite
+from probe_kit.suite.validation.findings import Finding
 
 __all__ = [
     "CATEGORIES",
     "LAYOUTS",
     "Category",
     "Episode",
+    "Finding",
     "Item",
     "Layout",
+    "Report",
     "Side",
     "Suite",
     "build_suite",
@@ -22,4 +26,5 @@ __all__ = [
     "default_suite",
     "load_picture",
     "load_suite",
+    "validate_suite",
 ]

@@ -103,6 +103,10 @@ def _cache_folder() -> Path:
 
 
 def _drawing_code() -> str:
-    """Hash of the generators' source, so that a changed drawing is never served from an old cache."""
-    sources = sorted((Path(__file__).parent / "generators").glob("*.py"))
+    """Hash of the generators' source, so that a changed drawing is never served from an old cache.
+
+    The art needs no hash of its own: the notice beside it holds its checksums.
+    """
+    folder = Path(__file__).parent
+    sources = [*sorted((folder / "generators").glob("*.py")), folder / "art" / "NOTICE.md"]
     return sha256_text("\n".join(source.read_text(encoding="utf-8") for source in sources))

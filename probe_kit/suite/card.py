@@ -10,13 +10,19 @@ from PIL import features
 
 import probe_kit
 from probe_kit.suite.items import Item
-from probe_kit.suite.suite import Suite, content_sha256, count_by_category
+from probe_kit.suite.suite import Suite, content_sha256, count_by_category, missing_categories
 
 
-def new_suite(name: str, version: str, items: tuple[Item, ...], options: Mapping[str, Any]) -> Suite:
+def new_suite(
+    name: str,
+    version: str,
+    items: tuple[Item, ...],
+    options: Mapping[str, Any],
+    extra: Mapping[str, Any] | None = None,
+) -> Suite:
     """A suite in memory, ready to be saved; `options` are what it was built or converted with.
 
-    The card holds no date: the same options give the same bytes.
+    extra: what else its card shall say. The card holds no date: the same options give the same bytes.
     """
     card = {
         "name": name,
@@ -25,12 +31,14 @@ def new_suite(name: str, version: str, items: tuple[Item, ...], options: Mapping
         "tool": {"probe_kit": probe_kit.__version__},
         "options": dict(options),
         "counts": count_by_category(items),
+        "missing": missing_categories(items),
         "sources": sorted({item.source["benchmark"] for item in items}),
         "curation": sorted({item.curation_status for item in items}),
         "licenses": sorted({item.license for item in items}),
         "contains_real_faces": any(item.contains_real_face for item in items),
         "environment": _environment(),
         "content_sha256": content_sha256(items),
+        **(extra or {}),
     }
     return Suite(name, version, items, Path(), card)
 

@@ -5,15 +5,18 @@ from textwrap import wrap
 
 from PIL import Image, ImageDraw, ImageFont
 
+from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.pictures import load_picture
-from probe_kit.suite.suite import Suite
+from probe_kit.suite.suite import Suite, missing_categories
 
 _ITEMS_PER_SHEET = 24
 _COLUMNS = 4
 _TILE = 132
 _FRAME = 4
 _LINE_LENGTH = 44
+_HEADER_LINE_LENGTH = 150
+_LINE_HEIGHT = 16
 _TEXT_HEIGHT = 34  # two lines
 _GAP = 12
 _CELL_WIDTH = 2 * _TILE + 4 * _FRAME
@@ -24,7 +27,8 @@ _GREEN = (16, 148, 66)
 def contact_sheets(suite: Suite, out_folder: Path | str) -> list[Path]:
     """One PNG per category in `out_folder`: up to 24 items, the correct picture framed in green.
 
-    Pictures lie as in the original layout. Raises SuiteError for a picture that cannot be read.
+    Pictures lie as in the original layout; the head names the suite and the categories it lacks. Raises SuiteError
+    for a picture that cannot be read.
     """
     folder = Path(out_folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,18 +36,33 @@ def contact_sheets(suite: Suite, out_folder: Path | str) -> list[Path]:
     for category in suite.categories:
         items = [item for item in suite.items if item.category == category]
         path = folder / f"{category}.png"
-        _sheet(items[:_ITEMS_PER_SHEET]).save(path)
+        _sheet(_header(suite, category, len(items)), items[:_ITEMS_PER_SHEET]).save(path)
         paths.append(path)
     return paths
 
 
-def _sheet(items: list[Item]) -> Image.Image:
+def _header(suite: Suite, category: str, count: int) -> list[str]:
+    missing = [CATEGORIES[slug].title for slug in missing_categories(suite.items)]
+    have = f"{len(CATEGORIES) - len(missing)} of {len(CATEGORIES)} categories"
+    lines = [
+        f"{CATEGORIES[category].title}: {count} items of {suite.identity}, {have}",
+        f"Curation: {', '.join(suite.card.get('curation', [])) or 'not stated'}."
+        + (f" Not in this suite: {', '.join(missing)}." if missing else ""),
+    ]
+    return [part for line in lines for part in wrap(line, _HEADER_LINE_LENGTH)]
+
+
+def _sheet(header: list[str], items: list[Item]) -> Image.Image:
     rows = -(-len(items) // _COLUMNS)
-    size = (_COLUMNS * (_CELL_WIDTH + _GAP) + _GAP, rows * (_CELL_HEIGHT + _GAP) + _GAP)
+    top = _GAP + _LINE_HEIGHT * len(header)
+    size = (_COLUMNS * (_CELL_WIDTH + _GAP) + _GAP, top + rows * (_CELL_HEIGHT + _GAP))
     sheet = Image.new("RGB", size, "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
+    for number, line in enumerate(header):
+        draw.text((_GAP, _GAP // 2 + number * _LINE_HEIGHT), line, fill="black", font=font)
     for number, item in enumerate(items):
         row, column = divmod(number, _COLUMNS)
-        corner = (_GAP + column * (_CELL_WIDTH + _GAP), _GAP + row * (_CELL_HEIGHT + _GAP))
+        corner = (_GAP + column * (_CELL_WIDTH + _GAP), top + row * (_CELL_HEIGHT + _GAP))
         sheet.paste(_cell(item), corner)
     return sheet
 

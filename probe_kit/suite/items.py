@@ -19,6 +19,7 @@ class Item:
     """One question: an imperative instruction, a correct and a wrong picture.
 
     `left` and `right` speak of the *original* layout; the swapped layout is derived, never stored.
+    `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
     `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
     """
 
@@ -54,6 +55,7 @@ class Item:
     source: dict[str, Any]
     gen: dict[str, Any]
     schema_version: str = "1.0"
+    side_word: bool = False
     folder: Path = field(default=Path(), compare=False)
 
     def file_name(self, side: Side) -> str:

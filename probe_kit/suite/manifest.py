@@ -20,15 +20,9 @@ from typing import Any
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
-from probe_kit.suite.validation import (
-    LOADING_RULES,
-    Finding,
-    check_card,
-    check_record,
-    check_schema,
-    parse_line,
-    report,
-)
+from probe_kit.suite.validation.findings import Finding, error, listing
+from probe_kit.suite.validation.records import check_card, check_record, check_schema, parse_line, unique_ids
+from probe_kit.suite.validation.rules import LOADING_RULES
 
 CARD = "suite.json"
 ITEMS = "items"
@@ -148,39 +142,47 @@ def load_suite(folder: Path | str) -> Suite:
 
     Raises UsageError if there is no suite, and SuiteError listing everything that is wrong with it.
     """
-    suite, findings = read_suite(Path(folder).absolute())
-    _refuse(suite.folder, [finding for finding in findings if finding.severity == "error"])
+    folder = Path(folder).absolute()
+    suite, findings = read_suite(folder)
+    if suite is None or findings:
+        noun = "error" if len(findings) == 1 else "errors"
+        raise SuiteError(
+            f"the suite in {folder} has {len(findings)} {noun}:\n{listing(findings)}\n"
+            "Restore the files, or delete the folder and build or convert the suite again."
+        )
     return suite
 
 
-def read_suite(folder: Path) -> tuple[Suite, list[Finding]]:
-    """The suite as far as it can be read, and what is wrong with it.
+def read_suite(folder: Path) -> tuple[Suite | None, list[Finding]]:
+    """The suite as far as it can be read, None if its card cannot, and every error found on the way.
 
-    Raises UsageError if there is no suite, and SuiteError if its card is unreadable.
+    Raises UsageError if there is no suite.
     """
     card = _read_card(folder)
+    if isinstance(card, list):
+        return None, card
     items, findings = _read_items(folder / ITEMS)
     suite = Suite(card["name"], card["version"], items, folder, card)
     findings += [finding for rule in LOADING_RULES for finding in rule(suite)]
     return suite, findings
 
 
-def _read_card(folder: Path) -> dict[str, Any]:
+def _read_card(folder: Path) -> dict[str, Any] | list[Finding]:
     path = folder / CARD
     if not path.is_file():
         raise UsageError(f"{folder} is not a suite: it holds no {CARD}. Name the folder a suite was written to.")
     card = parse_line(path.read_bytes(), CARD)
     if isinstance(card, Finding):
-        raise _invalid(folder, [card])
-    _refuse(folder, list(check_schema(card, CARD)) or list(check_card(card)))
-    return card
+        return [card]
+    return list(check_schema(card, CARD)) or list(check_card(card)) or card
 
 
 def _read_items(folder: Path) -> tuple[tuple[Item, ...], list[Finding]]:
     path = folder / METADATA
     if not path.is_file():
-        return (), [Finding("E01", "error", METADATA, "the file is missing")]
+        return (), [error("E01", METADATA, "the file is missing")]
     items, findings = [], []
+    lines_of: dict[str, list[int]] = {}
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         where = f"{METADATA}:{number}"
         record = parse_line(line, where)
@@ -191,17 +193,5 @@ def _read_items(folder: Path) -> tuple[tuple[Item, ...], list[Finding]]:
         findings += wrong
         if not wrong:
             items.append(Item.from_json(record, folder))
-    return tuple(items), findings
-
-
-def _refuse(folder: Path, errors: list[Finding]) -> None:
-    if errors:
-        raise _invalid(folder, errors)
-
-
-def _invalid(folder: Path, errors: list[Finding]) -> SuiteError:
-    noun = "error" if len(errors) == 1 else "errors"
-    return SuiteError(
-        f"the suite in {folder} has {len(errors)} {noun}:\n{report(errors)}\n"
-        "Restore the files, or delete the folder and build or convert the suite again."
-    )
+            lines_of.setdefault(record["item_id"], []).append(number)
+    return tuple(items), findings + list(unique_ids(lines_of))

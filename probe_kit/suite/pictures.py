@@ -46,9 +46,16 @@ def picture_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def load_picture(path: Path) -> Image.Image:
-    """A square RGB picture, upright, on white.
+    """A square RGB picture, upright, on white; the shorter side is padded with white.
 
-    EXIF rotation is applied, transparency is laid over white, and the shorter side is padded with white.
+    Raises SuiteError as `decode_picture` does.
+    """
+    return letterboxed(decode_picture(path))
+
+
+def decode_picture(path: Path) -> Image.Image:
+    """An RGB picture in its own size: EXIF rotation is applied and transparency is laid over white.
+
     Raises SuiteError naming the file if it is missing, is not a picture, is damaged, or has more than 8 bits per
     channel.
     """
@@ -59,7 +66,7 @@ def load_picture(path: Path) -> Image.Image:
             image.verify()  # decoding alone does not compare the checksums
         with Image.open(path) as image:
             _refuse_deep(image, path)
-            return _letterboxed(_on_white(ImageOps.exif_transpose(image)))
+            return _on_white(ImageOps.exif_transpose(image))
     except _DECODING_ERRORS as error:
         raise SuiteError(
             f"{path}: not a picture that Pillow can decode ({error}). Restore the suite's files or build it again."
@@ -80,10 +87,21 @@ def _on_white(image: Image.Image) -> Image.Image:
     return flat
 
 
-def _letterboxed(image: Image.Image) -> Image.Image:
+def letterboxed(image: Image.Image) -> Image.Image:
+    """The picture in the middle of a white square as large as its longer side."""
     side = max(image.size)
     if image.size == (side, side):
         return image
     square = Image.new("RGB", (side, side), WHITE)
     square.paste(image, ((side - image.width) // 2, (side - image.height) // 2))
     return square
+
+
+def difference_hash(image: Image.Image) -> int:
+    """64 bits that say where brightness falls from left to right; nearly equal for nearly equal pictures."""
+    small = image.convert("L").resize((9, 8), Image.Resampling.LANCZOS).tobytes()
+    bits = 0
+    for row in range(8):
+        for column in range(8):
+            bits = bits << 1 | (small[9 * row + column] > small[9 * row + column + 1])
+    return bits

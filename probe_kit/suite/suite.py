@@ -42,6 +42,12 @@ def count_by_category(items: Iterable[Item]) -> dict[str, int]:
     return {slug: counts[slug] for slug in CATEGORIES if slug in counts}
 
 
+def missing_categories(items: Iterable[Item]) -> list[str]:
+    """Slugs of the twelve categories without any item: an average over the others must say so."""
+    present = count_by_category(items)
+    return [slug for slug in CATEGORIES if slug not in present]
+
+
 @dataclass(frozen=True)
 class Suite:
     """Items with a name, a version and a content hash; `card` is what `suite.json` says about them."""
@@ -92,6 +98,7 @@ class Suite:
         card = self.card | {
             "parent": self.content_sha256,
             "counts": count_by_category(items),
+            "missing": missing_categories(items),
             "content_sha256": content_sha256(items),
         }
         return Suite(self.name, self.version, items, self.folder, card)

@@ -13,8 +13,8 @@ from probe_kit.suite import Suite, build_suite
 
 @pytest.fixture(scope="session")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    """All embedded categories with 120 items each."""
-    return build_suite(tmp_path_factory.mktemp("embedded") / "suite", items_per_category=120)
+    """All embedded categories with 40 items each."""
+    return build_suite(tmp_path_factory.mktemp("embedded") / "suite", items_per_category=40)
 
 
 @pytest.fixture

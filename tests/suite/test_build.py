@@ -56,7 +56,7 @@ def test_an_unknown_category_is_refused_with_the_nearest_name(tmp_path: Path) ->
 
 
 def test_a_category_that_is_never_embedded_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnknownCategoryError, match="unknown category 'celebrity'; available: color"):
+    with pytest.raises(UnknownCategoryError, match="unknown category 'celebrity'; available: emotion"):
         build_suite(tmp_path / "suite", ["celebrity"])
 
 

@@ -30,4 +30,6 @@ def test_a_sheet_shows_at_most_24_items(embedded: Suite, tmp_path: Path) -> None
     many, few = embedded.select(["color"]), embedded.select(["color"], 24)
     (sheet_of_many,) = contact_sheets(many, tmp_path / "many")
     (sheet_of_few,) = contact_sheets(few, tmp_path / "few")
-    assert sheet_of_many.read_bytes() == sheet_of_few.read_bytes()
+    with Image.open(sheet_of_many) as one, Image.open(sheet_of_few) as other:
+        below_the_head = (0, 60, *one.size)
+        assert one.crop(below_the_head) == other.crop(below_the_head)

@@ -2,15 +2,27 @@
 
 from typing import Any
 
+from probe_kit.suite.generators.attribute import ATTRIBUTE
 from probe_kit.suite.generators.color import COLOR
 from probe_kit.suite.generators.counting import COUNTING
+from probe_kit.suite.generators.emotion import EMOTION
 from probe_kit.suite.generators.generator import Concept, Generator, Tile
+from probe_kit.suite.generators.living_world import LIVING_WORLD
+from probe_kit.suite.generators.public_info import PUBLIC_INFO
 from probe_kit.suite.generators.shape import SHAPE
+from probe_kit.suite.generators.state import STATE
+from probe_kit.suite.generators.symmetry import SYMMETRY
+from probe_kit.suite.generators.time import TIME
+from probe_kit.suite.generators.traffic import TRAFFIC
 from probe_kit.suite.wording import instruction_for
 
 __all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]
 
-GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in (COLOR, SHAPE, COUNTING)}
+_ALL = (
+    *(EMOTION, ATTRIBUTE, STATE, COLOR, SHAPE, SYMMETRY),
+    *(COUNTING, TIME, PUBLIC_INFO, TRAFFIC, LIVING_WORLD),
+)
+GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in _ALL}
 
 
 def vocabulary() -> list[str]:

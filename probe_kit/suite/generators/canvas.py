@@ -16,6 +16,7 @@ from probe_kit.suite.generators.palette import RGB
 TILE_PIXELS = 256
 _SUPERSAMPLING = 3
 _DRAWN_PIXELS = TILE_PIXELS * _SUPERSAMPLING
+FULL_DISK = (0.8, 0.89)  # scales for a drawing that fills the unit disk
 _FONT_PIXELS = 160
 _BOLDNESS = 7  # pixels of that
 
@@ -45,14 +46,18 @@ class Placement:
 
 
 def random_placement(
-    rng: np.random.Generator, smallest: float = 0.82, turn: float = 17, mirrored: bool = True
+    rng: np.random.Generator,
+    scales: tuple[float, float] = (0.82, 1.0),
+    turn: float = 17,
+    mirrored: bool = True,
 ) -> Placement:
     """A placement for a drawing that has the tile to itself: up to 5 % off centre, up to `turn` degrees turned.
 
+    scales: the range of its radius; a drawing that fills the unit disk leaves the tile above FULL_DISK.
     mirrored: whether it may also be mirrored; not where that would change what is shown, as with lettering.
     """
     return Placement(
-        scale=round(rng.uniform(smallest, 1.0), 4),
+        scale=round(rng.uniform(*scales), 4),
         x=round(rng.uniform(-0.1, 0.1), 4),
         y=round(rng.uniform(-0.1, 0.1), 4),
         rotation=round(rng.uniform(-turn, turn), 2),

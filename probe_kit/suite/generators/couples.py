@@ -12,7 +12,7 @@ from probe_kit.suite.generators.generator import Concept, Generator, Tile
 
 SUITE_NAME = "a2a-embedded"
 # The next major version if the picture, text or side of any item changes; the next minor if items are added.
-SUITE_VERSION = "0.1.0"
+SUITE_VERSION = "1.0.0"
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ def _family(family: str, names: str, view: Literal["whole", "face"] = "whole") -
 CREATURES: tuple[Creature, ...] = (
     *_family(
         "mammal",
-        "cat dog monkey gorilla tiger leopard horse deer bison cow pig sheep=ewe goat camel llama giraffe elephant "
-        "rhinoceros hippopotamus mouse rabbit squirrel=chipmunk beaver hedgehog bat sloth otter skunk kangaroo "
-        "badger donkey zebra",
+        "cat dog monkey gorilla tiger leopard horse deer bison cow pig sheep=ewe goat camel llama giraffe "
+        "elephant rhinoceros hippopotamus mouse rabbit squirrel=chipmunk beaver hedgehog bat sloth otter "
+        "skunk kangaroo badger donkey",
     ),
     *_family("mammal", "raccoon boar fox lion bear panda koala wolf hamster moose", "face"),
     *_family("bird", "turkey penguin eagle duck owl flamingo peacock parrot chick=baby-chick goose"),
@@ -45,8 +45,8 @@ CREATURES: tuple[Creature, ...] = (
     *_family("flower", "rose tulip sunflower hibiscus cherry-blossom daisy=blossom hyacinth lotus"),
     *_family(
         "plant",
-        "seedling potted-plant pine-tree=evergreen-tree leafy-tree=deciduous-tree palm-tree cactus rice=sheaf-of-rice "
-        "herb clover=shamrock mushroom",
+        "seedling potted-plant pine-tree=evergreen-tree leafy-tree=deciduous-tree palm-tree cactus "
+        "rice=sheaf-of-rice herb clover=shamrock mushroom",
     ),
 )
 
@@ -56,7 +56,7 @@ LOOK_ALIKES: tuple[set[str], ...] = (
     {"monkey", "gorilla"},
     {"tiger", "leopard"},
     {"sheep", "goat", "llama"},
-    {"horse", "donkey", "zebra"},
+    {"horse", "donkey"},
     {"rhinoceros", "hippopotamus"},
     {"beaver", "hedgehog", "otter"},
     {"skunk", "badger"},
@@ -75,7 +75,8 @@ LOOK_ALIKES: tuple[set[str], ...] = (
     {"seedling", "potted plant", "herb"},
 )
 
-THINGS: tuple[str, ...] = tuple(
-    "chair bed bicycle automobile bus airplane rocket hammer scissors key umbrella teapot bell guitar trumpet "
-    "telephone laptop camera backpack toilet broom bucket anchor tractor house crown drum spoon".split()
+THINGS: tuple[str, ...] = (
+    *("chair", "bed", "bicycle", "automobile", "bus", "rocket", "hammer", "scissors", "key", "umbrella"),
+    *("teapot", "bell", "guitar", "trumpet", "telephone", "laptop", "camera", "backpack", "toilet", "broom"),
+    *("bucket", "anchor", "tractor", "house", "crown", "drum", "spoon"),
 )

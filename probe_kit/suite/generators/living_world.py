@@ -42,7 +42,7 @@ class Portrait:
 
 def _portrait(concept: Depicted, rng: np.random.Generator) -> Portrait:
     ink = mean_color(concept.icon)
-    return Portrait(concept.icon, ink, background_for(ink, rng), random_placement(rng, smallest=0.9, turn=_TURN))
+    return Portrait(concept.icon, ink, background_for(ink, rng), random_placement(rng, (0.9, 1.0), turn=_TURN))
 
 
 def _tiles(left: Depicted, right: Depicted, rng: np.random.Generator) -> tuple[Portrait, Portrait]:

@@ -1,7 +1,9 @@
 """Which concepts meet: every concept about equally often, and often enough beside its own kind."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 
+from probe_kit.identity import sha256_json
 from probe_kit.suite.generators.generator import Concept
 
 
@@ -10,13 +12,15 @@ def spread_pairs[C: Concept](
 ) -> tuple[tuple[C, C], ...]:
     """Allowed pairs, at most `most`, that use every concept about equally often.
 
-    The concepts stand in a circle; neighbours are paired first, then those two places apart, and so on.
+    The concepts stand in a circle, in an order that follows no family; neighbours are paired first, then those
+    two places apart, and so on.
     """
-    circle = len(concepts)
+    circle = sorted(concepts, key=lambda concept: sha256_json(asdict(concept)))
+    size = len(circle)
     pairs = [
-        (concepts[place], concepts[(place + step) % circle])
-        for step in range(1, circle // 2 + 1)
-        for place in range(circle if 2 * step < circle else circle // 2)
+        (circle[place], circle[(place + step) % size])
+        for step in range(1, size // 2 + 1)
+        for place in range(size if 2 * step < size else size // 2)
     ]
     return tuple(pair for pair in pairs if allowed(*pair))[:most]
 

@@ -53,10 +53,10 @@ def lightness(color: RGB) -> float:
     return 0.299 * red + 0.587 * green + 0.114 * blue
 
 
-def background_for(ink: RGB, rng: np.random.Generator) -> RGB:
-    """A pale, faintly tinted background at least 40 levels lighter or darker than `ink`."""
+def background_for(ink: RGB, rng: np.random.Generator, contrast: float = INK_CONTRAST) -> RGB:
+    """A pale, faintly tinted background at least `contrast` levels lighter or darker than `ink`."""
     while True:
         tinted = rng.uniform(*_BACKGROUND_LIGHTNESS) + rng.uniform(-_TINT, _TINT, size=3)
         red, green, blue = (int(channel) for channel in np.clip(np.rint(tinted), 0, 255))
-        if abs(lightness((red, green, blue)) - lightness(ink)) >= INK_CONTRAST:
+        if abs(lightness((red, green, blue)) - lightness(ink)) >= contrast:
             return red, green, blue

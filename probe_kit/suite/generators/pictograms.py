@@ -22,7 +22,7 @@ PICTOGRAMS: tuple[Pictogram, ...] = (
     Pictogram("cafe", "local-cafe"),
     Pictogram("wheelchair", "accessible"),
     Pictogram("baby changing", "baby-changing-station"),
-    Pictogram("first aid", "medical-services"),
+    Pictogram("medical kit", "medical-services"),
     Pictogram("pharmacy", "local-pharmacy"),
     Pictogram("information", "info"),
     Pictogram("baggage", "luggage"),
@@ -64,6 +64,6 @@ LOOK_ALIKES: tuple[set[str], ...] = (
     {"escalator", "stairs"},
     {"cafe", "drinking water"},
     {"taxi", "train station"},
-    {"first aid", "pharmacy"},
+    {"medical kit", "pharmacy"},
     {"trash bin", "drinking water"},
 )

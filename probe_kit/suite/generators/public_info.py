@@ -1,4 +1,4 @@
-"""Public Info: "escalator sign" against another pictogram, a forbidden thing beside another in half of its pairs."""
+"""Public Info: "escalator sign" against another pictogram, prohibitions meet prohibitions half the time."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -21,6 +21,7 @@ _WHITE = (250, 250, 250)
 _RED = (200, 20, 30)
 _INKS = {"black": (24, 24, 24), "blue": (20, 70, 160), "green": (10, 105, 60), "purple": (88, 40, 130)}
 _RING = 0.13
+_CONTRAST = 90  # a bare pictogram is thin
 _SERVICE_PAIRS_EACH = 6  # steps around the circle of services: each meets twelve others
 _PICTOGRAM_OF = {pictogram.name: pictogram for pictogram in PICTOGRAMS}
 
@@ -70,8 +71,9 @@ def _board(concept: Concept, style: Style, rng: np.random.Generator) -> Board:
     pictogram = _PICTOGRAM_OF[concept.name]
     name = "black" if pictogram.forbidden else str(rng.choice(list(_INKS)))
     ink = jittered(_INKS[name], rng)
-    placement = random_placement(rng, smallest=0.9, turn=6, mirrored=False)
-    return Board(pictogram.icon, "ring" if pictogram.forbidden else style, ink, background_for(ink, rng), placement)
+    placement = random_placement(rng, (0.9, 1.0), turn=6, mirrored=False)
+    background = background_for(ink, rng, _CONTRAST)
+    return Board(pictogram.icon, "ring" if pictogram.forbidden else style, ink, background, placement)
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Board, Board]:

@@ -1,5 +1,6 @@
 """What every embedded category promises, and the rules of each."""
 
+import hashlib
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -9,10 +10,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from probe_kit.suite import CATEGORIES
 from probe_kit.suite.generators import GENERATORS, vocabulary
+from probe_kit.suite.generators.art import FOLDER as ART
+from probe_kit.suite.generators.art import color_icon, mask_icon
+from probe_kit.suite.generators.canvas import Canvas, Placement
 from probe_kit.suite.generators.couples import Couple, draw_couples
+from probe_kit.suite.generators.creatures import CREATURES, THINGS
 from probe_kit.suite.generators.glyphs import GLYPHS
-from probe_kit.suite.generators.palette import INK_CONTRAST, lightness
+from probe_kit.suite.generators.gradable import GRADABLES
+from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, lightness
+from probe_kit.suite.generators.pictograms import PICTOGRAMS
+from probe_kit.suite.generators.road_signs import ROAD_SIGN_ICONS, ROAD_SIGNS
+from probe_kit.suite.generators.symmetry import mirror_overlap
+from probe_kit.suite.generators.two_states import TWO_STATES
+from probe_kit.suite.wording import MOST_WORDS, instruction_for, side_words
 
 THUMBNAILS = Path(__file__).with_name("thumbnails.png")
 
@@ -32,13 +44,20 @@ def test_equal_tiles_give_equal_pixels(category: str) -> None:
     ]
 
 
+# How many phrases against how many others there are: few where a category asks one rule of many pictures.
+FEW_QUESTIONS = {"emotion": 54, "attribute": 36, "state": 36, "symmetry": 2, "color": 110}
+
+
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_there_are_at_least_150_items_without_repeating_a_question(category: str) -> None:
     questions = {
         (asked.phrase, other.name) for a, b in GENERATORS[category].pairs for asked, other in ((a, b), (b, a))
     }
-    assert len(questions) == 2 * len(GENERATORS[category].pairs)
-    assert len(questions) >= (110 if category == "color" else 150)
+    assert len(set(GENERATORS[category].pairs)) == len(GENERATORS[category].pairs)
+    if category in FEW_QUESTIONS:
+        assert len(questions) == FEW_QUESTIONS[category]
+    else:
+        assert len(questions) >= 150
 
 
 @pytest.mark.parametrize("category", list(GENERATORS))
@@ -68,7 +87,9 @@ def test_the_vocabulary_holds_every_word_and_no_side() -> None:
     words = vocabulary()
     assert words == sorted(set(words))
     assert {"put", "the", "cube", "on", "gray", "parallelogram", "picture", "with", "nine", "leaves"} <= set(words)
+    assert {"clock", "4:30", "wi-fi", "speed", "50", "symmetric", "angrier", "unripe", "fox"} <= set(words)
     assert not {"left", "right"} & set(words)
+    assert all(word == word.lower() for word in words)
 
 
 # -- color -------------------------------------------------------------------------------------------
@@ -146,6 +167,155 @@ def test_plurals_are_real_english() -> None:
     assert GLYPHS["fish"].counted("two") == "two fish"
     assert GLYPHS["butterfly"].counted("nine") == "nine butterflies"
     assert GLYPHS["apple"].counted("one") == "one apple"
+
+
+# -- every category ----------------------------------------------------------------------------------
+
+
+def test_the_suite_has_all_categories_but_celebrity() -> None:
+    assert list(GENERATORS) == [slug for slug in CATEGORIES if slug != "celebrity"]
+
+
+@pytest.mark.parametrize("category", list(GENERATORS))
+def test_no_phrase_is_too_long_or_names_a_side(category: str) -> None:
+    for concept in {concept for pair in GENERATORS[category].pairs for concept in pair}:
+        instruction = instruction_for(concept.phrase, "the")
+        assert len(instruction.split()) <= MOST_WORDS
+        assert not side_words(instruction)
+
+
+# -- emotion -----------------------------------------------------------------------------------------
+
+
+def test_comparisons_show_one_feeling_at_two_strengths() -> None:
+    compared = [c for c in couples("emotion", 200) if c.left.polarity != "none"]
+    assert len({c.left.emotion for c in compared}) == 6
+    for couple in compared:
+        assert couple.left_tile.emotion == couple.right_tile.emotion
+        strength = {
+            couple.left.polarity: couple.left_tile.strength,
+            couple.right.polarity: couple.right_tile.strength,
+        }
+        assert strength == {"pos": 1.0, "neg": 0.3}
+
+
+def test_faces_vary_in_whatever_is_no_feeling() -> None:
+    drawn = tiles("emotion", 200)
+    assert len({tile.ink for tile in drawn}) == len({tile.hair for tile in drawn}) == 6
+    assert 0.1 < np.mean([tile.glasses for tile in drawn]) < 0.3
+
+
+# -- attribute and state -----------------------------------------------------------------------------
+
+
+def test_there_are_at_least_sixteen_kinds_of_attributes_and_states() -> None:
+    assert len(GRADABLES) >= 16
+    assert len(TWO_STATES) >= 16
+
+
+def test_levels_are_a_good_way_apart_and_in_the_order_that_is_asked_for() -> None:
+    for couple in couples("attribute", 200):
+        level = {couple.left.polarity: couple.left_tile.level, couple.right.polarity: couple.right_tile.level}
+        assert level["pos"] - level["neg"] >= 0.44
+        assert 0 <= level["neg"] < level["pos"] <= 1
+
+
+def test_a_smaller_scale_never_makes_up_for_a_larger_level() -> None:
+    """What is bigger must cover more of its tile, whatever its placement."""
+    for couple in couples("attribute", 200):
+        if couple.left_tile.thing == "bigger ball":
+            bigger, smaller = sorted((couple.left_tile, couple.right_tile), key=lambda tile: -tile.level)
+            ink = [(np.asarray(tile.draw()) != tile.background).any(axis=2).sum() for tile in (bigger, smaller)]
+            assert ink[0] > 1.3 * ink[1]
+
+
+def test_the_two_states_of_a_thing_look_different() -> None:
+    for thing in TWO_STATES:
+        drawn = []
+        for first in (True, False):
+            canvas = Canvas((220, 220, 220))
+            thing.draw(canvas.pen(Placement(0.85, 0, 0, 0, False)), first, COLORS["blue"])
+            drawn.append(np.asarray(canvas.picture().resize((48, 48)), np.float64))
+        assert np.abs(drawn[0] - drawn[1]).mean() > 3, thing.first
+
+
+# -- symmetry ----------------------------------------------------------------------------------------
+
+
+def test_shapes_are_what_they_are_called_when_measured() -> None:
+    for couple in couples("symmetry", 60):
+        for concept, tile in ((couple.left, couple.left_tile), (couple.right, couple.right_tile)):
+            overlap = mirror_overlap(tile.one_side, tile.other_side)
+            assert overlap >= 0.93 if concept.name == "symmetric" else overlap <= 0.80
+
+
+def test_both_kinds_of_shapes_have_the_same_widths_on_either_side() -> None:
+    for tile in tiles("symmetry"):
+        assert sorted(tile.one_side) == sorted(tile.other_side)
+
+
+# -- time --------------------------------------------------------------------------------------------
+
+
+def test_two_clocks_differ_in_one_hand_or_in_which_hand_is_which() -> None:
+    for one, other in GENERATORS["time"].pairs:
+        exchanged = one.minute == 5 * (other.hour % 12) and other.minute == 5 * (one.hour % 12)
+        assert (one.hour == other.hour) + (one.minute == other.minute) + exchanged >= 1
+
+
+def test_hands_never_hide_each_other() -> None:
+    for tile in tiles("time"):
+        apart = abs(30 * (tile.hour % 12) + tile.minute / 2 - 6 * tile.minute) % 360
+        assert min(apart, 360 - apart) >= 22
+
+
+# -- signs -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("category", "least"), [("public-info", 34), ("traffic", 31)])
+def test_there_are_enough_signs(category: str, least: int) -> None:
+    assert len({concept.name for pair in GENERATORS[category].pairs for concept in pair}) >= least
+
+
+def test_prohibitions_meet_prohibitions_half_of_the_time() -> None:
+    kinds = {pictogram.name: pictogram.forbidden for pictogram in PICTOGRAMS}
+    met = [kinds[a.name] + kinds[b.name] for a, b in GENERATORS["public-info"].pairs]
+    assert met.count(2) == met.count(1) == 28
+
+
+def test_road_signs_meet_their_own_family_half_of_the_time() -> None:
+    pairs = GENERATORS["traffic"].pairs
+    assert np.mean([ROAD_SIGNS[a.name].family == ROAD_SIGNS[b.name].family for a, b in pairs]) == 0.5
+
+
+# -- living world ------------------------------------------------------------------------------------
+
+
+def test_there_are_many_creatures_and_things() -> None:
+    assert len(CREATURES) >= 80
+    assert len(THINGS) >= 21
+
+
+def test_a_whole_animal_never_stands_beside_a_face() -> None:
+    view = {creature.name: creature.view for creature in CREATURES}
+    for one, other in GENERATORS["living-world"].pairs:
+        if one.name in view and other.name in view:
+            assert view[one.name] == view[other.name]
+
+
+def test_every_icon_is_in_the_sheets_that_are_shipped() -> None:
+    for name in (*(creature.icon for creature in CREATURES), *THINGS):
+        assert color_icon(name).getchannel("A").getextrema()[1] > 250
+    for name in (*(pictogram.icon for pictogram in PICTOGRAMS), *ROAD_SIGN_ICONS):
+        assert mask_icon(name).getextrema()[1] > 250
+
+
+def test_art_comes_with_its_licences_and_checksums() -> None:
+    notice = (ART / "NOTICE.md").read_text()
+    for sheet in ("fluent.png", "material.png"):
+        assert hashlib.sha256((ART / sheet).read_bytes()).hexdigest() in notice
+    assert "Microsoft Corporation" in (ART / "LICENSE-fluent.txt").read_text()
+    assert "Apache License" in (ART / "LICENSE-material.txt").read_text()
 
 
 # -- all pictures ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.errors import SuiteError
 from probe_kit.suite import load_suite
-from probe_kit.suite.validation import Finding, report
+from probe_kit.suite.validation.findings import Finding, listing
 
 Record = dict[str, Any]
 EditRecords = Callable[[Callable[[list[Record]], None]], Any]
@@ -16,6 +16,15 @@ def set_field(name: str, value: Any) -> Callable[[list[Record]], None]:
 
     def change(records: list[Record]) -> None:
         records[0][name] = value
+
+    return change
+
+
+def say(phrase: str) -> Callable[[list[Record]], None]:
+    """Asks the first record for something else."""
+
+    def change(records: list[Record]) -> None:
+        records[0] |= {"object_phrase": phrase, "instruction": f"Put the cube on the {phrase}"}
 
     return change
 
@@ -44,13 +53,23 @@ def ask_for_both(records: list[Record]) -> None:
         (set_field("correct_side", "centre"), r"E02 .*'correct_side' is 'centre'; expected one of left, right"),
         (set_field("category", "colour"), r"E02 .*'category' is 'colour'; expected one of emotion, "),
         (set_field("schema_version", "2.0"), r"E03 metadata.jsonl:1: uses schema 2.0; this tool reads 1.x"),
-        (repeat_id, r"E04 item a2a-embedded-color-\w+: the id appears 2 times"),
+        (repeat_id, r"E04 item a2a-embedded-color-\w+: the id appears in lines 1 and 2"),
         (set_field("left_file_name", "images/no.png"), r"E05 item .*: picture 'images/no.png' not found"),
         (set_field("left_file_name", "../x.png"), r"E05 item .*: the path '../x.png' leaves the suite folder"),
         (set_field("left_file_name", "/x.png"), r"E05 item .*: the path '/x.png' leaves the suite folder"),
         (set_field("left_sha256", "ab" * 32), r"E06 .*left picture changed.*expected abababababab, found"),
         (show_one_picture_twice, r"E08 item .*: both sides are the same picture"),
         (ask_for_both, r"E11 item .*: target and distractor concept are both '\w+'"),
+        (set_field("instruction", "Put the cube on me"), r"E09 item .*does not contain the object phrase"),
+        (set_field("object_phrase", ""), r"E09 item .*does not contain the object phrase ''"),
+        (say("red shape."), r"E09 item .*ends with a period"),
+        (say("red\nshape"), r"E09 item .*more than one line"),
+        (say("very " * 12 + "red shape"), r"E09 item .*has 19 words \(limit 12\)"),
+        (say("x" * 80), r"E09 item .*has 100 characters \(limit 80\)"),
+        (say("left shape"), r"E10 item .*names a side \('left'\)"),
+        (set_field("license", " "), r"E14 item .*: licence missing"),
+        (set_field("license", "LicenseRef-x"), r"E14 item .*marked redistributable"),
+        (set_field("contains_real_face", True), r"E15 item .*suite.json says there are none"),
         (set_field("group_id", "g-other"), r"E12 items .* share picture \w+ but have groups g-other, g-"),
         (list.pop, r"E13 suite.json: count per category differs: .*'shape': 12.*'shape': 11"),
         (set_field("instruction", "Put the cube on me"), r"E13 suite.json: content hash differs"),
@@ -87,7 +106,7 @@ def test_all_findings_are_reported_at_once(edit_records: EditRecords) -> None:
 def test_a_report_holds_at_most_twenty_findings_of_a_rule() -> None:
     findings = [Finding("E06", "error", f"item {n}", "changed") for n in range(23)]
     findings.append(Finding("E05", "error", "item x", "not found"))
-    lines = report(findings).splitlines()
+    lines = listing(findings).splitlines()
     assert lines[0] == "E05 item x: not found"
     assert len(lines) == 1 + 20 + 1
     assert lines[-1] == "E06: and 3 more"

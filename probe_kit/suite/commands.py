@@ -1,0 +1,132 @@
+"""`probe-kit suite`: build, convert, check and look at suites."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from probe_kit.console import counter, err, out, print_json, progress, split
+from probe_kit.errors import UsageError
+
+app = typer.Typer(help="Build, convert, check and look at suites of questions.", no_args_is_help=True)
+
+
+@app.command("build")
+def build(
+    folder: Annotated[Path, typer.Argument(help="New folder for the suite.")],
+    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all embedded ones.")] = None,
+    n: Annotated[int, typer.Option("--n", help="Items per category, even: items come as twins.")] = 150,
+    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+) -> None:
+    """Draw the embedded suite into FOLDER."""
+    from probe_kit.suite import build_suite
+
+    with progress() as bar:
+        suite = build_suite(folder, split(categories), n, seed, progress=counter(bar, "drawing items"))
+    out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
+
+
+@app.command("show")
+def show(
+    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
+    out_folder: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("suite-sheets"),
+) -> None:
+    """Write a contact sheet per category: pairs, instructions, the correct picture framed."""
+    from probe_kit.suite import contact_sheets, default_suite, load_suite
+
+    suite = default_suite() if folder is None else load_suite(folder)
+    for path in contact_sheets(suite, out_folder):
+        out.print(str(path), highlight=False, soft_wrap=True)
+
+
+@app.command("list")
+def list_categories(
+    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """List the categories of a suite with their item counts."""
+    from rich.table import Table
+
+    from probe_kit.suite import CATEGORIES, default_suite, load_suite
+
+    suite = default_suite() if folder is None else load_suite(folder)
+    counts = {c: sum(item.category == c for item in suite.items) for c in suite.categories}
+    if as_json:
+        print_json({"suite": suite.identity, "items": counts})
+        return
+    table = Table("category", "title", "domain", "items", "episodes", title=suite.identity)
+    for slug, count in counts.items():
+        category = CATEGORIES[slug]
+        table.add_row(slug, category.title, category.domain, str(count), str(2 * count))
+    out.print(table)
+
+
+@app.command()
+def validate(
+    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Also run the leakage gates: pixels, text and side alone.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Check every rule of the item format; exit code 1 if one is broken.
+
+    With --baselines, probes that see the pictures, the instruction or the side alone must be at chance.
+    """
+    from probe_kit.suite import default_suite, validate_suite
+
+    with err.status("checking"):
+        report = validate_suite(default_suite().folder if folder is None else folder, baselines=baselines)
+    if as_json:
+        print_json(report.to_json())
+    else:
+        out.print(report.to_text(), highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(0 if report.ok else 1)
+
+
+@app.command()
+def convert(
+    source: Annotated[str, typer.Argument(help="mllm-compbench, iconqa, mmbench, ok-vqa or vl-think.")],
+    root: Annotated[Path, typer.Option(help="Folder the benchmark was unpacked to.")],
+    out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
+    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the source.")] = None,
+    n: Annotated[int, typer.Option("--n", help="Most items per category.")] = 150,
+    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    curation: Annotated[Path | None, typer.Option(help="Reviewed file; only what it accepts is emitted.")] = None,
+    emit_curation: Annotated[Path | None, typer.Option(help="Write a file to review, with an HTML page.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option("--option", "-o", help="NAME=VALUE of the source, such as min_side=64.")
+    ] = None,
+) -> None:
+    """Turn a benchmark's files into a suite, counting every stage beside the paper's numbers."""
+    from probe_kit.suite.converters import convert as convert_source
+
+    with err.status(f"converting {source}"):
+        suite = convert_source(
+            source,
+            root,
+            out_folder,
+            categories=split(categories),
+            n=n,
+            seed=seed,
+            curation=curation,
+            emit_curation=emit_curation,
+            **_options(option or []),
+        )
+    counts = ", ".join(f"{c} {sum(i.category == c for i in suite.items)}" for c in suite.categories)
+    out.print(f"{suite.identity}: {counts} items in {out_folder}", highlight=False, soft_wrap=True)
+
+
+def _options(pairs: list[str]) -> dict[str, Any]:
+    """NAME=VALUE pairs; a value that is valid JSON is read as such, anything else is text."""
+    options = {}
+    for pair in pairs:
+        name, separator, value = pair.partition("=")
+        if not separator:
+            raise UsageError(f"--option {pair!r} has no value; write NAME=VALUE, such as min_side=64")
+        try:
+            options[name.replace("-", "_")] = json.loads(value)
+        except json.JSONDecodeError:
+            options[name.replace("-", "_")] = value
+    return options

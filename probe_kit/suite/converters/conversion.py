@@ -1,0 +1,290 @@
+"""`convert`: from a benchmark's folder to a suite, in five counted stages."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.identity import derive_seed
+from probe_kit.suite.card import new_suite
+from probe_kit.suite.categories import check_categories
+from probe_kit.suite.converters import compbench, iconqa, mmbench, okvqa, vlthink
+from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
+from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
+from probe_kit.suite.converters.emission import emit, sample
+from probe_kit.suite.converters.filters import Look, look_of, picture_problem, text_problem
+from probe_kit.suite.converters.llm import propose_wording
+from probe_kit.suite.converters.options import (
+    CompBenchOptions,
+    ConvertOptions,
+    IconQaOptions,
+    MmbenchOptions,
+    OkVqaOptions,
+    VlThinkOptions,
+    options_from,
+)
+from probe_kit.suite.converters.pairing import Bundle, Proposal, pair_candidates
+from probe_kit.suite.converters.rewriting import rewrite
+from probe_kit.suite.grouping import with_groups
+from probe_kit.suite.items import Item
+from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.suite import Suite
+from probe_kit.suite.wording import instruction_for
+
+VERSION = "1.0.0"
+# Table of tasks of the paper: what its authors found and what they kept. Concepts, where the source is boards.
+PAPER_POOL = {
+    "emotion": 5254,
+    "attribute": 5386,
+    "state": 1066,
+    "color": 11,
+    "shape": 12798,
+    "symmetry": 362,
+    "counting": 5001,
+    "time": 508,
+    "public-info": 14,
+    "traffic": 24,
+    "celebrity": 316,
+    "living-world": 2336,
+}
+PAPER_ITEMS = {slug: 70 if slug == "celebrity" else 150 for slug in PAPER_POOL}
+_POOL_TOLERANCE = 0.2
+_PICTURES_KEPT = 512
+
+
+@dataclass(frozen=True)
+class _Source:
+    name: str
+    categories: tuple[str, ...]
+    options: type[ConvertOptions]
+    read: Callable[[Path, Sequence[str], Any], Reading]
+    reuse: bool = False
+
+
+_ALL = (
+    _Source(compbench.SOURCE, compbench.CATEGORIES, CompBenchOptions, compbench.read),
+    _Source(iconqa.SOURCE, iconqa.CATEGORIES, IconQaOptions, iconqa.read),
+    _Source(mmbench.SOURCE, mmbench.CATEGORIES, MmbenchOptions, mmbench.read),
+    _Source(okvqa.SOURCE, okvqa.CATEGORIES, OkVqaOptions, okvqa.read),
+    _Source(vlthink.SOURCE, vlthink.CATEGORIES, VlThinkOptions, vlthink.read, reuse=True),
+)
+SOURCES: dict[str, _Source] = {source.name: source for source in _ALL}
+
+
+def convert(
+    source: str,
+    root: Path | str,
+    out: Path | str,
+    *,
+    categories: Sequence[str] | None = None,
+    n: int = 150,
+    seed: int = 0,
+    curation: Path | str | None = None,
+    emit_curation: Path | str | None = None,
+    **options: Any,
+) -> Suite:
+    """A suite made from the benchmark in `root`, written to `out` and read back.
+
+    n: most items per category. curation: a reviewed file; only what it accepts is emitted. emit_curation: where to
+    write a file to review. options: fields of the source's options, such as `min_side` (see `SOURCES`).
+    The same arguments give the same bytes. `stats.json` counts every stage beside the paper.
+    Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
+    should be; `out` is then left as it was.
+    """
+    if source not in SOURCES:
+        raise UsageError(f"unknown source {source!r}; available: {', '.join(SOURCES)}.")
+    if n < 1:
+        raise UsageError(f"n is {n}; expected at least 1 item per category.")
+    kind, root, out = SOURCES[source], Path(root), Path(out)
+    chosen = options_from(kind.options, options)
+    wanted = kind.categories if categories is None else check_categories(categories, kind.categories)
+    if not root.exists():
+        raise UsageError(f"{source}: {root} does not exist. Name the folder the benchmark was unpacked to.")
+    refuse_foreign_folder(out)
+    conversion = _Conversion(kind, chosen, kind.read(root, wanted, chosen), n, seed)
+    bundles = {category: conversion.propose(category) for category in wanted}
+    if emit_curation is not None:
+        write_curation(Path(emit_curation), _flat(bundles), conversion.load)
+    if curation is not None:
+        accepted = apply_curation(_flat(bundles), read_curation(Path(curation)), Path(curation))
+        bundles = {category: _reviewed(found, accepted) for category, found in bundles.items()}
+    else:
+        bundles = {category: conversion.without_review(found) for category, found in bundles.items()}
+    return conversion.save(bundles, out, Path(curation) if curation is not None else None)
+
+
+def _load(picture: SourcePicture) -> Image.Image:
+    return picture.load()
+
+
+@dataclass
+class _Conversion:
+    """One run: what was read, and how many candidates every stage left."""
+
+    kind: _Source
+    options: ConvertOptions
+    reading: Reading
+    n: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.stages: dict[str, Counter[str]] = {}
+        self.looks: dict[str, Look] = {}
+        self.load = lru_cache(maxsize=_PICTURES_KEPT)(_load)
+
+    def propose(self, category: str) -> list[Bundle]:
+        """Filter, rewrite and pair the candidates of one category."""
+        stage = self.stages[category] = Counter(pool=self.reading.pool[category])
+        candidates = sorted(
+            (c for c in self.reading.candidates if c.category == category), key=lambda c: (c.source_id, c.question)
+        )
+        stage["rule_selected"] = len(candidates)
+        candidates = [c for c in candidates if self._keep(self._picture_problem(c))]
+        stage["image_ok"] = len(candidates)
+        worded = [self._worded(candidate) for candidate in candidates]
+        usable = [candidate for candidate in worded if self._keep(self._text_problem(candidate))]
+        stage["text_ok"] = sum(candidate.wording is not None for candidate in usable)
+        stage["needs_edit"] = len(usable) - stage["text_ok"]
+        paired = [c for c in usable if c.wording is not None or c.distractor is not None]
+        bundles = pair_candidates(
+            paired, self.kind.reuse, self.options.paper_polarity, self._alike, self._random(category, "pairs")
+        )
+        stage["paired"] = sum(map(len, bundles))
+        return bundles
+
+    def _random(self, category: str, part: str) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64(derive_seed(self.seed, self.kind.name, category, part)))
+
+    def _keep(self, problem: str | None) -> bool:
+        if problem:
+            self.reading.reasons[problem] += 1
+        return problem is None
+
+    def _picture_problem(self, candidate: Candidate) -> str | None:
+        pictures = [picture for picture in (candidate.target, candidate.distractor) if picture]
+        for picture in pictures:
+            problem = picture_problem(self.load(picture), self.options, picture.least_side)
+            if problem:
+                return problem
+        return (
+            "target and distractor are the same picture" if len(pictures) == 2 and self._alike(*pictures) else None
+        )
+
+    def _alike(self, one: SourcePicture, other: SourcePicture) -> bool:
+        return self._look(one).same_as(self._look(other))
+
+    def _look(self, picture: SourcePicture) -> Look:
+        if picture.image_id not in self.looks:
+            self.looks[picture.image_id] = look_of(self.load(picture))
+        return self.looks[picture.image_id]
+
+    def _worded(self, candidate: Candidate) -> Candidate:
+        wording = candidate.wording or rewrite(candidate.question, candidate.answer)
+        return replace(candidate, wording=wording or propose_wording(candidate, self.options))
+
+    def _text_problem(self, candidate: Candidate) -> str | None:
+        """A question without a wording passes: a person may still write one."""
+        wording = candidate.wording
+        if wording is None:
+            self.reading.reasons["no rewriting rule matches (needs_edit)"] += 1
+            return None
+        if candidate.side_word:
+            return None if self.options.side_words else "instruction names a side"
+        for phrase in filter(None, (wording.phrase, wording.opposite)):
+            problem = text_problem(instruction_for(phrase, wording.article), phrase, self.options)
+            if problem:
+                return problem
+        return None
+
+    def without_review(self, bundles: list[Bundle]) -> list[Bundle]:
+        """What may be emitted although nobody looked: worded by a rule, or by a trusted model."""
+        return _reviewed(
+            bundles, {p.candidate_id: self._unreviewed(p) for b in bundles for p in b if self._passes(p)}
+        )
+
+    def _passes(self, proposal: Proposal) -> bool:
+        wording: Wording | None = proposal.wording
+        return wording is not None and not proposal.needs_person and (
+            wording.proposed_by is None or self.options.trust_llm
+        )  # fmt: skip
+
+    def _unreviewed(self, proposal: Proposal) -> Proposal:
+        by_model = proposal.wording is not None and proposal.wording.proposed_by is not None
+        return replace(proposal, curation_status="llm-trusted" if by_model else "rules-only")
+
+    def save(self, bundles: dict[str, list[Bundle]], out: Path, curation: Path | None) -> Suite:
+        """Sample, lay out and write; nothing is written if no item is left."""
+        items: list[Item] = []
+        pictures: dict[str, bytes] = {}
+        for category, accepted in bundles.items():
+            self.stages[category]["accepted"] = sum(map(len, accepted))
+            chosen = sample(accepted, self.n)
+            emitted = emit(self.kind.name, chosen, self.reading, self.load, self._random(category, "sides"))
+            self.stages[category]["emitted"] = len(emitted.items)
+            items += emitted.items
+            pictures |= emitted.pictures
+        if not items:
+            raise SuiteError(f"{self.kind.name}: no item left to write. {self._why_none()}")
+        grouped = with_groups(items)
+        extra = {
+            "annotation_files": {path.name: _file_sha256(path) for path in self.reading.files},
+            "curation_sha256": _file_sha256(curation) if curation else "none",
+            "source_url": self.reading.url,
+        }
+        settings = asdict(self.options) | {
+            "items_per_category": self.n,
+            "seed": self.seed,
+            "source": self.kind.name,
+        }
+        settings = {name: value for name, value in settings.items() if name not in _PLACES}
+        suite = new_suite(f"a2a-{self.kind.name}", VERSION, grouped, settings, extra)
+        return save_suite(suite, pictures, self._stats(), out)
+
+    def _stats(self) -> dict[str, Any]:
+        stats: dict[str, Any] = {
+            category: dict(stage) | {"paper_pool": PAPER_POOL[category], "paper_items": PAPER_ITEMS[category]}
+            for category, stage in self.stages.items()
+        }
+        return stats | {"reasons": dict(sorted(self.reading.reasons.items())), "notes": self._notes()}
+
+    def _notes(self) -> list[str]:
+        far = [
+            f"{category}: pool of {stage['pool']}, the paper has {PAPER_POOL[category]}; releases differ"
+            for category, stage in self.stages.items()
+            if abs(stage["pool"] - PAPER_POOL[category]) > _POOL_TOLERANCE * PAPER_POOL[category]
+        ]
+        return self.reading.notes + far
+
+    def _why_none(self) -> str:
+        counts = "; ".join(
+            f"{category}: {', '.join(f'{name} {count}' for name, count in stage.items())}"
+            for category, stage in self.stages.items()
+        )
+        reasons = ", ".join(f"{reason} {count}×" for reason, count in self.reading.reasons.most_common(5))
+        return (
+            f"{counts}. Reasons: {reasons or 'none recorded'}. {' '.join(self.reading.notes)} "
+            "Loosen a filter, or review the pairs with emit_curation and curation."
+        )
+
+
+_PLACES = ("image_root", "llm_base", "llm_cache", "instances")  # of this machine, not of the suite
+
+
+def _flat(bundles: dict[str, list[Bundle]]) -> list[Proposal]:
+    return [proposal for found in bundles.values() for bundle in found for proposal in bundle]
+
+
+def _reviewed(bundles: list[Bundle], accepted: dict[str, Proposal]) -> list[Bundle]:
+    kept = (tuple(accepted[p.candidate_id] for p in bundle if p.candidate_id in accepted) for bundle in bundles)
+    return [bundle for bundle in kept if bundle]
+
+
+def _file_sha256(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,194 @@
+"""The curation file: what a person accepts, rejects or rewords, as JSON lines or CSV, with a page to look at."""
+
+import csv
+import html
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from probe_kit.errors import SuiteError
+from probe_kit.suite.converters.candidates import SourcePicture, Wording
+from probe_kit.suite.converters.pairing import Proposal
+from probe_kit.suite.wording import instruction_for
+
+STATUSES = ("pending", "accept", "reject", "edited")
+COLUMNS = (
+    *("candidate_id", "category", "source_id", "left_preview", "right_preview", "question", "question_sha256"),
+    *("proposed_instruction", "rule_id", "status", "instruction", "object_phrase", "polarity", "recognisable"),
+    *("reason", "reviewer", "date", "llm"),
+)
+_PREVIEW_PIXELS = 160
+
+Row = Mapping[str, Any]
+Render = Callable[[SourcePicture], Image.Image]
+
+
+def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> Path:
+    """The file at `path`, previews in a folder beside it, and an HTML page, whose path is returned.
+
+    In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines.
+    """
+    previews = path.with_name(f"{path.stem}-previews")
+    previews.mkdir(parents=True, exist_ok=True)
+    rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
+    text = (
+        _to_csv(rows)
+        if path.suffix == ".csv"
+        else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
+    )
+    path.write_text(text, encoding="utf-8")
+    page = path.with_suffix(".html")
+    page.write_text(_page(rows), encoding="utf-8")
+    return page
+
+
+def read_curation(path: Path) -> list[dict[str, Any]]:
+    """The rows of a curation file. Raises SuiteError naming the line that cannot be used."""
+    if not path.is_file():
+        raise SuiteError(f"curation file {path} not found. Make one with emit_curation (--emit-curation).")
+    text = path.read_text(encoding="utf-8")
+    rows = _from_csv(text) if path.suffix == ".csv" else _from_lines(text, path)
+    for number, row in enumerate(rows, start=1):
+        missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
+        if missing:
+            raise SuiteError(
+                f"{path}: row {number} has no {missing[0]}; expected the columns {', '.join(COLUMNS)}."
+            )
+        if row["status"] not in STATUSES:
+            raise SuiteError(
+                f"{path}: row {number} ({row['candidate_id']}): status is {row['status']!r}; "
+                f"expected one of {', '.join(STATUSES)}."
+            )
+    return rows
+
+
+def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Path) -> dict[str, Proposal]:
+    """The accepted proposals by candidate id, reworded where a person did so.
+
+    Raises SuiteError for ids this conversion does not have, and for rows whose question has changed since.
+    """
+    by_id = {proposal.candidate_id: proposal for proposal in proposals}
+    unknown = [row["candidate_id"] for row in rows if row["candidate_id"] not in by_id]
+    if unknown:
+        raise SuiteError(
+            f"{path}: {len(unknown)} unknown ids, such as {', '.join(unknown[:5])}. "
+            "Use the root, categories, seed and options that the file was made with."
+        )
+    stale = [
+        row["candidate_id"] for row in rows if row["question_sha256"] != by_id[row["candidate_id"]].question_sha256
+    ]
+    if stale:
+        raise SuiteError(
+            f"{path}: {len(stale)} stale rows, such as {', '.join(stale[:5])}: their questions changed since. "
+            "Make a new file with emit_curation and review those again."
+        )
+    return {
+        row["candidate_id"]: _reviewed(by_id[row["candidate_id"]], row, path)
+        for row in rows
+        if row["status"] in ("accept", "edited") and str(row.get("recognisable") or "yes").lower() != "no"
+    }
+
+
+def _reviewed(proposal: Proposal, row: Row, path: Path) -> Proposal:
+    if row["status"] == "accept":
+        if proposal.wording is None:
+            raise SuiteError(
+                f"{path}: {row['candidate_id']} is accepted but has no instruction. Set its status to edited and "
+                "fill in instruction and object_phrase."
+            )
+        return replace(proposal, curation_status="accepted")
+    instruction, phrase = str(row.get("instruction") or ""), str(row.get("object_phrase") or "")
+    articles = [article for article in ("the", "none") if instruction == instruction_for(phrase, article)]
+    if not phrase or not articles:
+        raise SuiteError(
+            f"{path}: {row['candidate_id']}: instruction {instruction!r} and object_phrase {phrase!r} do not fit; "
+            f"expected {instruction_for(phrase or '<object_phrase>', 'the')!r}."
+        )
+    rule_id = proposal.wording.rule_id if proposal.wording else "R0"
+    wording = Wording(phrase, rule_id, article=articles[0])
+    return replace(proposal, wording=wording, curation_status="edited")
+
+
+def _row(proposal: Proposal, previews: tuple[str, str]) -> dict[str, Any]:
+    wording = proposal.wording
+    return {
+        "candidate_id": proposal.candidate_id,
+        "category": proposal.category,
+        "source_id": proposal.source_id,
+        "left_preview": previews[0],
+        "right_preview": previews[1],
+        "question": proposal.question,
+        "question_sha256": proposal.question_sha256,
+        "proposed_instruction": proposal.instruction,
+        "rule_id": wording.rule_id if wording else "R0",
+        "status": "pending",
+        "instruction": proposal.instruction,
+        "object_phrase": wording.phrase if wording else "",
+        "polarity": proposal.polarity,
+        "recognisable": "",
+        "reason": "",
+        "reviewer": "",
+        "date": "",
+        "llm": dict(wording.proposed_by or {}) if wording else {},
+    }
+
+
+def _previews(proposal: Proposal, folder: Path, render: Render) -> tuple[str, str]:
+    names = []
+    for role, picture in (("asked", proposal.target), ("other", proposal.distractor)):
+        name = f"{proposal.candidate_id}-{role}.png"
+        image = render(picture)
+        image.thumbnail((_PREVIEW_PIXELS, _PREVIEW_PIXELS))
+        image.save(folder / name)
+        names.append(f"{folder.name}/{name}")
+    return names[0], names[1]
+
+
+def _to_csv(rows: Sequence[Row]) -> str:
+    buffer = io.StringIO()
+    table = csv.DictWriter(buffer, COLUMNS, lineterminator="\n")
+    table.writeheader()
+    table.writerows({**row, "llm": json.dumps(row["llm"])} for row in rows)
+    return buffer.getvalue()
+
+
+def _from_csv(text: str) -> list[dict[str, Any]]:
+    return [dict(row) for row in csv.DictReader(io.StringIO(text))]
+
+
+def _from_lines(text: str, path: Path) -> list[dict[str, Any]]:
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            row = json.loads(line)
+        except ValueError as problem:
+            raise SuiteError(f"{path}:{number}: not valid JSON ({problem}). Restore the line.") from problem
+        if not isinstance(row, dict):
+            raise SuiteError(
+                f"{path}:{number}: a JSON {type(row).__name__}; expected an object. Restore the line."
+            )
+        rows.append(row)
+    return rows
+
+
+def _page(rows: Sequence[Row]) -> str:
+    cells = "\n".join(
+        f"<tr><td>{html.escape(row['candidate_id'])}</td>"
+        f'<td><img src="{html.escape(row["left_preview"])}" alt="asked for"></td>'
+        f'<td><img src="{html.escape(row["right_preview"])}" alt="other"></td>'
+        f"<td>{html.escape(row['question'])}</td>"
+        f"<td>{html.escape(row['proposed_instruction'] or 'needs a wording')}</td></tr>"
+        for row in rows
+    )
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Curation</title>'
+        "<style>body{font-family:sans-serif}td{padding:4px 12px;border-bottom:1px solid #ccc}</style>"
+        "<h1>Curation</h1><p>The picture asked for lies left. Edit status and instruction in the file itself.</p>"
+        f"<table><tr><th>id<th>asked for<th>other<th>question<th>instruction</tr>\n{cells}\n"
+        "</table></html>\n"
+    )

@@ -1,0 +1,69 @@
+"""Reading a source's tree: annotation files, and pictures that may lie in one of several places."""
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from probe_kit.errors import SuiteError
+from probe_kit.suite.pictures import WHITE, decode_picture
+
+MARGIN = 0.08  # of the longer side, around trimmed art
+_TRIM_STEP = 12  # levels that ink differs from white
+
+
+def read_json(path: Path, source: str, remedy: str) -> Any:
+    """The JSON value in a file. Raises SuiteError naming file and remedy."""
+    if not path.is_file():
+        raise SuiteError(f"{source}: {path} not found. {remedy}")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as problem:
+        raise SuiteError(f"{source}: {path} is not valid JSON ({problem}). {remedy}") from problem
+
+
+def first_existing(tried: Sequence[Path], source: str, record: str, remedy: str) -> Path:
+    """The first path that is a file. Raises SuiteError naming the record, what was tried, and the remedy."""
+    for path in tried:
+        if path.is_file():
+            return path
+    listed = ", ".join(str(path) for path in dict.fromkeys(tried))
+    raise SuiteError(f"{source}: image not found for {record}: tried {listed}; {remedy}")
+
+
+def field_of(record: Any, name: str, kind: type, source: str, where: str) -> Any:
+    """A field of a record. Raises SuiteError if it is missing or of another type."""
+    value = record.get(name) if isinstance(record, dict) else None
+    if not isinstance(value, kind):
+        raise SuiteError(
+            f"{source}: {where}: field {name!r} is {value!r}; expected a {kind.__name__}. "
+            "Check that this is the release the converter was made for (docs/suite.md)."
+        )
+    return value
+
+
+def photo(path: Path) -> partial[Image.Image]:
+    """Loads a photograph as it is."""
+    return partial(decode_picture, path)
+
+
+def trimmed_art(path: Path) -> Image.Image:
+    """Line art on white without its own margins, square, with one margin for all."""
+    return trimmed(decode_picture(path))
+
+
+def trimmed(image: Image.Image) -> Image.Image:
+    """The picture cut to its ink and padded to a white square with a margin of 8 %."""
+    ink = (255 - np.asarray(image.convert("RGB"), np.int64)).max(axis=2) > _TRIM_STEP
+    rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
+    if not len(rows):
+        return image
+    cut = image.crop((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1))
+    side = round(max(cut.size) / (1 - 2 * MARGIN))
+    square = Image.new("RGB", (side, side), WHITE)
+    square.paste(cut, ((side - cut.width) // 2, (side - cut.height) // 2))
+    return square

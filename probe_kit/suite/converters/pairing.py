@@ -1,0 +1,176 @@
+"""From candidates to proposals: which two pictures lie side by side, and which of them is asked for."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from probe_kit.identity import sha256_json
+from probe_kit.suite.converters.candidates import Candidate, SourcePicture, Wording
+from probe_kit.suite.wording import instruction_for
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One would-be item. `wording` is None if a person has to write it; `status` is how it stands in review."""
+
+    candidate_id: str
+    category: str
+    source_id: str
+    pair_key: str
+    question: str
+    question_sha256: str
+    target: SourcePicture
+    distractor: SourcePicture
+    wording: Wording | None
+    polarity: str
+    target_concept: str
+    distractor_concept: str
+    construction: str
+    needs_person: bool
+    side_word: bool
+    curation_status: str = "rules-only"
+
+    @property
+    def instruction(self) -> str:
+        """The imperative, empty without a wording."""
+        return instruction_for(self.wording.phrase, self.wording.article) if self.wording else ""
+
+
+Bundle = tuple[Proposal, ...]
+
+
+def pair_candidates(
+    candidates: Sequence[Candidate],
+    reuse: bool,
+    paper_polarity: bool,
+    alike: Callable[[SourcePicture, SourcePicture], bool],
+    rng: np.random.Generator,
+) -> list[Bundle]:
+    """Proposals in bundles that stay together, in random order.
+
+    Questions that bring both pictures keep them, and half of those with an opposite ask for it, so that the
+    pictures alone do not give the answer. Others are paired two by two and asked both ways.
+    reuse: every two of those, instead of every picture once. alike: whether two pictures are too much the same.
+    """
+    native = [candidate for candidate in candidates if candidate.distractor is not None]
+    single = [candidate for candidate in candidates if candidate.distractor is None]
+    bundles = list(_native(native, paper_polarity, rng))
+    couples = _every_couple(single, rng) if reuse else _disjoint_couples(single, rng)
+    bundles += [
+        (_ask(one, other), _ask(other, one)) for one, other in couples if not alike(one.target, other.target)
+    ]
+    return [bundles[int(index)] for index in rng.permutation(len(bundles))]
+
+
+def _native(candidates: Sequence[Candidate], paper_polarity: bool, rng: np.random.Generator) -> Iterator[Bundle]:
+    negate = rng.permutation(len(candidates)) % 2 == 1
+    for candidate, chosen in zip(candidates, negate, strict=True):
+        wording, opposite = candidate.wording, candidate.wording.opposite if candidate.wording else None
+        negative = bool(chosen) and opposite is not None and not paper_polarity
+        proposal = _native_proposal(candidate, wording)
+        yield (_opposite(proposal) if negative else proposal,)
+
+
+def _native_proposal(candidate: Candidate, wording: Wording | None) -> Proposal:
+    assert candidate.distractor is not None
+    phrase = wording.phrase if wording else candidate.question
+    opposite = wording.opposite if wording else None
+    return Proposal(
+        candidate_id=_candidate_id(candidate.category, candidate.source_id),
+        category=candidate.category,
+        source_id=candidate.source_id,
+        pair_key=candidate.source_id,
+        question=candidate.question,
+        question_sha256=candidate.question_sha256,
+        target=candidate.target,
+        distractor=candidate.distractor,
+        wording=wording,
+        polarity="pos" if opposite else "none",
+        target_concept=phrase,
+        distractor_concept=opposite or f"not {phrase}",
+        construction=candidate.construction,
+        needs_person=candidate.needs_person,
+        side_word=candidate.side_word,
+    )
+
+
+def _opposite(proposal: Proposal) -> Proposal:
+    """The same two pictures, asked for by the opposite."""
+    wording = proposal.wording
+    assert wording is not None
+    assert wording.opposite is not None
+    return replace(
+        proposal,
+        target=proposal.distractor,
+        distractor=proposal.target,
+        wording=replace(wording, phrase=wording.opposite, opposite=wording.phrase),
+        polarity="neg",
+        target_concept=proposal.distractor_concept,
+        distractor_concept=proposal.target_concept,
+    )
+
+
+def _ask(asked: Candidate, other: Candidate) -> Proposal:
+    """One of two candidates asked for, with the other's picture as the wrong one."""
+    ids = sorted((asked.source_id, other.source_id))
+    return Proposal(
+        candidate_id=_candidate_id(asked.category, asked.source_id, other.source_id),
+        category=asked.category,
+        source_id=f"{asked.source_id}|{other.source_id}",
+        pair_key="+".join(ids),
+        question=asked.question,
+        question_sha256=asked.question_sha256,
+        target=asked.target,
+        distractor=other.target,
+        wording=asked.wording,
+        polarity="none",
+        target_concept=asked.concept,
+        distractor_concept=other.concept,
+        construction="recolored"
+        if "recolored" in (asked.construction, other.construction)
+        else asked.construction,
+        needs_person=asked.needs_person or other.needs_person,
+        side_word=asked.side_word,
+    )
+
+
+def _candidate_id(category: str, *source_ids: str) -> str:
+    return f"{category}-{sha256_json(list(source_ids))[:12]}"
+
+
+def _may_meet(one: Candidate, other: Candidate) -> bool:
+    return (
+        one.concept != other.concept
+        and one.target.image_id != other.target.image_id
+        and not one.forbids & other.shows
+        and not other.forbids & one.shows
+    )
+
+
+def _every_couple(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[tuple[Candidate, Candidate]]:
+    couples = [(a, b) for a, b in combinations(candidates, 2) if _may_meet(a, b)]
+    return [couples[int(index)] for index in rng.permutation(len(couples))]
+
+
+def _disjoint_couples(
+    candidates: Sequence[Candidate], rng: np.random.Generator
+) -> list[tuple[Candidate, Candidate]]:
+    """Every picture in at most one couple, inside one family; within the family whoever is free and may meet."""
+    waiting: dict[str, list[Candidate]] = {}
+    used: set[str] = set()
+    couples = []
+    for index in rng.permutation(len(candidates)):
+        candidate = candidates[int(index)]
+        if candidate.target.image_id in used:
+            continue
+        used.add(candidate.target.image_id)
+        free = waiting.setdefault(candidate.family, [])
+        partner = next((other for other in free if _may_meet(candidate, other)), None)
+        if partner is None:
+            free.append(candidate)
+        else:
+            free.remove(partner)
+            couples.append((partner, candidate))
+    return couples

@@ -1,0 +1,236 @@
+"""From a benchmark's question to the phrase that names the right picture: an ordered table, first match wins."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from probe_kit.suite.converters.candidates import Wording
+
+# Opposites that were looked at one by one. Any other comparative is negated as "less" and its base.
+ANTONYMS = {
+    "longer": "shorter",
+    "taller": "shorter",
+    "higher": "lower",
+    "bigger": "smaller",
+    "larger": "smaller",
+    "wider": "narrower",
+    "thicker": "thinner",
+    "darker": "lighter",
+    "brighter": "darker",
+    "older": "younger",
+    "heavier": "lighter",
+    "newer": "older",
+    "fuller": "emptier",
+    "deeper": "shallower",
+    "wetter": "drier",
+    "cleaner": "dirtier",
+    "smoother": "rougher",
+    "harder": "softer",
+    "hotter": "colder",
+    "fewer": "more",
+    "straighter": "curvier",
+    "sharper": "blunter",
+    "denser": "sparser",
+    "rounder": "flatter",
+    "more": "less",
+    "dryer": "wetter",
+    "warmer": "cooler",
+    "stronger": "weaker",
+    "faster": "slower",
+    "closer": "farther",
+}
+ANTONYMS |= {value: key for key, value in ANTONYMS.items() if value not in ANTONYMS}
+# Stems that lost an e: one vowel and one consonant, which else would be doubled, or a cluster that needs it.
+_LOST_E = re.compile(r"((?<![aeiou])[aeiou][bcdfgklmnprstvz]|rg|rs|ns|rc|nc|[bpdtg]l|oos|v)$")
+_BASES = {"better": "good", "worse": "bad", "farther": "far", "further": "far", "freer": "free"}
+_NOT_COMPARATIVE = frozenset(
+    (
+        *(
+            "other",
+            "water",
+            "paper",
+            "flower",
+            "tiger",
+            "river",
+            "number",
+            "corner",
+            "finger",
+            "letter",
+            "together",
+        ),
+        *("computer", "summer", "winter", "weather", "center", "feather", "leather", "power", "tower", "shower"),
+        *(
+            "over",
+            "under",
+            "after",
+            "ever",
+            "never",
+            "her",
+            "silver",
+            "copper",
+            "butter",
+            "runner",
+            "player",
+            "together",
+        ),
+    )
+)
+_PREFIX = re.compile(
+    r"^(based on (these|the|the two|both) (images|pictures|photos)|looking at the (images|pictures)|"
+    r"(in|from) (these|the|the two) (images|pictures)|(of|between) the two (images|pictures)),?\s+",
+    re.IGNORECASE,
+)
+_TAIL = re.compile(r"\s+in (the|this|these|which|both) (image|picture|photo)s?$", re.IGNORECASE)
+_IDENTITY = re.compile(
+    r"who\b|what('s| is) the name|(what|which) (actor|actress|singer|player|person|celebrity)", re.IGNORECASE
+)
+_KIND = re.compile(
+    r"(what|which) (kind|type|species|breed|sort|variety) of|(what|which) (animal|bird|dog|cat|tree|flower|plant)",
+    re.IGNORECASE,
+)
+_ARTICLE = re.compile(r"^(the|a|an|one|some)\s+", re.IGNORECASE)
+_GENERIC = ("image", "picture", "photo", "one", "option")
+_MORE = r"(?:more|less|fewer)"
+_ER = r"(?:[a-z]+er|worse|more|less|fewer)"
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """`build` makes the phrase and its opposite from the match, or None if the match means something else."""
+
+    rule_id: str
+    pattern: re.Pattern[str]
+    build: Callable[[re.Match[str]], tuple[str, str | None] | None]
+
+
+def rewrite(question: str, answer: str = "", options_are_names: bool = False) -> Wording | None:
+    """The wording of the first rule that matches, None (rule R0) if a person has to write it.
+
+    answer: the right option's text, for questions whose options are words.
+    """
+    text = clean(question)
+    if options_are_names and _IDENTITY.match(text):
+        return Wording(answer.strip(), "R10", article="none")
+    if answer and _KIND.match(text) and len(answer.split()) <= 2:
+        return Wording(f"picture of {_bare(answer)}", "R11")
+    for rule in _TABLE:
+        match = rule.pattern.match(text)
+        built = rule.build(match) if match else None
+        if built:
+            phrase, opposite = built
+            return Wording(phrase, rule.rule_id, opposite)
+    return None
+
+
+def clean(question: str) -> str:
+    """The question without what every question has: prefixes, question mark, double spaces."""
+    text = re.sub(r"\s+", " ", question).strip().rstrip("?.! ").strip()
+    text = _TAIL.sub("", _PREFIX.sub("", text))
+    return text[:1].lower() + text[1:]
+
+
+def opposite_of(comparative: str, noun_follows: str = "") -> str:
+    """The other way round: "shorter" for "longer", "less dry" for "drier", "fewer" or "less" for "more"."""
+    word = comparative.lower()
+    if word == "more" and noun_follows:
+        return "fewer" if noun_follows.endswith("s") and not noun_follows.endswith("ss") else "less"
+    if word == "less":
+        return "more"
+    return ANTONYMS.get(word) or f"less {base_of(word)}"
+
+
+def base_of(comparative: str) -> str:
+    """ "happy" for "happier", "big" for "bigger", "large" for "larger"."""
+    if comparative in _BASES:
+        return _BASES[comparative]
+    stem = comparative.removesuffix("er")
+    if stem.endswith("i"):
+        return f"{stem[:-1]}y"
+    if len(stem) > 3 and stem[-1] == stem[-2] and stem[-1] not in "lsz":
+        return stem[:-1]
+    return f"{stem}e" if _LOST_E.search(stem) else stem
+
+
+def _bare(text: str) -> str:
+    return _ARTICLE.sub("", _TAIL.sub("", text.strip()))
+
+
+def _thing(text: str) -> str:
+    """The noun of a question; "picture" for a mere "image"."""
+    noun = _bare(text)
+    return "picture" if noun.lower() in _GENERIC or noun.startswith("of ") else noun
+
+
+def _is_comparative(word: str) -> bool:
+    return word in ("worse", "more", "less", "fewer") or (word.endswith("er") and word not in _NOT_COMPARATIVE)
+
+
+def _graded(match: re.Match[str]) -> tuple[str, str] | None:
+    """ "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
+    thing, degree, adjective = _thing(match["x"]), match["degree"], _bare(match["adj"])
+    return f"{degree} {adjective} {thing}", f"{opposite_of(degree)} {adjective} {thing}"
+
+
+def _comparative(match: re.Match[str]) -> tuple[str, str] | None:
+    """ "ADJ-er X" and its opposite (R2, R3, R6)."""
+    word = match["er"].lower()
+    if not _is_comparative(word) or word in ("more", "less", "fewer"):
+        return None
+    thing = _thing(match["x"])
+    return f"{word} {thing}", f"{opposite_of(word)} {thing}"
+
+
+def _doing(match: re.Match[str]) -> tuple[str, str]:
+    verb = match["verb"].removesuffix("s")
+    doing = f"{verb[:-1] if verb.endswith('e') else verb}ing"
+    thing = _thing(match["x"])
+    return f"more {doing} {thing}", f"less {doing} {thing}"
+
+
+def _having(match: re.Match[str]) -> tuple[str, str] | None:
+    """ "X with more Y" (R5, R7)."""
+    word = match["er"].lower()
+    if not _is_comparative(word):
+        return None
+    thing, owned = _thing(match["x"]), _bare(match["y"])
+    follows = owned if word == "more" and " " not in owned else owned.split()[-1] if word == "more" else ""
+    return f"{thing} with {word} {owned}", f"{thing} with {opposite_of(word, follows)} {owned}"
+
+
+def _with(match: re.Match[str]) -> tuple[str, str]:
+    owned = _TAIL.sub("", match["y"].strip())
+    return f"picture with {owned}", f"picture without {owned}"
+
+
+def _noun(match: re.Match[str]) -> tuple[str, None]:
+    return _TAIL.sub("", match["noun"].strip()), None
+
+
+def _clock(match: re.Match[str]) -> tuple[str, None]:
+    return f"clock showing {match['time'].strip()}", None
+
+
+def _rule(rule_id: str, pattern: str, build: Callable[[re.Match[str]], tuple[str, str | None] | None]) -> _Rule:
+    return _Rule(rule_id, re.compile(f"{pattern}$", re.IGNORECASE), build)
+
+
+_LOOKS = r"(?:looks|appears|seems|look|appear|seem)"
+_PICTURE = r"(?:image|picture|photo)"
+_IN_WHICH = rf"in which {_PICTURE} (?:is|are|does|do) the (?P<x>.+?) (?:{_LOOKS} )?"
+_GRADE = r"(?P<degree>more|less) (?P<adj>[\w -]+)"
+_OWNS_MORE = rf"(?:a |an |the )?(?P<er>{_ER}) (?P<y>.+)"
+_TABLE: tuple[_Rule, ...] = (
+    _rule("R9", r"(?:which|what) clock (?:shows|says|reads) (?:the time )?(?P<time>.+)", _clock),
+    _rule("R6", rf"{_IN_WHICH}{_GRADE}", _graded),
+    _rule("R6", rf"{_IN_WHICH}(?P<er>{_ER})", _comparative),
+    _rule("R4", r"which (?P<x>.+?) (?P<verb>smiles|laughs|frowns|shines|glows) more", _doing),
+    _rule("R1", rf"which (?P<x>.+?) (?:is|are) {_GRADE}", _graded),
+    _rule("R3", rf"which (?P<x>.+?) {_LOOKS} {_GRADE}", _graded),
+    _rule("R3", rf"which (?P<x>.+?) {_LOOKS} (?P<er>{_ER})", _comparative),
+    _rule("R2", rf"which (?P<x>.+?) (?:is|are) (?P<er>{_ER})", _comparative),
+    _rule("R7", rf"which (?P<x>{_PICTURE}) (?:has|have|contains|shows) {_OWNS_MORE}", _having),
+    _rule("R5", rf"which (?P<x>.+?) (?:has|have) {_OWNS_MORE}", _having),
+    _rule("R7", rf"which {_PICTURE} (?:has|have|contains) (?P<y>.+)", _with),
+    _rule("R7", r"which (?:shape|figure|letter|object|one) has (?P<y>(?:a |no )?lines? of symmetry)", _with),
+    _rule("R8", r"which (?:.+?) (?:shows|is) an? (?P<noun>.+)", _noun),
+)

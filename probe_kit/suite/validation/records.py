@@ -1,0 +1,75 @@
+"""E01 to E04: the lines of `metadata.jsonl` and the card, before they can become items."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields
+from typing import Any
+
+from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.items import Item
+from probe_kit.suite.validation.findings import Finding, error
+
+SCHEMA_MAJOR = "1"
+
+_ENUMS: dict[str, tuple[str, ...]] = {
+    "category": tuple(CATEGORIES),
+    "domain": tuple(dict.fromkeys(category.domain for category in CATEGORIES.values())),
+    "transfer_type": ("near", "moderate", "heavy", "procedural"),
+    "construction": ("native_pair", "choice_vs_distractor", "cross_item", "recolored", "procedural"),
+    "object_article": ("the", "none"),
+    "polarity": ("pos", "neg", "none"),
+    "correct_side": ("left", "right"),
+    "curation_status": ("rules-only", "accepted", "edited", "llm-trusted"),
+    "split": ("eval", "dev", "train"),
+}
+_TYPES: dict[str, type] = {"source": dict, "gen": dict, "redistributable": bool, "contains_real_face": bool}
+_CARD_TYPES: dict[str, type] = {"name": str, "version": str, "counts": dict, "content_sha256": str}
+_REQUIRED = [field.name for field in fields(Item) if field.default is MISSING]
+
+
+def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
+    """E01: the JSON object on one line, or why it is none."""
+    try:
+        record = json.loads(line)
+    except ValueError as problem:  # JSONDecodeError or UnicodeDecodeError
+        return error("E01", where, f"not valid JSON ({problem})")
+    if not isinstance(record, dict):
+        return error("E01", where, f"a JSON {type(record).__name__}; expected an object")
+    return record
+
+
+def check_card(card: dict[str, Any]) -> Iterator[Finding]:
+    """E02 for `suite.json`: it holds what identifies a suite."""
+    for name, expected in _CARD_TYPES.items():
+        if not isinstance(card.get(name), expected):
+            yield error(
+                "E02", "suite.json", f"field {name!r} is {card.get(name)!r}; expected a {expected.__name__}"
+            )
+
+
+def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
+    """E02: every field is there, has its type, and is one of the values it may have."""
+    for name in _REQUIRED:
+        expected = _TYPES.get(name, str)
+        if name not in record:
+            yield error("E02", where, f"field {name!r} is missing")
+        elif not isinstance(record[name], expected):
+            yield error("E02", where, f"field {name!r} is {record[name]!r}; expected a {expected.__name__}")
+        elif name in _ENUMS and record[name] not in _ENUMS[name]:
+            allowed = ", ".join(_ENUMS[name])
+            yield error("E02", where, f"field {name!r} is {record[name]!r}; expected one of {allowed}")
+
+
+def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:
+    """E03: the record follows a schema this tool can read."""
+    version = str(record.get("schema_version", "none"))
+    if version.split(".")[0] != SCHEMA_MAJOR:
+        yield error("E03", where, f"uses schema {version}; this tool reads {SCHEMA_MAJOR}.x")
+
+
+def unique_ids(lines_of: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
+    """E04: no id is that of two items; `lines_of` holds the line numbers of each."""
+    for item_id, lines in lines_of.items():
+        if len(lines) > 1:
+            listed = ", ".join(map(str, lines[:-1]))
+            yield error("E04", f"item {item_id}", f"the id appears in lines {listed} and {lines[-1]}")

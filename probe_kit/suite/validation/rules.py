@@ -1,0 +1,184 @@
+"""E05 to E15: what every item and the suite as a whole must keep.
+
+Every rule has the same shape, a Suite in and findings out. Those in `LOADING_RULES` run each time a suite is
+opened; they are fast, because pictures are hashed but not decoded. `DECODING_RULES` run in `validate_suite`.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import PurePosixPath
+
+from probe_kit.errors import SuiteError
+from probe_kit.suite.grouping import ties
+from probe_kit.suite.items import Item, Side
+from probe_kit.suite.pictures import decode_picture, picture_size, pixels_sha256
+from probe_kit.suite.suite import Suite, count_by_category
+from probe_kit.suite.validation.findings import Finding, error
+from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, side_words
+
+SMALLEST_PICTURE = 64
+SIGN_CATEGORIES = ("traffic", "public-info")  # a sign may be named after a side
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+def pictures_unchanged(suite: Suite) -> Iterator[Finding]:
+    """E05 to E07: every picture is a file inside the suite, has the recorded bytes, and is large enough."""
+    users: dict[tuple[str, str], tuple[Item, Side]] = {}
+    for item in suite.items:
+        for side in SIDES:
+            users.setdefault((item.file_name(side), item.file_sha256(side)), (item, side))
+    for item, side in users.values():
+        yield from _check_file(item, side)
+
+
+def _check_file(item: Item, side: Side) -> Iterator[Finding]:
+    where, name, path = f"item {item.item_id}", item.file_name(side), item.picture(side)
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        yield error("E05", where, f"the path {name!r} leaves the suite folder")
+    elif not path.is_file():
+        yield error("E05", where, f"picture {name!r} not found")
+    else:
+        encoded = path.read_bytes()
+        yield from _check_bytes(encoded, item, side)
+        yield from _check_size(encoded, item, side)
+
+
+def _check_bytes(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
+    expected, found = item.file_sha256(side), hashlib.sha256(encoded).hexdigest()
+    if found != expected:
+        message = f"{side} picture changed on disk (expected {expected[:12]}, found {found[:12]})"
+        yield error("E06", f"item {item.item_id}", message)
+
+
+def _check_size(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
+    size = picture_size(encoded)
+    if size is None:
+        yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded")
+    elif min(size) < SMALLEST_PICTURE:
+        message = f"{side} picture is {size[0]}×{size[1]}; needs at least {SMALLEST_PICTURE}"
+        yield error("E07", f"item {item.item_id}", message)
+
+
+def sides_differ(suite: Suite) -> Iterator[Finding]:
+    """E08: the two pictures of an item are different ones."""
+    for item in suite.items:
+        if item.left_pixels_sha256 == item.right_pixels_sha256:
+            yield error("E08", f"item {item.item_id}", "both sides are the same picture")
+
+
+def instruction_names_object(suite: Suite) -> Iterator[Finding]:
+    """E09: one short line without a full stop that contains the object phrase."""
+    for item in suite.items:
+        words = len(item.instruction.split())
+        problems = {
+            f"the instruction does not contain the object phrase {item.object_phrase!r}": (
+                not item.object_phrase or item.object_phrase not in item.instruction
+            ),
+            "the instruction ends with a period": item.instruction.endswith("."),
+            "the instruction has more than one line": len(item.instruction.splitlines()) != 1,
+            f"the instruction has {words} words (limit {MOST_WORDS})": words > MOST_WORDS,
+            f"the instruction has {len(item.instruction)} characters (limit {MOST_CHARACTERS})": (
+                len(item.instruction) > MOST_CHARACTERS
+            ),
+        }
+        for message, present in problems.items():
+            if present:
+                yield error("E09", f"item {item.item_id}", message)
+
+
+def no_side_words(suite: Suite) -> Iterator[Finding]:
+    """E10: no side is named, except by signs that are marked with `side_word` (W07 lists them)."""
+    for item in suite.items:
+        outside = item.instruction.replace(item.object_phrase, " ")
+        exempt = item.side_word and item.category in SIGN_CATEGORIES
+        named = side_words(outside) or (() if exempt else side_words(item.object_phrase))
+        if named:
+            yield error("E10", f"item {item.item_id}", f"the instruction names a side ({named[0]!r})")
+
+
+def concepts_differ(suite: Suite) -> Iterator[Finding]:
+    """E11: the wrong picture does not show what is asked for."""
+    for item in suite.items:
+        if item.target_concept == item.distractor_concept:
+            message = f"target and distractor concept are both {item.target_concept!r}"
+            yield error("E11", f"item {item.item_id}", message)
+
+
+def groups_closed(suite: Suite) -> Iterator[Finding]:
+    """E12: items that share a picture or are twins are in the same group."""
+    first_with: dict[str, Item] = {}
+    for item in suite.items:
+        for tie in ties(item):
+            first = first_with.setdefault(tie, item)
+            if first.group_id != item.group_id:
+                message = f"share {tie} but have groups {first.group_id}, {item.group_id}"
+                yield error("E12", f"items {first.item_id} and {item.item_id}", message)
+
+
+def card_agrees(suite: Suite) -> Iterator[Finding]:
+    """E13: the counts and the content hash of the items are those of `suite.json`."""
+    said = suite.card["counts"], suite.card["content_sha256"]
+    found = count_by_category(suite.items), suite.content_sha256
+    for what, expected, given in zip(("count per category", "content hash"), said, found, strict=True):
+        if expected != given:
+            yield error("E13", "suite.json", f"{what} differs: it says {expected}, items give {given}")
+
+
+def license_present(suite: Suite) -> Iterator[Finding]:
+    """E14: every item has a licence, and a licence that forbids passing pictures on is marked so."""
+    for item in suite.items:
+        if not item.license.strip():
+            yield error("E14", f"item {item.item_id}", "licence missing")
+        elif item.redistributable and item.license.startswith("LicenseRef-"):
+            message = f"marked redistributable, but {item.license!r} is no licence known to allow that"
+            yield error("E14", f"item {item.item_id}", message)
+
+
+def real_faces_declared(suite: Suite) -> Iterator[Finding]:
+    """E15: the card says whether there are pictures of real people."""
+    declared = bool(suite.card.get("contains_real_faces", False))
+    with_face = [item.item_id for item in suite.items if item.contains_real_face]
+    if with_face and not declared:
+        yield error("E15", f"item {with_face[0]}", "contains_real_face is true but suite.json says there are none")
+    if declared and not with_face:
+        yield error("E15", "suite.json", "contains_real_faces is true but no item has a real face")
+
+
+LOADING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
+    pictures_unchanged,
+    sides_differ,
+    instruction_names_object,
+    no_side_words,
+    concepts_differ,
+    groups_closed,
+    card_agrees,
+    license_present,
+    real_faces_declared,
+)
+
+
+def pixels_as_recorded(suite: Suite) -> Iterator[Finding]:
+    """E07: every picture decodes, and E06: to the recorded pixels."""
+    seen: set[tuple[str, str]] = set()
+    for item in suite.items:
+        recorded = {"left": item.left_pixels_sha256, "right": item.right_pixels_sha256}
+        for side in SIDES:
+            name = item.file_name(side)
+            if (name, recorded[side]) in seen or not item.picture(side).is_file():
+                continue
+            seen.add((name, recorded[side]))
+            yield from _check_pixels(item, side, recorded[side])
+
+
+def _check_pixels(item: Item, side: Side, expected: str) -> Iterator[Finding]:
+    try:
+        found = pixels_sha256(decode_picture(item.picture(side)))
+    except SuiteError as problem:
+        yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded ({problem})")
+        return
+    if found != expected:
+        message = f"{side} picture has other pixels (expected {expected[:12]}, found {found[:12]})"
+        yield error("E06", f"item {item.item_id}", message)
+
+
+DECODING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (pixels_as_recorded,)

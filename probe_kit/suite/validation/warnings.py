@@ -1,0 +1,144 @@
+"""W01 to W04, W06 and W07: true things about a suite that one should know before trusting its numbers."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.items import Item
+from probe_kit.suite.pictures import difference_hash, load_picture
+from probe_kit.suite.suite import Suite, count_by_category
+from probe_kit.suite.validation.findings import Finding, warning
+from probe_kit.suite.validation.rules import SIDES
+
+LEAST_ROLE_BALANCE = 0.4
+FEWEST_ITEMS = 30
+NEAR_DUPLICATE_BITS = 4
+SCREEN_PIXELS = 40  # a tile's side on a 224 px frame, see docs/suite.md
+
+_FEWEST_USES = 5  # below, no balance can be told
+_INK_STEP = 32  # levels that a pixel differs from the border of its picture
+_LEAST_EXTENT = 0.2  # of the tile, along the longer side of the ink's box
+_LEAST_INK = 0.02
+_LEAST_SPREAD = 8.0  # standard deviation of the grey levels
+
+
+def sides_balanced(suite: Suite) -> Iterator[Finding]:
+    """W01: per category, as many answers lie left as right in the original layout."""
+    for category, sides in side_counts(suite.items).items():
+        if abs(sides["left"] - sides["right"]) > 1:
+            yield warning("W01", CATEGORIES[category].title, f"{sides['left']} left / {sides['right']} right")
+
+
+def side_counts(items: Sequence[Item]) -> dict[str, Counter[str]]:
+    """Per category, how often the answer lies on each side of the original layout."""
+    counts: dict[str, Counter[str]] = {category: Counter() for category in count_by_category(items)}
+    for item in items:
+        counts[item.category][item.correct_side] += 1
+    return counts
+
+
+def roles_balanced(suite: Suite) -> Iterator[Finding]:
+    """W02: every concept that occurs a few times is target about as often as distractor."""
+    for (category, concept), (target, distractor) in role_counts(suite.items).items():
+        uses = target + distractor
+        if uses >= _FEWEST_USES and min(target, distractor) / uses < LEAST_ROLE_BALANCE:
+            message = f"concept {concept!r} is target {target}×, distractor {distractor}×"
+            yield warning("W02", CATEGORIES[category].title, message)
+
+
+def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]:
+    """Per category and concept, how often it is the target and how often the distractor."""
+    targets = Counter((item.category, item.target_concept) for item in items)
+    distractors = Counter((item.category, item.distractor_concept) for item in items)
+    return {key: (targets[key], distractors[key]) for key in sorted(targets | distractors)}
+
+
+def pictures_distinct(suite: Suite) -> Iterator[Finding]:
+    """W03: no two pictures of different groups look nearly the same.
+
+    Procedural items are left out: two drawings of one sign or one clock always look alike.
+    """
+    pictures: dict[Path, Item] = {}
+    for item in suite.items:
+        if item.construction != "procedural":
+            for side in SIDES:
+                if item.picture(side).is_file():
+                    pictures.setdefault(item.picture(side), item)
+    items = list(pictures.values())
+    hashes = np.array([difference_hash(load_picture(path)) for path in pictures], np.uint64)
+    for one, other in _close_pairs(hashes):
+        if items[one].group_id != items[other].group_id:
+            names = f"items {items[one].item_id} and {items[other].item_id}"
+            yield warning("W03", names, "show nearly the same picture but are in different groups")
+
+
+def _close_pairs(hashes: npt.NDArray[np.uint64]) -> Iterator[tuple[int, int]]:
+    for one in range(len(hashes)):
+        distances = np.bitwise_count(hashes[one + 1 :] ^ hashes[one])
+        for other in np.flatnonzero(distances <= NEAR_DUPLICATE_BITS):
+            yield one, one + 1 + int(other)
+
+
+def enough_items(suite: Suite) -> Iterator[Finding]:
+    """W04: at least 30 items per category, and as many as were asked for."""
+    requested = suite.card.get("options", {}).get("items_per_category")
+    for category, count in count_by_category(suite.items).items():
+        if requested is not None and count != requested:
+            yield warning("W04", CATEGORIES[category].title, f"{count} of {requested} requested")
+        elif count < FEWEST_ITEMS:
+            yield warning("W04", CATEGORIES[category].title, f"{count} items; fewer than {FEWEST_ITEMS}")
+
+
+def legible(suite: Suite) -> Iterator[Finding]:
+    """W06: at the size a tile has on the screen, something large enough stands out from the picture's border."""
+    seen = set()
+    for item in suite.items:
+        for side in SIDES:
+            path = item.picture(side)
+            if path not in seen and path.is_file():
+                seen.add(path)
+                problem = _illegible(load_picture(path))
+                if problem:
+                    yield warning("W06", f"item {item.item_id}", f"{side} picture {problem}")
+
+
+def _illegible(image: Image.Image) -> str | None:
+    small = image.resize((SCREEN_PIXELS, SCREEN_PIXELS), Image.Resampling.LANCZOS)
+    pixels = np.asarray(small, np.float64)
+    if pixels.mean(axis=2).std() < _LEAST_SPREAD and pixels.std(axis=(0, 1)).max() < _LEAST_SPREAD:
+        return "has little contrast"
+    border = np.median(np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]]), axis=0)
+    rows, columns = np.nonzero(np.abs(pixels - border).max(axis=2) > _INK_STEP)
+    if len(rows) < _LEAST_INK * SCREEN_PIXELS**2:
+        return "shows almost nothing"
+    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    if extent < _LEAST_EXTENT * SCREEN_PIXELS:
+        return f"shows something only {extent} px large at {SCREEN_PIXELS} px"
+    return None
+
+
+def side_word_signs(suite: Suite) -> Iterator[Finding]:
+    """W07: signs with a side word in their name, which E10 lets pass."""
+    marked = sorted((item for item in suite.items if item.side_word), key=attrgetter("category", "object_phrase"))
+    for (category, phrase), items in groupby(marked, key=attrgetter("category", "object_phrase")):
+        message = (
+            f"{phrase!r} names a side in {len(list(items))} items; a model asked for left or right may stumble"
+        )
+        yield warning("W07", CATEGORIES[category].title, message)
+
+
+WARNING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
+    sides_balanced,
+    roles_balanced,
+    pictures_distinct,
+    enough_items,
+    legible,
+    side_word_signs,
+)

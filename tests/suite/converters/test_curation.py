@@ -1,0 +1,124 @@
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import SuiteError
+from probe_kit.suite import Suite
+from probe_kit.suite.converters import convert
+
+Rows = list[dict[str, Any]]
+
+
+@pytest.fixture
+def review(compbench_root: Path, tmp_path: Path) -> Callable[[Callable[[Rows], None]], Suite]:
+    """Emits a curation file for all pairs, lets `change` edit its rows, and converts with it."""
+
+    def run(change: Callable[[Rows], None]) -> Suite:
+        path = tmp_path / "review.jsonl"
+        convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        change(rows)
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        return convert("mllm-compbench", compbench_root, tmp_path / "reviewed", curation=path)
+
+    return run
+
+
+def accept_first(rows: Rows) -> None:
+    rows[0]["status"] = "accept"
+
+
+def test_only_what_a_person_accepted_is_emitted(review: Callable[[Callable[[Rows], None]], Suite]) -> None:
+    suite = review(accept_first)
+    assert [item.curation_status for item in suite.items] == ["accepted"]
+    assert suite.card["curation"] == ["accepted"]
+    assert len(suite.card["curation_sha256"]) == 64
+
+
+def test_an_edited_wording_replaces_the_proposed_one(review: Callable[[Callable[[Rows], None]], Suite]) -> None:
+    def reword(rows: Rows) -> None:
+        (row,) = [row for row in rows if row["rule_id"] == "R0"]
+        row |= {"status": "edited", "object_phrase": "red sky", "instruction": "Put the cube on the red sky"}
+
+    (item,) = review(reword).items
+    assert (item.object_phrase, item.curation_status, item.rule_id) == ("red sky", "edited", "R0")
+
+
+def test_rejected_and_unrecognisable_ones_are_left_out(review: Callable[[Callable[[Rows], None]], Suite]) -> None:
+    def judge(rows: Rows) -> None:
+        accept_first(rows)
+        rows[1]["status"] = "reject"
+        rows[2] |= {"status": "accept", "recognisable": "no"}
+
+    assert len(review(judge).items) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"candidate_id": "emotion-unknown", "status": "accept"}, "1 unknown ids, such as emotion-unknown"),
+        ({"question_sha256": "0" * 64, "status": "accept"}, "1 stale rows, such as"),
+        ({"status": "yes"}, "row 1 .*status is 'yes'; expected one of pending"),
+        ({"status": ""}, "row 1 has no status"),
+        ({"status": "edited", "instruction": "Take the cube"}, "do not fit; expected 'Put the cube on the"),
+    ],
+)
+def test_a_row_that_cannot_be_applied_is_named(
+    review: Callable[[Callable[[Rows], None]], Suite], change: dict[str, str], message: str
+) -> None:
+    with pytest.raises(SuiteError, match=message):
+        review(lambda rows: rows[0].update(change))
+
+
+def test_accepting_a_question_without_wording_is_refused(
+    review: Callable[[Callable[[Rows], None]], Suite],
+) -> None:
+    def accept_unworded(rows: Rows) -> None:
+        (row,) = [row for row in rows if row["rule_id"] == "R0"]
+        row["status"] = "accept"
+
+    with pytest.raises(SuiteError, match="is accepted but has no instruction"):
+        review(accept_unworded)
+
+
+def test_the_page_shows_every_pair(compbench_root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "review.jsonl"
+    convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
+    page = (tmp_path / "review.html").read_text()
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    for row in rows:
+        assert row["left_preview"] in page
+        assert (tmp_path / row["left_preview"]).is_file()
+    assert "needs a wording" in page
+
+
+def test_a_spreadsheet_does_as_well(compbench_root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "review.csv"
+    convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    rows[0]["status"] = "accept"
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0].keys())
+        table.writeheader()
+        table.writerows(rows)
+    assert len(convert("mllm-compbench", compbench_root, tmp_path / "reviewed", curation=path).items) == 1
+
+
+def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "review.jsonl"
+    with pytest.raises(SuiteError, match="no item left to write"):
+        convert("ok-vqa", okvqa_root, tmp_path / "suite", emit_curation=path)
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps(row | {"status": "accept"}) + "\n" for row in rows))
+    suite = convert("ok-vqa", okvqa_root, tmp_path / "suite", curation=path)
+    assert len(suite.items) == len(rows) == 6
+
+
+def test_a_missing_curation_file_is_named(compbench_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(SuiteError, match=r"curation file .*no\.jsonl not found"):
+        convert("mllm-compbench", compbench_root, tmp_path / "suite", curation=tmp_path / "no.jsonl")
