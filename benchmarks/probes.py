@@ -1,9 +1,10 @@
 """Nested probes with a permutation null: probe_kit against loops over scikit-learn, one thread each.
 
-    python benchmarks/probes.py [--permutations 200] [--sizes 300,1000]
+    python benchmarks/probes.py [--permutations 200] [--sizes 300,1000] [--tokens 8,32] [--device cuda]
 
 Features imitate a pooled VLM stream: 2,048 wide, a steep spectrum, a few features a thousand times larger, two
 layouts per item. scikit-learn fits a stated subset of the sweep's problems; its time is scaled to all of them.
+With --device, torch solves the same problems there.
 """
 
 import argparse
@@ -52,13 +53,12 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def probe_kit_seconds(n_episodes: int, permutations: int) -> float:
-    """One site, everything included: folds, C grid, relabellings."""
-    labels, items = labels_of(n_episodes)
+def probe_kit_seconds(samples: Samples, permutations: int, device: str | None = None) -> float:
+    """One site, everything included: folds, C grid, relabellings, and the way to the device."""
+    labels, items = labels_of(len(samples.counts))
     relabellings = flip_items(labels, items, permutations, seed=0)
     folds = nested_folds(labels, items, seed=0)
-    values = features(n_episodes)
-    return seconds(lambda: probe_site(Samples.pooled(values), labels, relabellings, folds))
+    return seconds(lambda: probe_site(samples.to(device), labels, relabellings, folds))
 
 
 def scikit_learn_seconds(samples: Matrix, columns: NDArray[np.bool_], tolerance: float) -> float:
@@ -72,8 +72,8 @@ def scikit_learn_seconds(samples: Matrix, columns: NDArray[np.bool_], tolerance:
     return seconds(fit_all) / (STRENGTHS.size * columns.shape[1])
 
 
-def compare(n_episodes: int, permutations: int) -> Table:
-    """Seconds per site of probe_kit and of three ways to use scikit-learn."""
+def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
+    """Seconds per site of probe_kit, by numpy and by torch, and of three ways to use scikit-learn."""
     labels, items = labels_of(n_episodes)
     fold = nested_folds(labels, items, seed=0)[0].inner[0]
     coordinates = Coordinates.fit(features(n_episodes)[fold.train])
@@ -81,10 +81,17 @@ def compare(n_episodes: int, permutations: int) -> Table:
     columns = flip_items(labels, items, SUBSET, seed=0)[fold.train]
     problems = OUTER_FOLDS * (INNER_FOLDS * STRENGTHS.size + 1) * (permutations + 1)
 
-    ours = probe_kit_seconds(n_episodes, permutations)
+    samples_of_site = Samples.pooled(features(n_episodes))
+    ours = probe_kit_seconds(samples_of_site, permutations)
     table = Table("", "ms per problem", "s per site", "times slower")
     table.title = f"N = {n_episodes}, D = {WIDTH}, {permutations} relabellings: {problems:,} problems per site"
     table.add_row("probe_kit", f"{1e3 * ours / problems:.3f}", f"{ours:.1f}", "1")
+    if device is not None:
+        probe_kit_seconds(samples_of_site, 0, device)  # the first use of a device is slow
+        there = probe_kit_seconds(samples_of_site, permutations, device)
+        table.add_row(
+            f"probe_kit, {device}", f"{1e3 * there / problems:.3f}", f"{there:.1f}", f"{there / ours:.2f}"
+        )
     for name, samples, tolerance in (
         ("scikit-learn, tol 1e-10", raw, 1e-10),
         ("scikit-learn, default tol", raw, 1e-4),
@@ -97,27 +104,46 @@ def compare(n_episodes: int, permutations: int) -> Table:
     return table
 
 
-def costs(sizes: list[int]) -> Table:
+def costs(cases: dict[str, Samples], device: str | None) -> Table:
     """What one more site and one more relabelling cost."""
-    table = Table("N", "s per site without relabellings", "ms per relabelling and site", title="probe_kit")
-    for n_episodes in sizes:
-        fixed, more = probe_kit_seconds(n_episodes, 0), probe_kit_seconds(n_episodes, 20)
-        table.add_row(f"{n_episodes:,}", f"{fixed:.2f}", f"{1e3 * (more - fixed) / 20:.1f}")
+    table = Table("", "s per site without relabellings", "ms per relabelling and site")
+    table.title = f"probe_kit, {device or 'numpy'}"
+    for name, samples in cases.items():
+        fixed, more = (probe_kit_seconds(samples, permutations, device) for permutations in (0, 20))
+        table.add_row(name, f"{fixed:.2f}", f"{1e3 * (more - fixed) / 20:.1f}")
     return table
 
 
+def pooled_cases(sizes: list[int]) -> dict[str, Samples]:
+    """One sample per episode."""
+    return {f"N = {size:,}, D = {WIDTH}": Samples.pooled(features(size)) for size in sizes}
+
+
+def token_cases(lengths: list[int]) -> dict[str, Samples]:
+    """60 episodes of that many tokens, 256 wide."""
+    cases = {}
+    for length in lengths:
+        tokens = features(60 * length)[:, :256].reshape(60, length, 256)
+        cases[f"N = 60 × {length} tokens, D = 256"] = Samples.tokens(tokens, np.ones((60, length), bool))
+    return cases
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--permutations", type=int, default=200)
     parser.add_argument("--sizes", default="300,1000,3440", help="episodes, for the table of costs")
+    parser.add_argument("--tokens", default="8,32", help="tokens per episode, for the table of costs")
+    parser.add_argument("--device", help="where torch solves the problems too")
     arguments = parser.parse_args()
+    sizes, lengths = ([int(part) for part in text.split(",")] for text in (arguments.sizes, arguments.tokens))
     console = Console(width=120)
     with threadpool_limits(1), warnings.catch_warnings():
         # lbfgs stops before 1e-10 when the line search meets rounding: as precise as it gets, and timed as such.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        console.print(compare(300, arguments.permutations))
-        console.print(costs([int(size) for size in arguments.sizes.split(",")]))
+        console.print(compare(300, arguments.permutations, arguments.device))
+        for device in dict.fromkeys([None, arguments.device]):
+            console.print(costs(pooled_cases(sizes) | token_cases(lengths), device))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from probe_kit.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.extract.commands import extract, run_app
+from probe_kit.extract.commands import export, extract, run_app
 from probe_kit.suite.commands import app as suite_app
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ app = typer.Typer(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 app.command()(extract)
+app.command()(export)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The README's picture, from a finished demo: `python scripts/make_readme_picture.py DEMO_FOLDER docs/demo.png`."""
+"""The README's picture: `python scripts/make_readme_picture.py DEMO_FOLDER docs/demo.png`."""
 
 import sys
 from pathlib import Path

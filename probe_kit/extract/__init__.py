@@ -1,26 +1,42 @@
 """Runs: plan them, extract them, read them. Reading needs neither a simulator nor a model."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.extract.export import export_run
     from probe_kit.extract.extraction import Extraction, extract_run, prepare
     from probe_kit.extract.run import Run, open_run
+    from probe_kit.extract.sealing import seal
     from probe_kit.extract.settings import ExtractSettings
+    from probe_kit.extract.verify import Verification, verify_run
 
-__all__ = ["ExtractSettings", "Extraction", "Run", "extract_run", "open_run", "prepare"]
+__all__ = [
+    "ExtractSettings",
+    "Extraction",
+    "Run",
+    "Verification",
+    "export_run",
+    "extract_run",
+    "open_run",
+    "prepare",
+    "seal",
+    "verify_run",
+]
 
-_LAZY = {
-    "ExtractSettings": "settings",
-    "Extraction": "extraction",
-    "extract_run": "extraction",
-    "prepare": "extraction",
-    "Run": "run",
-    "open_run": "run",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"probe_kit.extract.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "ExtractSettings": "settings",
+        "Extraction": "extraction",
+        "export_run": "export",
+        "extract_run": "extraction",
+        "prepare": "extraction",
+        "Run": "run",
+        "open_run": "run",
+        "seal": "sealing",
+        "Verification": "verify",
+        "verify_run": "verify",
+    },
+)

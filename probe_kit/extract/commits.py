@@ -13,7 +13,11 @@ from zarr.core.buffer import Buffer
 from zarr.storage import WrapperStore
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.layout import COMMITS, DATA
+from probe_kit.extract.layout import COMMITS, DATA, FAILED
+from probe_kit.identity import canonical_json, sha256_json
+
+Commit = dict[str, Any]
+CHECKSUM = "crc32c"
 
 
 class RecordingStore(WrapperStore[Store]):
@@ -35,7 +39,12 @@ class RecordingStore(WrapperStore[Store]):
 
     def _record(self, key: str, value: Buffer) -> None:
         content = value.to_bytes()
-        self.objects[key] = (len(content), f"{google_crc32c.value(content):08x}")
+        self.objects[key] = (len(content), crc32c(content))
+
+
+def crc32c(content: bytes) -> str:
+    """The checksum commits carry, as eight hex digits."""
+    return f"{google_crc32c.value(content):08x}"
 
 
 def create_once(path: Path, content: Mapping[str, Any]) -> bool:
@@ -44,11 +53,11 @@ def create_once(path: Path, content: Mapping[str, Any]) -> bool:
     Exclusive and atomic: written aside, flushed to the disk, then linked to its name.
     """
     handle, aside = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    with os.fdopen(handle, "w") as file:
-        json.dump(content, file, sort_keys=True, indent=1, allow_nan=False)
-        file.flush()
-        os.fsync(file.fileno())
     try:
+        with os.fdopen(handle, "w") as file:
+            json.dump(content, file, sort_keys=True, indent=1, allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
         os.link(aside, path)
     except FileExistsError:
         return False
@@ -57,30 +66,61 @@ def create_once(path: Path, content: Mapping[str, Any]) -> bool:
     return True
 
 
-def commit_path(run: Path, index: int) -> Path:
-    """Where the commit of episode `index` lies."""
-    return run / COMMITS / f"{index:08d}.json"
+def write_commit(run: Path, number: int, commit: Commit) -> bool:
+    """Make episode `number` count; False if another writer was first."""
+    return create_once(commit_path(run, number), {**commit, CHECKSUM: commit_checksum(commit)})
 
 
-def read_commits(run: Path) -> dict[int, dict[str, Any]]:
-    """All commits by episode index, each checked against the sizes of the objects it names.
+def commit_path(run: Path, number: int) -> Path:
+    """Where the commit of episode `number` lies."""
+    return run / COMMITS / f"{number:08d}.json"
+
+
+def commit_checksum(commit: Commit) -> str:
+    """crc32c over everything else a commit says."""
+    return crc32c(canonical_json({key: value for key, value in commit.items() if key != CHECKSUM}).encode())
+
+
+def read_commits(run: Path) -> dict[int, Commit]:
+    """All commits by episode number, each checked against the sizes of the objects it names.
 
     Raises RunDamagedError naming the first object that is missing or has another size.
     """
     commits = {}
     for path in sorted((run / COMMITS).glob("*.json")):
         commit = json.loads(path.read_text())
-        for key, (length, _crc) in commit["objects"].items():
-            _check_size(run / DATA / key, length, commit["episode_id"])
+        for key, (length, _) in commit["objects"].items():
+            problem = wrong_size(run, key, length)
+            if problem:
+                raise RunDamagedError(
+                    f"{run / DATA / key} of episode {commit['episode_id']} {problem}. Delete "
+                    f"{COMMITS}/{path.name} and run the same `probe-kit extract` again to redo the episode"
+                )
         commits[int(path.stem)] = commit
     return commits
 
 
-def _check_size(path: Path, length: int, episode_id: str) -> None:
-    found = path.stat().st_size if path.is_file() else None
-    if found != length:
-        seen = "is missing" if found is None else f"has {found} bytes"
-        raise RunDamagedError(
-            f"{path} of episode {episode_id} {seen}; its commit says {length} bytes. Delete that commit and run "
-            "the same `probe-kit extract` again to redo the episode"
-        )
+def stamp_of(commits: Mapping[int, Commit]) -> str:
+    """Hash of all commits: what derived files say they were made from."""
+    return sha256_json([[number, commits[number]] for number in sorted(commits)])
+
+
+def wrong_size(run: Path, key: str, length: int) -> str | None:
+    """What is wrong with the size of a committed object, or None."""
+    path = run / DATA / key
+    if not path.is_file():
+        return "is missing"
+    found = path.stat().st_size
+    return None if found == length else f"has {found} bytes; its commit says {length} bytes"
+
+
+def write_failure(run: Path, number: int, episode_id: str, reason: str) -> None:
+    """Record why an episode was given up."""
+    (run / FAILED).mkdir(exist_ok=True)
+    create_once(run / FAILED / f"{number:08d}.json", {"episode_id": episode_id, "reason": reason})
+
+
+def read_failures(run: Path) -> dict[str, str]:
+    """Reason by episode id of every episode that was given up."""
+    records = [json.loads(path.read_text()) for path in sorted((run / FAILED).glob("*.json"))]
+    return {record["episode_id"]: record["reason"] for record in records}

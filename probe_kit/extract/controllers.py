@@ -1,4 +1,4 @@
-"""Who drives an episode: a captured policy, or the scripted expert that knows the answer."""
+"""Who decides: a captured policy, or the scripted expert that knows the answer."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -10,75 +10,70 @@ from numpy.typing import NDArray
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract.layout import StoredStream
 from probe_kit.identity import derive_seed
-from probe_kit.suite import Episode
 
 if TYPE_CHECKING:
-    from probe_kit.env import Act2AnswerEnv
-    from probe_kit.hooks import Observation, Policy, Roles, Tape
+    from torch import Tensor
+
+    from probe_kit.extract.staging import EpisodeBuffers
+    from probe_kit.hooks import Observation, Policy, Roles, Site, Tape
 
 SCRIPTED = {
     "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
     "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
 }
-
-
 # Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
 SMALL = 10_000_000
 
 
 @dataclass(frozen=True)
-class StreamCapture:
-    """One stream at one inference of one episode.
+class Turn:
+    """One inference that is due.
 
-    pooled: (*lead, V, D) float32. tokens: (*lead, T, D) uint16 bits of bfloat16, padding zero, or None.
+    seed: of the episode; every inference derives its own. call: how many inferences came before.
+    buffers: where the activations of the first calls go.
     """
 
-    pooled: NDArray[np.float32]
-    tokens: NDArray[np.uint16] | None
-    roles: "Roles"
-
-
-Capture = dict[str, StreamCapture]
+    image: NDArray[np.uint8]
+    state: NDArray[np.float32]
+    instruction: str
+    seed: int
+    call: int
+    buffers: "EpisodeBuffers"
 
 
 class Controller(Protocol):
-    """Drives episodes one after the other; `threads` is what its network wants, None for torch's choice."""
+    """Decides what happens on every stage.
+
+    script: for `Stage`, None if this controller acts itself.
+    threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
+    """
 
     identity: dict[str, Any]
     streams: list[StoredStream]
-    captured: list[Capture]
+    script: str | None
     threads: int | None
+    on_gpu: bool
 
-    def begin(self, env: "Act2AnswerEnv", episode: Episode, seed: int) -> None:
-        """Forget the last episode; `env` has been reset to the new one."""
-
-    def next_actions(self) -> NDArray[np.float32]:
-        """The next (n, 7) float32 actions to execute, n >= 1."""
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
 
     def certificate(self) -> dict[str, Any]:
         """What was checked so far, for the run's certificate."""
 
 
 class ScriptedController:
-    """The scripted expert; it looks at nothing and leaves no activations."""
+    """The scripted expert plays on the stage itself, looks at nothing and leaves no activations."""
 
     def __init__(self, name: str) -> None:
-        self.mirrored = name == "expert-mirrored"
         self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
         self.streams: list[StoredStream] = []
+        self.script: str | None = name
         self.threads: int | None = None
-        self.captured: list[Capture] = []
+        self.on_gpu = False
 
-    def begin(self, env: "Act2AnswerEnv", episode: Episode, seed: int) -> None:  # noqa: ARG002
-        """Plan the way-points of this episode."""
-        from probe_kit.env import ScriptedExpert
-
-        self._expert = ScriptedExpert(env, mirrored=self.mirrored)
-        self._expert.reset()
-
-    def next_actions(self) -> NDArray[np.float32]:
-        """One action towards the next way-point."""
-        return self._expert.act()[None]
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Never asked: a scripted stage plays to the end by itself."""
+        raise NotImplementedError(f"a scripted stage asked for {len(turns)} actions")
 
     def certificate(self) -> dict[str, Any]:
         """Nothing was loaded."""
@@ -86,7 +81,7 @@ class ScriptedController:
 
 
 class PolicyController:
-    """Looks, infers, executes the head of the chunk, and captures the first inferences of every episode."""
+    """Infers, executes the head of the chunk, and captures the first inferences of every episode."""
 
     def __init__(
         self, policy: "Policy", name: str, instructions: Sequence[str], execute: int | None, captured_calls: int,
@@ -97,7 +92,9 @@ class PolicyController:
         self.captured_calls, self.with_tokens = captured_calls, with_tokens
         self.streams = _stored_streams(policy, instructions)
         card = policy.card
+        self.script: str | None = None
         self.threads = 1 if card.parameters < SMALL else None
+        self.on_gpu = card.device.startswith("cuda")
         self.identity: dict[str, Any] = {
             "model": name,
             "random_weights": card.random_weights,
@@ -105,74 +102,83 @@ class PolicyController:
             "dtype": card.dtype,
             "execute": self.execute,
         }
-        self.captured: list[Capture] = []
         self._fires: dict[str, int] = {}
 
-    def begin(self, env: "Act2AnswerEnv", episode: Episode, seed: int) -> None:
-        """Start counting inferences anew."""
-        self._env, self._instruction, self._seed = env, episode.item.instruction, seed
-        self._calls, self.captured = 0, []
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """The first `execute` actions of a fresh chunk per turn, from one call of the policy."""
+        from probe_kit.hooks import Observation
 
-    def next_actions(self) -> NDArray[np.float32]:
-        """The first `execute` actions of a fresh chunk."""
-        observation = self._look()
-        seed = derive_seed(self._seed, "inference", self._calls)
-        if self._calls < self.captured_calls:
-            chunk = self._act_and_capture(observation, seed)
+        observations = [Observation(turn.image, turn.state, turn.instruction) for turn in turns]
+        seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
+        captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
+        if captured:
+            chunks = self._act_and_capture(observations, seeds, captured)
         else:
-            chunk = self.policy.act([observation], [seed])
-        self._calls += 1
-        return chunk[0, : self.execute]
+            chunks = self.policy.act(observations, seeds)
+        return [chunk[: self.execute] for chunk in chunks]
 
     def certificate(self) -> dict[str, Any]:
-        """The policy's card, fire counts of the last capture, and the check of `_act_and_capture`."""
+        """The policy's card, fire counts of the last capture, and the check of `_prove_harmless`."""
         return {
             "policy": asdict(self.policy.card),
             "fires_per_inference": self._fires,
             "hooks_on_equals_hooks_off": True,
         }
 
-    def _look(self) -> "Observation":
-        from probe_kit.hooks import Observation
-
-        seen = self._env.observe()
-        return Observation(seen["pixels"]["image"], seen["agent_pos"], self._instruction)
-
-    def _act_and_capture(self, observation: "Observation", seed: int) -> NDArray[np.float32]:
+    def _act_and_capture(
+        self, observations: "Sequence[Observation]", seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
+    ) -> NDArray[np.float32]:
         from probe_kit.hooks import capture
 
-        with capture(self.policy, self.policy.sites()) as tape:
-            chunk = self.policy.act([observation], [seed])
-        if not self._fires:
-            self._prove_harmless(observation, seed, chunk)
-        self._fires = tape.fires
-        roles = self.policy.roles([observation])
-        self.captured.append({s.name: self._pack(tape, s, roles[s.name][0]) for s in self.streams})
-        return chunk
+        roles = self.policy.roles(observations)
+        views = {stream.name: stream.views for stream in self.streams}
 
-    def _prove_harmless(self, observation: "Observation", seed: int, chunk: NDArray[np.float32]) -> None:
+        def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
+            return _pool_rows(activation, roles[site.stream], views[site.stream])
+
+        with capture(self.policy, self.policy.sites(), None if self.with_tokens else pool_rows) as tape:
+            chunks = self.policy.act(observations, seeds)
+        if not self._fires:
+            self._prove_harmless(observations, seeds, chunks)
+        self._fires = tape.fires
+        for row, buffers in captured.items():
+            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, buffers)
+        return chunks
+
+    def _prove_harmless(
+        self, observations: "Sequence[Observation]", seeds: Sequence[int], chunks: NDArray[np.float32]
+    ) -> None:
         """Once per process: the same inference without hooks gives the same actions, bit for bit."""
-        plain = self.policy.act([observation], [seed])
-        if not np.array_equal(plain, chunk):
+        plain = self.policy.act(observations, seeds)
+        if not np.array_equal(plain, chunks):
             raise CaptureChangedActionError(
-                f"capturing changed the actions by up to {np.abs(plain - chunk).max():.3g}; they must be equal "
+                f"capturing changed the actions by up to {np.abs(plain - chunks).max():.3g}; they must be equal "
                 "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
             )
 
-    def _pack(self, tape: "Tape", stored: StoredStream, roles: "Roles") -> StreamCapture:
+    def _keep(self, tape: "Tape", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers") -> None:
+        """Hand one episode's share of a capture to its buffers."""
         import torch
 
-        from probe_kit.hooks import pool
+        buffers.keep_roles(roles)
+        for stored in self.streams:
+            own = roles[stored.name]
+            kept = torch.stack([tape[site][row] for site in stored.stream.sites()])
+            if self.with_tokens:
+                valid = torch.from_numpy(own.valid).to(kept.device)
+                bits = (kept * valid[:, None]).to(torch.bfloat16).view(torch.int16)
+                buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
+                kept = torch.stack([_pool_rows(site[None], [own], stored.views)[0] for site in kept])
+            buffers.keep_pooled(stored.name, kept)
 
-        layers = torch.stack([tape[site][0] for site in stored.stream.sites()])
-        layers = layers.reshape(*stored.lead, *layers.shape[1:])
-        pooled = pool(layers, roles, stored.views).cpu().numpy()
-        tokens = None
-        if self.with_tokens:
-            valid = torch.from_numpy(roles.valid).to(layers.device)
-            bits = (layers * valid[:, None]).to(torch.bfloat16).view(torch.int16)
-            tokens = bits.cpu().numpy().view(np.uint16)
-        return StreamCapture(pooled, tokens, roles)
+
+def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":
+    """(B, V, D) float32 from (B, T, D), on its device."""
+    import torch
+
+    from probe_kit.hooks import pool
+
+    return torch.stack([pool(tokens, own, views) for tokens, own in zip(activation, roles, strict=True)])
 
 
 def _stored_streams(policy: "Policy", instructions: Sequence[str]) -> list[StoredStream]:

@@ -1,44 +1,49 @@
-"""The loop: plan, load, roll out every remaining episode, commit each."""
+"""Extraction: plan, load, let the workers play every remaining episode, seal."""
 
-import platform
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from importlib.metadata import version
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
+from probe_kit.errors import EpisodesFailedError
+from probe_kit.extract.commits import write_failure
 from probe_kit.extract.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
-from probe_kit.extract.layout import RUN_FILE, VIDEOS
-from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan, refuse_if_full
-from probe_kit.extract.rollout import Rollout, roll_out
+from probe_kit.extract.disk import full_disk_in_words, refuse_if_full
+from probe_kit.extract.layout import RUN_FILE
+from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.run import Run, open_run
+from probe_kit.extract.scheduler import Done, Event, Scheduler
+from probe_kit.extract.sealing import seal
 from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.transports import run_here, run_in_processes, run_on_ray
+from probe_kit.extract.worker import Worker
 from probe_kit.extract.writer import RunWriter
 from probe_kit.identity import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
 Progress = Callable[[int, int, str], None]
-_PACKAGES = ("probe-kit", "torch", "lerobot", "transformers", "pybullet", "zarr", "numcodecs", "numpy")
-_FILM_SIZE = (320, 240)
+# If this many episodes were given up and none succeeded, something is wrong with all of them.
+HOPELESS = 3
 
 
 @dataclass(frozen=True)
 class Extraction:
-    """A prepared extraction: the model is loaded and the plan is made, nothing is written."""
+    """A prepared extraction: the model was loaded and the plan is made, nothing is written.
+
+    controller: None if the model is loaded again by workers elsewhere.
+    """
 
     settings: ExtractSettings
     plan: Plan
-    controller: Controller
+    card: dict[str, Any]
+    controller: Controller | None
 
     def identity(self) -> dict[str, Any]:
         """Everything that names the stored numbers; two runs with equal identity are interchangeable."""
         suite = self.plan.suite
         return {
             **self.settings.choices(),
-            **self.controller.identity,
+            **self.card,
             "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
             "categories": list(suite.categories),
             "items": len(suite.items),
@@ -50,37 +55,54 @@ class Extraction:
         return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
 
     def run(self, out: Path, force: bool = False, progress: Progress | None = None) -> Run:
-        """Roll out and commit every episode that is not committed yet, then open the run.
+        """Play and commit every episode that is not committed yet, seal the run and open it.
 
         progress: called with (episodes done, episodes planned, outcome of the last one).
-        Raises SettingsMismatchError or DiskSpaceError before anything is written, and whatever an episode
-        raises; committed episodes stay, and the same call continues behind them.
+        Raises SettingsMismatchError or DiskSpaceError before anything is written, EpisodesFailedError at the end
+        if episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay, and
+        the same call continues behind them.
         """
         if not force and not (out / RUN_FILE).is_file():
             refuse_if_full(self.plan, out)
         writer = RunWriter(out, self.plan, self.identity())
-        remaining = writer.remaining()
-        if remaining:
-            self._roll_out_all(writer, remaining, progress)
+        with writer.owned(), full_disk_in_words(out):
+            remaining = writer.remaining()
+            if remaining:
+                self._play(writer, remaining, progress)
+            seal(out)
         return open_run(out)
 
-    def _roll_out_all(self, writer: RunWriter, remaining: list[PlannedEpisode], progress: Progress | None) -> None:
-        from probe_kit.env import Act2AnswerEnv
-
+    def _play(self, writer: RunWriter, remaining: list[int], progress: Progress | None) -> None:
+        scheduler = Scheduler(remaining)
         total = len(self.plan.episodes)
-        env = Act2AnswerEnv(self.settings.scene)
-        with closing(env), _torch_threads(self.controller.threads):
-            for done, planned in enumerate(remaining, start=total - len(remaining) + 1):
-                film = self.settings.video == "all" or (self.settings.video == "first" and planned.index == 0)
-                rollout = roll_out(
-                    env, self.controller, planned.episode, planned.scene_seed, planned.policy_seed, film
-                )
-                writer.write_certificate({**self.controller.certificate(), **_versions()})
-                writer.write(planned, rollout)
-                if film:
-                    _save_film(writer.path / VIDEOS, planned, rollout)
-                if progress:
-                    progress(done, total, rollout.outcome["outcome"])
+
+        def heard(event: Event) -> None:
+            if progress and isinstance(event, Done):
+                progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
+            if event.number in scheduler.given_up:
+                episode = self.plan.episodes[event.number].episode
+                write_failure(writer.path, event.number, episode.episode_id, scheduler.given_up[event.number])
+            if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
+                raise self._failure(scheduler)
+
+        if self.settings.ray:
+            run_on_ray(self.settings, writer.path, scheduler, heard)
+        elif self.settings.workers:
+            run_in_processes(self.settings, writer.path, scheduler, heard)
+        else:
+            run_here(self, writer, scheduler, heard)
+        if scheduler.given_up:
+            seal(writer.path)
+            raise self._failure(scheduler)
+
+    def _failure(self, scheduler: Scheduler) -> EpisodesFailedError:
+        error = EpisodesFailedError(
+            f"{len(scheduler.given_up)} episodes failed twice and were given up; {len(scheduler.done)} others "
+            "were finished and are kept. The same command tries them again; --partial reads the run without them"
+        )
+        for number, reason in scheduler.given_up.items():
+            error.add_note(f"{self.plan.episodes[number].episode.episode_id}: {reason}")
+        return error
 
 
 def prepare(settings: ExtractSettings) -> Extraction:
@@ -88,13 +110,29 @@ def prepare(settings: ExtractSettings) -> Extraction:
 
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
+    if settings.workers or settings.ray:
+        # This process only plans; the GPUs belong to the workers.
+        planned = _load(replace(settings, device="cpu"))
+        return replace(planned, settings=settings, controller=None)
+    return _load(settings)
+
+
+def load_worker(settings: ExtractSettings, run: Path) -> Worker:
+    """A worker for a run that exists, with a model of its own. Raises SettingsMismatchError if they differ."""
+    extraction = _load(settings)
+    assert extraction.controller is not None
+    writer = RunWriter(run, extraction.plan, extraction.identity())
+    return Worker(writer, settings, extraction.controller, len(writer.remaining()))
+
+
+def _load(settings: ExtractSettings) -> Extraction:
     if settings.model not in SCRIPTED:
         _find_family(settings.model)
     suite = _suite(settings)
     controller = _controller(settings, suite)
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.captured_calls, with_tokens)
-    return Extraction(settings, plan, controller)
+    return Extraction(settings, plan, controller.identity, controller)
 
 
 def extract_run(settings: ExtractSettings, out: Path, progress: Progress | None = None) -> Run:
@@ -127,33 +165,3 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
     return PolicyController(
         policy, settings.model, instructions, settings.execute, settings.captured_calls, settings.tokens == "all"
     )
-
-
-@contextmanager
-def _torch_threads(count: int | None) -> Iterator[None]:
-    if count is None:
-        yield
-        return
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _versions() -> dict[str, Any]:
-    return {
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "versions": {package: version(package) for package in _PACKAGES},
-    }
-
-
-def _save_film(folder: Path, planned: PlannedEpisode, rollout: Rollout) -> None:
-    folder.mkdir(exist_ok=True)
-    frames = [Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS) for frame in rollout.frames]
-    name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
-    frames[0].save(folder / name, save_all=True, append_images=frames[1:], duration=200, loop=0)

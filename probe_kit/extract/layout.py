@@ -4,8 +4,10 @@
       run.json           settings and the sha256 of their canonical form
       plan.json          the episodes in order
       commits/<n>.json   one per finished episode, written last
+      failed/<n>.json    why an episode was given up; removed when it is tried again
       certificate.json   what was really loaded, and what was checked
       data.zarr/         <stream>/pooled and, with --tokens all, <stream>/tokens
+      columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
       probes/            results of `probe-kit train`
       videos/            GIFs, if asked for
 
@@ -28,7 +30,7 @@ from probe_kit.hooks.sites import Site, Stream
 SCHEMA_VERSION = 1
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
-COMMITS, DATA, VIDEOS = "commits", "data.zarr", "videos"
+COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 CODECS = ("zstd", "fast", "none")
 
 
@@ -109,7 +111,7 @@ def create_arrays(
             chunks=(1, steps, *pooled),
             dtype="float32",
             fill_value=np.nan,
-            compressors=_codec(codec, typesize=4),
+            compressors=codecs(codec, typesize=4),
             dimension_names=("episode", "step", *stream.dimensions, "view", "feature"),
             attributes={"views": list(stream.views)},
             config={"write_empty_chunks": True},
@@ -123,14 +125,14 @@ def create_arrays(
                 chunks=(1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width),
                 dtype="uint16",
                 fill_value=0,
-                compressors=_codec(codec, typesize=2),
+                compressors=codecs(codec, typesize=2),
                 dimension_names=("episode", "step", *stream.dimensions, "token", "feature"),
                 attributes={"probe_kit:dtype": "bfloat16", "tokens": stream.tokens},
                 config={"write_empty_chunks": True},
             )
 
 
-def _codec(name: str, typesize: int) -> list[BytesBytesCodec]:
+def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
     """blosc with its block size set (its own choice at level 1 loses most of the gain), then a checksum."""
     if name == "none":
         return [Crc32cCodec()]
@@ -145,9 +147,9 @@ def _codec(name: str, typesize: int) -> list[BytesBytesCodec]:
     return [blosc, Crc32cCodec()]
 
 
-def open_array(path: Path, name: str) -> "zarr.Array[Any]":
+def open_array(group: Path, name: str) -> "zarr.Array[Any]":
     """Open one array for reading; a missing chunk is an error, never a fill value."""
-    return zarr.open_array(path / DATA / name, mode="r", config={"read_missing_chunks": False})
+    return zarr.open_array(group / name, mode="r", config={"read_missing_chunks": False})
 
 
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -1,17 +1,11 @@
 """The plan: which episodes in which order, and what they will cost, before anything is written."""
 
-import shutil
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from probe_kit.errors import DiskSpaceError
 from probe_kit.extract.layout import StoredStream
 from probe_kit.identity import derive_seed
 from probe_kit.suite import Episode, Suite
-
-# The estimate is of uncompressed bytes; this much more covers commits and file-system blocks.
-HEADROOM = 1.1
 
 
 @dataclass(frozen=True)
@@ -74,14 +68,3 @@ def make_plan(suite: Suite, streams: list[StoredStream], seed: int, calls: int, 
     )
     per_call = sum(stream.raw_bytes(with_tokens) for stream in streams)
     return Plan(suite, episodes, tuple(streams), per_call * calls * len(episodes))
-
-
-def refuse_if_full(plan: Plan, out: Path) -> None:
-    """Raise DiskSpaceError if the plan with headroom exceeds the free space where `out` will lie."""
-    place = next(parent for parent in (out, *out.resolve().parents) if parent.exists())
-    free = shutil.disk_usage(place).free
-    if plan.bytes * HEADROOM > free:
-        raise DiskSpaceError(
-            f"the run needs up to {plan.bytes * HEADROOM / 1e9:.1f} GB but {place} has {free / 1e9:.1f} GB free. "
-            "Use fewer --items, --tokens pooled, another --out, or --force"
-        )

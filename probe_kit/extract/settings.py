@@ -10,6 +10,9 @@ from probe_kit.extract.layout import CODECS
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
+# Named by what they lead to (a weights hash, a list of episodes), not by themselves.
+_ELSEWHERE = {"checkpoint", "suite", "categories", "items", "scene"}
+_MACHINE = {"device", "video", "batch", "env_workers", "workers", "ray"}
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,12 @@ class ExtractSettings:
     tokens: `pooled` stores pooled views only, `all` also every token.
     captured_calls: policy inferences captured per episode, from the first on.
     execute: actions executed per inference; None for the policy's own.
+
+    The rest changes no stored number, only how fast it comes:
+    batch: observations per call of the policy. With 1, bytes repeat exactly; with more, up to float rounding.
+    env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
+    workers: processes with a model each, one per GPU where there are several; 0 for this process.
+    ray: address of a Ray cluster, or `auto`; the workers then run there.
     """
 
     model: str
@@ -40,20 +49,24 @@ class ExtractSettings:
     device: str = "cpu"
     dtype: str | None = None
     video: str = "none"
+    batch: int = 1
+    env_workers: int | None = None
+    workers: int = 0
+    ray: str | None = None
 
     def __post_init__(self) -> None:
         for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS)):
             if getattr(self, name) not in allowed:
                 raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
-        for name in ("captured_calls", "execute", "items"):
+        least = {"captured_calls": 1, "execute": 1, "items": 1, "batch": 1, "workers": 0, "env_workers": 0}
+        for name, bound in least.items():
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise UsageError(f"{name} is {value}; expected at least 1")
+            if value is not None and value < bound:
+                raise UsageError(f"{name} is {value}; expected at least {bound}")
 
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""
-        machine = {"checkpoint", "suite", "device", "video", "categories", "items", "scene"}
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in machine}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
 
 
 def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: Path) -> None:

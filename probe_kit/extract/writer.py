@@ -1,35 +1,46 @@
 """Writing a run: created once, then one committed episode at a time."""
 
+import fcntl
 import json
 import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import zarr
+from zarr.core.array_spec import ArrayConfigLike
 from zarr.storage import LocalStore
 
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract.commits import RecordingStore, commit_path, create_once, read_commits
-from probe_kit.extract.controllers import Capture
+from probe_kit.extract.commits import RecordingStore, create_once, read_commits, write_commit
 from probe_kit.extract.layout import (
     CERTIFICATE_FILE,
     COMMITS,
     DATA,
+    FAILED,
     PLAN_FILE,
     RUN_FILE,
     SCHEMA_VERSION,
-    StoredStream,
     create_arrays,
 )
-from probe_kit.extract.plan import Plan, PlannedEpisode
-from probe_kit.extract.rollout import Rollout
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.settings import refuse_other_settings
 from probe_kit.identity import canonical_json, sha256_json
 
+if TYPE_CHECKING:
+    from probe_kit.extract.rollout import Rollout
+
+# Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
+# a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
+_WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
+# What a killed process leaves: commits, objects and columns that never got their final name.
+_ORPHANS = ("*.tmp", f"{COMMITS}/*.tmp", f"{DATA}/**/*.partial")
+
 
 class RunWriter:
-    """Creates a run folder or continues the one that is there.
+    """Creates a run folder or continues the one that is there; any number of processes may do so at once.
 
     Raises SettingsMismatchError if the folder holds a run with other settings, or anything else.
     """
@@ -37,21 +48,33 @@ class RunWriter:
     def __init__(self, path: Path, plan: Plan, settings: dict[str, Any]) -> None:
         self.path, self.plan = path, plan
         self.settings = json.loads(canonical_json(settings))
-        if (path / RUN_FILE).is_file():
-            self._continue()
-        else:
+        if not (path / RUN_FILE).is_file():
             self._create()
+        self._refuse_other_settings()
 
     def _create(self) -> None:
-        """Everything aside `run.json` first: a folder without it is no run and is never read as one."""
-        if self.path.exists() and not _is_leftover(self.path):
-            raise SettingsMismatchError(f"{self.path} exists and is not a run; choose another --out")
-        if self.path.exists():
-            shutil.rmtree(self.path)
-        (self.path / COMMITS).mkdir(parents=True)
-        create_once(self.path / PLAN_FILE, {"episodes": [e.to_json() for e in self.plan.episodes]})
+        """The folder appears whole or not at all: it is made aside and renamed, and the first one stays."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}.", suffix=".tmp"))
+        aside.chmod(0o755)
+        try:
+            self._fill(aside)
+            aside.rename(self.path)
+        except OSError as error:
+            if not (self.path / RUN_FILE).is_file():
+                if not self.path.exists():
+                    raise
+                raise SettingsMismatchError(
+                    f"{self.path} exists and is not a run; choose another --out"
+                ) from error
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def _fill(self, folder: Path) -> None:
+        (folder / COMMITS).mkdir()
+        create_once(folder / PLAN_FILE, {"episodes": [e.to_json() for e in self.plan.episodes]})
         create_arrays(
-            self.path / DATA,
+            folder / DATA,
             list(self.plan.streams),
             len(self.plan.episodes),
             self.settings["captured_calls"],
@@ -64,55 +87,59 @@ class RunWriter:
             "settings_sha256": sha256_json(self.settings),
             "streams": [stream.to_json() for stream in self.plan.streams],
         }
-        create_once(self.path / RUN_FILE, run)
+        create_once(folder / RUN_FILE, run)
 
-    def _continue(self) -> None:
+    def _refuse_other_settings(self) -> None:
         stored = json.loads((self.path / RUN_FILE).read_text())
         asked = {"schema_version": SCHEMA_VERSION, **self.settings}
         refuse_other_settings({"schema_version": stored["schema_version"], **stored["settings"]}, asked, self.path)
 
-    def remaining(self) -> list[PlannedEpisode]:
-        """Episodes of the plan that are not committed; objects of the committed ones are checked."""
-        done = read_commits(self.path)
-        return [episode for episode in self.plan.episodes if episode.index not in done]
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Own the run while the body runs, and begin by clearing what killed processes left behind.
 
-    def write(self, planned: PlannedEpisode, rollout: Rollout) -> None:
+        A second process that extracts into the same folder is a guest: it works along and clears nothing.
+        """
+        with (self.path / RUN_FILE).open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield
+                return
+            self._clear_orphans()
+            yield
+
+    def _clear_orphans(self) -> None:
+        for pattern in _ORPHANS:
+            for orphan in self.path.glob(pattern):
+                if orphan.is_dir():
+                    shutil.rmtree(orphan)
+                else:
+                    orphan.unlink()
+        shutil.rmtree(self.path / FAILED, ignore_errors=True)
+
+    def remaining(self) -> list[int]:
+        """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
+        done = read_commits(self.path)
+        return [episode.index for episode in self.plan.episodes if episode.index not in done]
+
+    def write(self, rollout: "Rollout") -> None:
         """Store one episode: first its arrays, then the commit that makes it count."""
+        planned, buffers = rollout.planned, rollout.buffers
         store = RecordingStore(LocalStore(self.path / DATA))
-        for stored in self.plan.streams:
-            self._write_stream(store, planned.index, stored, rollout.captured)
+        for kind, arrays in (("pooled", buffers.pooled), ("tokens", buffers.tokens)):
+            for stream, values in arrays.items():
+                array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
+                array[planned.index] = values
         commit = {
             "episode_id": planned.episode.episode_id,
             "outcome": rollout.outcome,
-            "roles": [
-                {name: [list(span) for span in stream.roles.spans] for name, stream in call.items()}
-                for call in rollout.captured
-            ],
+            "roles": buffers.roles,
             "objects": {key: list(record) for key, record in sorted(store.objects.items())},
         }
-        create_once(commit_path(self.path, planned.index), commit)
-
-    def _write_stream(self, store: RecordingStore, index: int, stored: StoredStream, calls: list[Capture]) -> None:
-        pooled = zarr.open_array(store, path=f"{stored.name}/pooled", mode="r+")
-        rows = np.full(pooled.shape[1:], np.nan, np.float32)
-        for step, call in enumerate(calls):
-            rows[step] = call[stored.name].pooled
-        pooled[index] = rows
-        if self.settings["tokens"] == "all":
-            tokens = zarr.open_array(store, path=f"{stored.name}/tokens", mode="r+")
-            bits = np.zeros(tokens.shape[1:], np.uint16)
-            for step, call in enumerate(calls):
-                captured = call[stored.name].tokens
-                assert captured is not None
-                bits[step, ..., : captured.shape[-2], :] = captured
-            tokens[index] = bits
+        write_commit(self.path, planned.index, commit)
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
         """Record what was loaded and checked; the first one stays."""
         if not (self.path / CERTIFICATE_FILE).is_file():
             create_once(self.path / CERTIFICATE_FILE, json.loads(json.dumps(certificate, default=list)))
-
-
-def _is_leftover(path: Path) -> bool:
-    """Whether `path` holds nothing but what `_create` writes before `run.json`."""
-    return path.is_dir() and {p.name for p in path.iterdir() if p.suffix != ".tmp"} <= {COMMITS, PLAN_FILE, DATA}

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.env import SceneSpec
+from probe_kit.env import SceneSpec, ScriptedExpert
 from probe_kit.errors import (
-    ActionError,
     DiskSpaceError,
+    EpisodesFailedError,
     RunIncompleteError,
     SettingsMismatchError,
     SuiteError,
@@ -18,7 +18,6 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
-from probe_kit.extract.controllers import ScriptedController
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -42,6 +41,10 @@ class CrashError(Exception):
     """Stands for a crash between two episodes."""
 
 
+def _crash(*_: object) -> None:
+    raise CrashError
+
+
 def stop_after(count: int):
     def progress(done: int, _total: int, _outcome: str) -> None:
         if done == count:
@@ -55,7 +58,7 @@ def test_a_run_that_was_interrupted_continues_to_the_same_bytes(two_items: Suite
     extract_run(settings, tmp_path / "whole")
     with pytest.raises(CrashError):
         extract_run(settings, tmp_path / "resumed", stop_after(1))
-    assert len(open_run(tmp_path / "resumed", allow_partial=True).episodes) == 1
+    assert 1 <= len(open_run(tmp_path / "resumed", allow_partial=True).episodes) < 4
     extract_run(settings, tmp_path / "resumed")
     assert files(tmp_path / "resumed") == files(tmp_path / "whole")
 
@@ -64,7 +67,7 @@ def test_an_unfinished_run_does_not_read_as_whole(two_items: Suite, tmp_path: Pa
     settings = ExtractSettings("expert", suite=two_items.folder)
     with pytest.raises(CrashError):
         extract_run(settings, tmp_path / "run", stop_after(1))
-    with pytest.raises(RunIncompleteError, match="1 of 4 episodes"):
+    with pytest.raises(RunIncompleteError, match="of 4 episodes"):
         open_run(tmp_path / "run")
 
 
@@ -87,22 +90,26 @@ def test_a_folder_that_is_no_run_is_left_alone(two_items: Suite, tmp_path: Path)
     assert (tmp_path / "thesis.txt").read_text() == "do not touch"
 
 
-def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(two_items: Suite, tmp_path: Path) -> None:
+def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(
+    two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = ExtractSettings("expert", suite=two_items.folder, scene=SHORT)
-    run = extract_run(settings, tmp_path / "run")
-    (run.path / "run.json").unlink()
-    shutil.rmtree(run.path / "commits")
-    (run.path / "certificate.json").unlink()
+    monkeypatch.setattr("probe_kit.extract.writer.create_arrays", _crash)
+    with pytest.raises(CrashError):
+        extract_run(settings, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    monkeypatch.undo()
     assert len(extract_run(settings, tmp_path / "run").episodes) == 4
 
 
 def test_a_nan_action_stops_the_run_and_commits_nothing(
     two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScriptedController, "next_actions", lambda _self: np.full((1, 7), np.nan, np.float32))
-    with pytest.raises(ActionError) as caught:
+    monkeypatch.setattr(ScriptedExpert, "act", lambda _self: np.full(7, np.nan, np.float32))
+    with pytest.raises(EpisodesFailedError) as caught:
         extract_run(ExtractSettings("expert", suite=two_items.folder), tmp_path / "run")
-    assert "in episode a2a-embedded-color" in caught.value.__notes__[0]
+    assert "a2a-embedded-color" in caught.value.__notes__[0]
+    assert "ActionError" in caught.value.__notes__[0]
     assert caught.value.exit_code == 1
     assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
 

@@ -1,0 +1,239 @@
+"""`probe-kit extract`, `probe-kit export` and `probe-kit run`."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from probe_kit.console import counter, err, out, print_json, progress, split
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    from probe_kit.extract import Extraction, Run
+
+run_app = typer.Typer(help="Look after runs.", no_args_is_help=True)
+DAMAGED = 1
+
+SCENE = "Scene (recorded with the run)"
+
+
+def extract(
+    model: Annotated[str, typer.Option(help="A model of `probe-kit models`, or expert, expert-mirrored.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default runs/<model>-<settings hash>.")
+    ] = None,
+    checkpoint: Annotated[str | None, typer.Option(help="Folder or hub id; default the family's.")] = None,
+    random_weights: Annotated[
+        bool, typer.Option("--random-weights", help="Untrained twin of the same architecture, as a control.")
+    ] = False,
+    suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
+    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
+    items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
+    scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal or vl-think.")] = "bridge",
+    max_steps: Annotated[
+        int | None, typer.Option(help="Actions per episode, at 5 Hz.", rich_help_panel=SCENE)
+    ] = None,
+    tile_side: Annotated[
+        float | None, typer.Option(help="Metres; the paper's sizes are 0.11, 0.154, 0.088.", rich_help_panel=SCENE)
+    ] = None,
+    light_level: Annotated[
+        float | None, typer.Option(help="1 is default; the paper's levels are 0.7, 1.3.", rich_help_panel=SCENE)
+    ] = None,
+    rendering: Annotated[
+        str | None, typer.Option(help="raw, or visual-matching: over a photo.", rich_help_panel=SCENE)
+    ] = None,
+    background: Annotated[
+        Path | None, typer.Option(help="Photo for visual-matching; default our own.", rich_help_panel=SCENE)
+    ] = None,
+    picture_size: Annotated[
+        str | None, typer.Option(help="What the policy is handed, such as 224x224.", rich_help_panel=SCENE)
+    ] = None,
+    epsilon: Annotated[
+        float | None, typer.Option(help="Zone radius, metres; default half a tile + 0.01.", rich_help_panel=SCENE)
+    ] = None,
+    arm: Annotated[
+        str | None, typer.Option(help="panda, or widowx (extra widowx).", rich_help_panel=SCENE)
+    ] = None,
+    arm_urdf: Annotated[
+        Path | None, typer.Option(help="Your own description of that arm.", rich_help_panel=SCENE)
+    ] = None,
+    start_grasped: Annotated[
+        bool, typer.Option("--start-grasped", help="Begin with the cube in hand.", rich_help_panel=SCENE)
+    ] = False,
+    early_stop: Annotated[
+        bool, typer.Option("--early-stop", help="End when the cube was released and rests.", rich_help_panel=SCENE)
+    ] = False,
+    tokens: Annotated[str, typer.Option(help="pooled: views only. all: every token too (large).")] = "pooled",
+    captured_calls: Annotated[int, typer.Option(help="Inferences captured per episode.")] = 1,
+    execute: Annotated[
+        int | None, typer.Option(help="Actions executed per inference; default the model's.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of cube places and policy noise.")] = 0,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
+    dtype: Annotated[str | None, typer.Option(help="float32 or bfloat16; default the checkpoint's.")] = None,
+    codec: Annotated[str, typer.Option(help="zstd, fast or none.")] = "zstd",
+    video: Annotated[str, typer.Option(help="GIF of the first episode, of all, or none.")] = "none",
+    batch: Annotated[
+        int, typer.Option(help="Observations per policy call; above 1, numbers repeat up to float rounding.")
+    ] = 1,
+    env_workers: Annotated[
+        int | None, typer.Option(help="Processes that simulate and draw; default two per observation of a batch.")
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(help="Processes with a model each, one per GPU; 0 for this process.")
+    ] = 0,
+    ray: Annotated[
+        str | None, typer.Option(help="Work on this Ray cluster; auto: the one of this machine, or a new one.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Start even if the disk looks too small.")] = False,
+) -> None:
+    """Let a model act in every episode and store its residual streams.
+
+    The same command continues an interrupted run; other settings in the same folder are refused.
+    """
+    from probe_kit.env import SceneSpec
+    from probe_kit.extract import ExtractSettings, prepare
+
+    asked = {
+        "max_steps": max_steps,
+        "tile_side": tile_side,
+        "light_level": light_level,
+        "rendering": rendering,
+        "background": background,
+        "picture_size": _size(picture_size),
+        "epsilon": epsilon,
+        "arm": arm,
+        "arm_urdf": arm_urdf,
+        "start_grasped": start_grasped or None,
+        "early_stop": early_stop or None,
+    }
+    changes = {name: value for name, value in asked.items() if value is not None}
+    settings = ExtractSettings(
+        model=model,
+        checkpoint=checkpoint,
+        random_weights=random_weights,
+        suite=suite,
+        categories=split(categories),
+        items=items,
+        scene=SceneSpec.preset(scene, **changes),
+        seed=seed,
+        tokens=tokens,
+        captured_calls=captured_calls,
+        execute=execute,
+        codec=codec,
+        device=device,
+        dtype=dtype,
+        video=video,
+        batch=batch,
+        env_workers=env_workers,
+        workers=workers,
+        ray=ray,
+    )
+    with err.status("loading suite and model"):
+        extraction = prepare(settings)
+    folder = out_folder or Path("runs") / extraction.default_name()
+    _print_plan(extraction, folder)
+    if dry_run:
+        return
+    with progress() as bar:
+        run = extraction.run(folder, force=force, progress=counter(bar, "episodes"))
+    _print_outcomes(run)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """WIDTHxHEIGHT in pixels."""
+    if text is None:
+        return None
+    width, separator, height = text.partition("x")
+    if not (separator and width.isdigit() and height.isdigit()):
+        raise UsageError(f"picture size {text!r} is not WIDTHxHEIGHT, such as 224x224")
+    return int(width), int(height)
+
+
+def _print_plan(extraction: "Extraction", folder: Path) -> None:
+    from rich.table import Table
+
+    from probe_kit.extract.disk import free_bytes
+
+    plan, identity = extraction.plan, extraction.identity()
+    weights = (identity["weights_sha256"] or "scripted")[:12]
+    rows = {
+        "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
+        "suite": plan.suite.identity,
+        "categories": ", ".join(plan.suite.categories),
+        "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
+        "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
+        "disk": f"{free_bytes(folder) / 1e9:,.1f} GB free",
+        "run": str(folder),
+    }
+    table = Table(show_header=False, title="plan", box=None)
+    for name, value in rows.items():
+        table.add_row(f"[dim]{name}[/]", value)
+    err.print(table)
+
+
+def _describe(stored: Any) -> str:
+    steps = f" x {stored.iterations} iterations" if stored.iterations else ""
+    return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
+
+
+def _print_outcomes(run: "Run") -> None:
+    counts = run.episodes["outcome"].value_counts()
+    text = ", ".join(f"{name} {count}" for name, count in counts.items())
+    err.print(f"{len(run.episodes)} episodes: {text}", highlight=False)
+    step = "retention" if not run.streams else "train"
+    err.print(f"next: [bold]probe-kit {step} {run.path}[/]", highlight=False, soft_wrap=True)
+    out.print(str(run.path), highlight=False, soft_wrap=True)
+
+
+# -- run -----------------------------------------------------------------------------------------------
+
+
+@run_app.command("verify")
+def verify(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Read every byte, not only sizes.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Compare a run with what its commits promise; exit 1 if anything is missing or changed."""
+    from probe_kit.extract import verify_run
+
+    found = verify_run(run, deep)
+    if as_json:
+        print_json({**asdict(found), "path": str(found.path), "ok": found.ok})
+    else:
+        checked = "every byte" if deep else "sizes"
+        sealed = "sealed" if found.sealed else "not sealed"
+        failed = f", {found.failed} failed" if found.failed else ""
+        out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
+        for problem in found.problems:
+            out.print(f"damaged: {problem}", highlight=False, markup=False, soft_wrap=True)
+    if not found.ok:
+        raise typer.Exit(DAMAGED)
+
+
+@run_app.command("seal")
+def seal_run(run: Annotated[Path, typer.Argument(help="Run folder.")]) -> None:
+    """Build the columns that make probing fast; `extract` does it by itself at the end."""
+    from probe_kit.extract import seal
+
+    out.print("sealed" if seal(run) else "nothing to do")
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    style: Annotated[str, typer.Option("--format", help="h5, safetensors or parquet.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", help="File to write; default <run>.<format> beside the run.")
+    ] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
+) -> None:
+    """Write a run as one ordinary file, with its sha256 beside it."""
+    from probe_kit.extract import export_run
+
+    target = out_file or run.with_name(f"{run.resolve().name}.{style}")
+    with err.status("exporting"):
+        out.print(str(export_run(run, style, target, partial)), highlight=False, soft_wrap=True)

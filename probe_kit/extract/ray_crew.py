@@ -1,0 +1,87 @@
+"""Workers on a Ray cluster."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from probe_kit.extract.commits import commit_path
+from probe_kit.extract.extras import require
+from probe_kit.extract.scheduler import Done, Event, Scheduler
+from probe_kit.extract.settings import ExtractSettings
+
+# Episodes per call, so that a worker always has something to simulate while it infers; fewer towards the end.
+EPISODES_PER_CALL = 8
+RESTARTS = 3
+
+
+class RayActor:
+    """What runs on a node: the same worker as everywhere."""
+
+    def __init__(self, settings: ExtractSettings, run: Path) -> None:
+        from probe_kit.extract.extraction import load_worker
+
+        self._worker = load_worker(settings, run).__enter__()
+
+    def play(self, numbers: Sequence[int]) -> list[Event]:
+        """Play and commit these episodes."""
+        ahead = iter(numbers)
+        return list(self._worker.run(lambda: next(ahead, None)))
+
+
+class RayCrew:
+    """Actors on a cluster, as many as GPUs, or as `settings.workers` says. A context manager.
+
+    Raises MissingExtraError if Ray is not installed.
+    """
+
+    def __init__(self, settings: ExtractSettings, run: Path) -> None:
+        self._ray = require("ray", "ray")
+        self._settings, self._run = settings, run.resolve()
+        self._playing: dict[Any, int] = {}
+
+    def __enter__(self) -> Self:
+        self._started = not self._ray.is_initialized()
+        if self._started:
+            address = None if self._settings.ray == "auto" else self._settings.ray
+            self._ray.init(address=address, include_dashboard=False, log_to_driver=True)
+        gpus = int(self._ray.cluster_resources().get("GPU", 0)) if self._settings.device.startswith("cuda") else 0
+        options = {"num_gpus": 1 if gpus else 0, "max_restarts": RESTARTS, "max_task_retries": 0}
+        actor = self._ray.remote(**options)(RayActor)
+        count = self._settings.workers or max(1, gpus)
+        self._actors = [actor.remote(self._settings, self._run) for _ in range(count)]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for actor in self._actors:
+            self._ray.kill(actor)
+        if self._started:
+            self._ray.shutdown()
+
+    def hand_out(self, scheduler: Scheduler) -> None:
+        """Give every idle actor something to play."""
+        for slot, actor in enumerate(self._actors):
+            if slot not in self._playing.values():
+                numbers = scheduler.take_some(slot, EPISODES_PER_CALL)
+                if numbers:
+                    self._playing[actor.play.remote(numbers)] = slot
+
+    def collect(self, scheduler: Scheduler) -> list[Event]:
+        """Wait for one actor and note what became of its episodes."""
+        (ready,), _ = self._ray.wait(list(self._playing), num_returns=1)
+        slot = self._playing.pop(ready)
+        try:
+            events: list[Event] = self._ray.get(ready)
+        except self._ray.exceptions.RayActorError as error:
+            events = self._committed(scheduler.holds(slot))
+            for event in events:
+                scheduler.hear(slot, event)
+            return [*events, *scheduler.lose(slot, f"its Ray actor died: {error}")]
+        for event in events:
+            scheduler.hear(slot, event)
+        return events
+
+    def _committed(self, numbers: set[int]) -> list[Event]:
+        """What a dead actor finished before it could say so."""
+        paths = {number: commit_path(self._run, number) for number in sorted(numbers)}
+        return [Done(n, json.loads(path.read_text())["outcome"]) for n, path in paths.items() if path.is_file()]

@@ -1,0 +1,92 @@
+"""A process that extracts synthetic episodes through the real writer, to be killed.
+
+Usage: python killing.py RUN SUITE [POINT].
+
+It loads no model, so that sixty kills take seconds. POINT is where it kills itself: before-put, after-put,
+before-commit or after-commit of the third episode it writes.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+from zarr.core.buffer import Buffer
+from zarr.storage import LocalStore
+
+from probe_kit.extract import commits, sealing, writer
+from probe_kit.extract.disk import full_disk_in_words
+from probe_kit.extract.layout import StoredStream
+from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.rollout import Rollout
+from probe_kit.extract.staging import EpisodeBuffers
+from probe_kit.suite import load_suite
+
+STREAMS = [
+    StoredStream("backbone", 4, 64, None, 150, ("mean", "last")),
+    StoredStream("expert", 3, 32, 5, 20, ("mean",)),
+]
+SETTINGS = {"captured_calls": 1, "tokens": "all", "codec": "zstd", "model": "synthetic"}
+
+
+def plan_for(suite: Path) -> Plan:
+    return make_plan(load_suite(suite), STREAMS, 0, 1, True)
+
+
+def rollout(plan: Plan, number: int) -> Rollout:
+    """The same numbers for the same episode, always."""
+    draw = np.random.default_rng(number)
+    buffers = EpisodeBuffers(STREAMS, 1, True, pinned=False)
+    for stream in STREAMS:
+        buffers.pooled[stream.name][:] = draw.normal(size=buffers.pooled[stream.name].shape)
+        buffers.tokens[stream.name][:] = draw.integers(0, 1 << 16, buffers.tokens[stream.name].shape)
+    buffers.roles.append({stream.name: [("language", 0, stream.tokens)] for stream in STREAMS})
+    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
+
+
+def extract(run: Path, plan: Plan) -> None:
+    """What an extraction does with its episodes."""
+    writing = writer.RunWriter(run, plan, SETTINGS)
+    with writing.owned(), full_disk_in_words(run):
+        for number in writing.remaining():
+            writing.write(rollout(plan, number))
+        sealing.seal(run)
+
+
+def die_at(point: str) -> None:
+    """Arrange for a SIGKILL before or after an object or a commit of the third episode is written."""
+    when, what = point.split("-")
+    put, commit = LocalStore.set, commits.create_once
+    calls = {"put": 0, "commit": 0}
+
+    def reached(here: str, thing: str) -> None:
+        if (here, thing, calls[thing]) == (when, what, FATAL[thing]):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    async def deadly_put(store: LocalStore, key: str, value: Buffer) -> None:
+        calls["put"] += "/c/" in key
+        reached("before", "put")
+        await put(store, key, value)
+        reached("after", "put")
+
+    def deadly_commit(path: Path, content: dict[str, object]) -> bool:
+        calls["commit"] += 1
+        reached("before", "commit")
+        written = commit(path, content)
+        reached("after", "commit")
+        return written
+
+    LocalStore.set = deadly_put
+    commits.create_once = deadly_commit
+
+
+# Of four objects and one commit per episode.
+FATAL = {"put": 10, "commit": 3}
+
+
+if __name__ == "__main__":
+    folder, suite = Path(sys.argv[1]), Path(sys.argv[2])
+    if len(sys.argv) > 3:
+        die_at(sys.argv[3])
+    extract(folder, plan_for(suite))

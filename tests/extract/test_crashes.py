@@ -1,0 +1,138 @@
+"""Crashes: killed and resumed equals never killed."""
+
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import DiskSpaceError
+from probe_kit.extract import open_run, verify_run
+from probe_kit.extract.disk import full_disk_in_words
+from probe_kit.suite import Suite, build_suite
+
+KILLING = Path(__file__).with_name("killing.py")
+
+
+def tree(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def start(run: Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, str(KILLING), str(run), str(suite.folder), *point])
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "six", ["color"], 6)
+
+
+@pytest.fixture(scope="module")
+def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nobody disturbed."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert start(run, suite).wait() == 0
+    return run
+
+
+@pytest.mark.parametrize("point", ["before-put", "after-put", "before-commit", "after-commit"])
+def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
+    point: str, suite: Suite, whole: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert start(run, suite, point).wait() == -signal.SIGKILL
+    committed = 3 if point == "after-commit" else 2
+    assert len(open_run(run, allow_partial=True).episodes) == committed
+    assert verify_run(run, deep=True).ok
+    assert start(run, suite).wait() == 0
+    assert tree(run) == tree(whole)
+
+
+def test_three_writers_at_once_give_the_same_store(suite: Suite, whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    writers = [start(run, suite) for _ in range(3)]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
+    assert tree(run) == tree(whole)
+    assert list(tmp_path.iterdir()) == [run], "no half-made folder stays behind"
+
+
+def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
+    suite: Suite, whole: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    for orphan in ("commits/abc.tmp", "data.zarr/backbone/pooled/c/0/x.partial", "columns.zarrx.tmp/zarr.json"):
+        (run / orphan).parent.mkdir(exist_ok=True)
+        (run / orphan).write_text("torn")
+    assert start(run, suite).wait() == 0
+    assert tree(run) == tree(whole)
+
+
+@pytest.mark.slow
+def test_sixty_random_kills_lose_nothing_that_was_committed(suite: Suite, whole: Path, tmp_path: Path) -> None:
+    draw = random.Random(0)
+    kills = rounds = 0
+    while kills < 60:
+        run, seen = tmp_path / str(rounds), set[str]()
+        while True:
+            process = start(run, suite)
+            time.sleep(draw.uniform(0.6, 2.5))
+            if process.poll() is not None:
+                break
+            process.kill()
+            process.wait()
+            kills += 1
+            committed = {path.name for path in run.glob("commits/*.json")}
+            assert seen <= committed
+            seen = committed
+            assert not committed or verify_run(run, deep=True).ok
+        assert process.returncode == 0
+        assert tree(run) == tree(whole)
+        rounds += 1
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 700 kB, about half of what the run needs."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=700k", "none", str(disk)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="mounts a tmpfs")
+def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whole: Path, small_disk: Path) -> None:
+    run = small_disk / "run"
+    process = subprocess.run(
+        [sys.executable, str(KILLING), str(run), str(suite.folder)], capture_output=True, text=True, check=False
+    )
+    assert "is full" in process.stderr
+    found = verify_run(run, deep=True)
+    assert found.ok
+    assert 0 < found.committed < 12
+    assert not list(run.rglob("*.tmp"))
+    subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
+    assert start(run, suite).wait() == 0
+    assert tree(run) == tree(whole)
+
+
+def test_other_errors_of_the_disk_keep_their_name(tmp_path: Path) -> None:
+    with pytest.raises(PermissionError), full_disk_in_words(tmp_path):
+        raise PermissionError
+    with pytest.raises(DiskSpaceError), full_disk_in_words(tmp_path):
+        raise OSError(28, "No space left on device")

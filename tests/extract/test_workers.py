@@ -1,0 +1,122 @@
+"""Batches, environment processes and worker processes change how fast a run comes, not what is in it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
+from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract.stage import Seen
+from probe_kit.extract.stage_process import ProcessStage
+from probe_kit.suite import Suite, build_suite
+
+SHORT = SceneSpec(max_steps=2)
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    """Twelve episodes."""
+    return build_suite(tmp_path_factory.mktemp("suite") / "six", ["color"], 6)
+
+
+def settings(suite: Suite, **changes: object) -> ExtractSettings:
+    return ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, **changes)
+
+
+def commits(run: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in run.glob("commits/*.json")}
+
+
+@pytest.fixture(scope="module")
+def plain(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything in this process, one observation at a time."""
+    return extract_run(settings(suite, env_workers=0), tmp_path_factory.mktemp("plain") / "run").path
+
+
+def test_environment_processes_give_the_same_bytes(suite: Suite, plain: Path, tmp_path: Path) -> None:
+    run = extract_run(settings(suite, env_workers=2), tmp_path / "run")
+    assert commits(run.path) == commits(plain)
+
+
+def test_a_batch_gives_the_same_numbers_up_to_float_rounding(suite: Suite, plain: Path, tmp_path: Path) -> None:
+    run, one = extract_run(settings(suite, batch=3, env_workers=0), tmp_path / "run"), open_run(plain)
+    for stream in run.streams:
+        for site in run.sites(stream):
+            np.testing.assert_allclose(run.column(site), one.column(site), rtol=1e-4, atol=1e-4)
+    assert run.settings_sha256 == one.settings_sha256
+    assert run.episodes["outcome"].tolist() == one.episodes["outcome"].tolist()
+
+
+def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -> None:
+    planned = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[0]
+    stage = ProcessStage(SHORT, None)
+    try:
+        os.kill(stage._child.pid, signal.SIGKILL)
+        stage.ask("begin", planned, False)
+        with pytest.raises(StageDiedError, match="code -9"):
+            stage.answer()
+        stage.ask("begin", planned, False)
+        assert isinstance(stage.answer(), Seen)
+    finally:
+        stage.close()
+
+
+def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from probe_kit.extract.controllers import PolicyController
+
+    poison = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[5]
+    act = PolicyController.act
+
+    def act_badly(self, turns):
+        chunks = act(self, turns)
+        bad = [np.nan if turn.seed == poison.policy_seed else 1 for turn in turns]
+        return [chunk * factor for chunk, factor in zip(chunks, bad, strict=True)]
+
+    monkeypatch.setattr(PolicyController, "act", act_badly)
+    with pytest.raises(EpisodesFailedError, match="1 episodes failed twice") as caught:
+        extract_run(settings(suite, env_workers=0), tmp_path / "run")
+    assert poison.episode.episode_id in caught.value.__notes__[0]
+    assert caught.value.exit_code == 1
+    run = open_run(tmp_path / "run", allow_partial=True)
+    assert (len(run.episodes), list(run.failed), run.sealed) == (11, [poison.episode.episode_id], True)
+    with pytest.raises(RunIncompleteError, match="1 failed"):
+        open_run(tmp_path / "run")
+    monkeypatch.undo()
+    assert len(extract_run(settings(suite), tmp_path / "run").episodes) == 12
+    assert not (tmp_path / "run/failed").exists()
+
+
+@pytest.mark.parametrize("model", ["expert", pytest.param("pi0-tiny", marks=pytest.mark.slow)])
+def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: Suite, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    alone = ExtractSettings(model, suite=suite.folder, scene=SHORT, env_workers=0)
+    plain = extract_run(alone, tmp_path / "plain").path
+    command = [sys.executable, "-m", "probe_kit", "extract", "--model", model, "--suite", str(suite.folder)]
+    command += ["--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out", str(run)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    killed = _kill_a_worker(process.pid, run)
+    _, messages = process.communicate(timeout=120)
+    assert process.returncode == 0, messages
+    assert killed
+    assert commits(run) == commits(plain)
+
+
+def _kill_a_worker(driver: int, run: Path) -> bool:
+    """Kill one child of the driver as soon as something is committed."""
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline:
+        if list(run.glob("commits/*.json")):
+            children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
+            os.kill(int(children[0]), signal.SIGKILL)
+            return True
+        time.sleep(0.02)
+    return False
