@@ -18,6 +18,7 @@ from rich.table import Table
 from scipy.special import ndtri, stdtrit
 
 from probe_kit.retention.crossfit import GroupScores, crossfit
+from probe_kit.retention.estimates import Estimate, average, retention_draws
 from probe_kit.retention.fieller import Interval, fieller_interval
 from probe_kit.train.permutation import family_p, flip_items
 from probe_kit.train.probe import nested_folds, probe_site
@@ -102,6 +103,37 @@ def study(world: World, draws: int) -> Study:
     )
 
 
+def joined_coverage(draws: int) -> tuple[float, float]:
+    """How often the intervals of a mean over four categories, and of a difference of two such means, cover.
+
+    True retentions 0.8 and 0.5, backbone strong and broad.
+    """
+    worlds = [World("", 0.25, 0.35, retention) for retention in (0.8, 0.5)]
+    covered = []
+    for seed in range(draws):
+        generator = np.random.default_rng(seed)
+        mean, other = (
+            average([estimate(world, generator, category) for category in range(4)]) for world in worlds
+        )
+        covered.append([covers(mean, 0.8), covers(mean - other, 0.3)])
+    of_mean, of_difference = np.mean(covered, axis=0)
+    return float(of_mean), float(of_difference)
+
+
+def estimate(world: World, generator: np.random.Generator, category: int) -> Estimate:
+    """Debiased retention of one data set, with draws that belong to `category`."""
+    items = np.repeat(np.arange(ITEMS), 2)
+    fit = crossfit(*(GroupScores.of(part, items) for part in draw(world, generator)), 0.5, category)
+    drawn = retention_draws(fit.held_out, np.full(ITEMS, 2), 0.5, category)
+    return Estimate(fit.expert / fit.backbone, drawn, category)
+
+
+def covers(estimated: Estimate, truth: float) -> bool:
+    """Whether the interval holds the truth; one without limits does."""
+    low, high = estimated.ci
+    return low is None or high is None or low <= truth <= high
+
+
 def best_mean(scores: GroupScores) -> np.float64:
     """Accuracy of the best site."""
     best: np.float64 = scores.sums.sum(axis=1).max() / scores.sizes.sum()
@@ -176,6 +208,8 @@ def main() -> None:
     console.print(
         f"coverage over the {len(planted)} worlds: mean {np.mean(planted):.1%}, least {min(planted):.1%}"
     )
+    mean, difference = joined_coverage(draws)
+    console.print(f"bootstrap over four categories: mean covers {mean:.1%}, difference of groups {difference:.1%}")
     alarms = false_alarms(draws)
     console.print(f"no signal, real probes: family-wise error {alarms:.1%}, so n/a in {1 - alarms:.1%} of draws")
 

@@ -132,6 +132,24 @@ class RunIncompleteError(ProbeKitError):
     """Episodes of the plan are not committed yet."""
 
 
+class EpisodesFailedError(ProbeKitError):
+    """Episodes were given up after failing twice; all others are kept."""
+
+
+class StageDiedError(ProbeKitError):
+    """The process that simulates an episode ended in the middle of it."""
+
+
+class WorkerDiedError(ProbeKitError):
+    """A worker process ended before it could begin its first episode."""
+
+
+class MissingExtraError(ProbeKitError):
+    """A feature needs an optional dependency that is not installed."""
+
+    exit_code = 2
+
+
 # -- probes ------------------------------------------------------------------------------------------
 
 

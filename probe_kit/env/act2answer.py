@@ -16,7 +16,7 @@ from probe_kit.env.scene import Scene
 from probe_kit.env.spec import SceneSpec
 from probe_kit.env.trial import Trial
 from probe_kit.errors import EpisodeOverError, SceneError
-from probe_kit.suite.items import other_side
+from probe_kit.suite.items import Item, other_side
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
@@ -210,4 +210,8 @@ def _question(options: dict[str, Any]) -> Question:
         raise SceneError(f"reset has no option {unknown[0]!r}; it takes 'item' and 'layout'.")
     layout = options.get("layout", "original")
     item = options.get("item")
-    return Question.built_in(layout) if item is None else Question.from_item(item, layout)
+    if item is None:
+        return Question.built_in(layout)
+    if not isinstance(item, Item):
+        raise SceneError(f"reset option 'item' is a {type(item).__name__}; expected an Item of a suite.")
+    return Question.from_item(item, layout)

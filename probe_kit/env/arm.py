@@ -9,6 +9,7 @@ from probe_kit.env.bullet import BulletClient
 from probe_kit.env.kinematics import Pose, SerialChain
 from probe_kit.env.rotations import Array, to_rpy
 from probe_kit.env.spec import XYZ, PhysicsSpec
+from probe_kit.errors import SceneError
 
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 1.0
@@ -20,13 +21,14 @@ class Arm:
     """An arm loaded into a physics server.
 
     Joint angles are (n,) radians; an opening is 1 for an open and 0 for a closed gripper.
+    Raises SceneError if the description is missing or has other joints than the model.
     """
 
     def __init__(self, client: BulletClient, model: ArmModel, physics: PhysicsSpec, urdf: Path) -> None:
         self._client = client
         self._physics = physics
         self.model = model
-        self.body: int = client.loadURDF(str(urdf), model.base, useFixedBase=True)
+        self.body: int = self._load(urdf)
         self._efforts = [client.getJointInfo(self.body, j)[10] for j in model.joints]
         self._couple_fingers()
         self.chain = self._measure_chain()
@@ -82,6 +84,21 @@ class Arm:
     def tool_down(self, position: XYZ) -> Pose:
         """The pose with the tool at `position` and the gripper pointing down."""
         return Pose(np.array(position), np.array(self.model.down))
+
+    def _load(self, urdf: Path) -> int:
+        client, model = self._client, self.model
+        if not urdf.is_file():
+            raise SceneError(f"there is no arm description {urdf}; check `arm_urdf`.")
+        body: int = client.loadURDF(str(urdf), model.base, useFixedBase=True)
+        kinds = [client.getJointInfo(body, joint)[2] for joint in range(client.getNumJoints(body))]
+        expected = dict.fromkeys(model.joints, client.JOINT_REVOLUTE)
+        expected |= dict.fromkeys(model.fingers, client.JOINT_PRISMATIC) | {model.tool: client.JOINT_FIXED}
+        if max(expected) >= len(kinds) or any(kinds[joint] != kind for joint, kind in expected.items()):
+            raise SceneError(
+                f"{urdf} does not describe this arm: expected turning joints {model.joints}, sliding fingers "
+                f"{model.fingers} and a fixed tool {model.tool}, in PyBullet's order. Give one of the same arm."
+            )
+        return body
 
     def _finger_position(self, opening: float) -> float:
         return self.model.closed + opening * (self.model.opened - self.model.closed)

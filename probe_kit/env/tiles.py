@@ -22,17 +22,9 @@ TEXTURE_BUDGET = 512
 def write_quad(path: Path, side: float) -> None:
     """Write a square of `side` metres in the plane z = 0 as OBJ; the top of its picture points to +x."""
     h = side / 2
-    lines = [f"v {x} {y} 0" for x, y in ((-h, h), (-h, -h), (h, -h), (h, h))]
-    lines += [
-        "vt 0 0",
-        "vt 1 0",
-        "vt 1 1",
-        "vt 0 1",
-        "vn 0 0 1",
-        "f 1/1/1 2/2/1 3/3/1",
-        "f 1/1/1 3/3/1 4/4/1",
-    ]
-    path.write_text("\n".join(lines) + "\n")
+    corners = "".join(f"v {x} {y} 0\n" for x, y in ((-h, h), (-h, -h), (h, -h), (h, h)))
+    picture = "".join(f"vt {u} {v}\n" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    path.write_text(f"{corners}{picture}vn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n")
 
 
 def as_texture(picture: Image.Image) -> NDArray[np.uint8]:

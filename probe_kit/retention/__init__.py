@@ -3,6 +3,7 @@
 Reads runs and probe results; needs no simulator and no model.
 """
 
+from probe_kit.retention.differences import Difference
 from probe_kit.retention.figures import layer_curve
 from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
@@ -12,11 +13,13 @@ from probe_kit.retention.success import (
     SuccessRate,
     chance_margin,
     normalised_score,
+    sensitivity,
     success_rate,
 )
 from probe_kit.retention.table import RetentionTable, retention
 
 __all__ = [
+    "Difference",
     "PairedItems",
     "Peak",
     "Regime",
@@ -30,5 +33,6 @@ __all__ = [
     "measure_retention",
     "normalised_score",
     "retention",
+    "sensitivity",
     "success_rate",
 ]

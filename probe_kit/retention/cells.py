@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+from probe_kit.retention.differences import Difference
+from probe_kit.retention.estimates import Limits
 from probe_kit.retention.rows import RetentionRow
 
 Column = tuple[str, Callable[[RetentionRow], str]]
@@ -19,14 +21,22 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def model_name(row: RetentionRow) -> str:
-    """The model, marked if its weights are random."""
-    return f"{row.model} (random weights)" if row.random_weights else row.model
+    """The model, marked if its weights are random, and its group if there are groups."""
+    name = f"{row.model} (random weights)" if row.random_weights else row.model
+    return name if row.group is None else f"{row.group}: {name}"
+
+
+def with_limits(value: str, limits: Limits | None, write: Callable[[float | None], str]) -> str:
+    """A value with its interval, if it has one."""
+    if limits is None:
+        return value
+    low, high = limits
+    return f"{value} [unbounded]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
 
 
 def success_interval(row: RetentionRow) -> str:
     """SR in percent with its interval."""
-    interval = "" if row.sr_ci is None else f" [{percent(row.sr_ci[0])}, {percent(row.sr_ci[1])}]"
-    return percent(row.sr) + interval
+    return with_limits(percent(row.sr), row.sr_ci, percent)
 
 
 def retention_value(row: RetentionRow) -> str:
@@ -40,11 +50,7 @@ def debiased_value(row: RetentionRow) -> str:
     """Debiased retention with its interval; a dash where retention is not defined."""
     if not row.retention_defined:
         return "–"
-    if row.retention_ci is None:
-        return number(row.retention_debiased)
-    low, high = row.retention_ci
-    interval = "[unbounded]" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"
-    return f"{number(row.retention_debiased)} {interval}"
+    return with_limits(number(row.retention_debiased), row.retention_ci, number)
 
 
 def peak(depth: float | None, iteration: int | None = None) -> str:
@@ -66,3 +72,51 @@ def title(what: str, rows: Sequence[RetentionRow]) -> str:
 def probed(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     """The rows that have probes."""
     return [row for row in rows if row.view is not None]
+
+
+# -- controls ------------------------------------------------------------------------------------------------
+
+ABOVE_CHANCE = "above chance"
+"""How a cell ends that tables colour red: the suite gives the answer away without a model."""
+
+
+def baseline(name: str) -> Callable[[RetentionRow], str]:
+    """Writes a baseline's accuracy in percent, and whether it is above chance."""
+
+    def cell(row: RetentionRow) -> str:
+        return percent(row.baselines.get(name)) + (f" {ABOVE_CHANCE}" if name in row.leaks else "")
+
+    return cell
+
+
+CONTROL_COLUMNS: list[Column] = [
+    ("category", lambda row: row.category),
+    ("position", baseline("position")),
+    ("instruction", baseline("instruction")),
+    ("pixels", baseline("pixels")),
+    ("selectivity", lambda row: f"{percent(row.prefix_selectivity)} / {percent(row.action_selectivity)}"),
+    ("backbone − twin", lambda row: with_limits(percent(row.prefix_twin), row.prefix_twin_ci, percent)),
+    ("expert − twin", lambda row: with_limits(percent(row.action_twin), row.action_twin_ci, percent)),
+]
+
+
+def controlled(rows: Sequence[RetentionRow]) -> bool:
+    """Whether any row was held against a control."""
+    return any(row.baselines or row.twin for row in rows)
+
+
+# -- differences ---------------------------------------------------------------------------------------------
+
+DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
+    ("category", lambda row: row.category),
+    ("view", lambda row: row.view or "–"),
+    ("SR %", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+    ("prefix %", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+    ("action %", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+    ("debiased retention", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
+]
+
+
+def difference_title(row: Difference) -> str:
+    """Which groups are compared, and whether item by item."""
+    return f"Difference: {row.group} − {row.minus} ({'the same items' if row.paired else 'other items'})"

@@ -6,8 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.retention.cells import (
+    ABOVE_CHANCE,
+    CONTROL_COLUMNS,
+    DIFFERENCE_COLUMNS,
     Column,
+    controlled,
     debiased_value,
+    difference_title,
     model_name,
     number,
     once_per_category,
@@ -15,12 +20,14 @@ from probe_kit.retention.cells import (
     probed,
     success_interval,
 )
+from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
+    from rich.text import Text
 
 _REGIMES: dict[str | None, str] = {
     Regime.KNOWLEDGE: "knowledge",
@@ -29,12 +36,12 @@ _REGIMES: dict[str | None, str] = {
 }
 
 
-def rich_tables(rows: Sequence[RetentionRow]) -> "Group":
-    """Success rates of every run, then its retention per view."""
+def rich_tables(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> "Group":
+    """Success rates of every run, then its retention and controls per view; differences between groups last."""
     from rich.console import Group
 
     tables: list[Table] = []
-    for _, of_run in groupby(rows, key=lambda row: row.run):
+    for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
         found = list(of_run)
         tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, []))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
@@ -42,6 +49,10 @@ def rich_tables(rows: Sequence[RetentionRow]) -> "Group":
             notes = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
             legend = ["@ depth of the best layer/iteration", *notes]
             tables.append(_table(f"Retention, view {view}", shown, _RETENTION_COLUMNS, legend))
+            if controlled(shown):
+                tables.append(_table(f"Controls, view {view}", shown, CONTROL_COLUMNS, [_control_legend(shown)]))
+    for title, of_pair in groupby(differences, key=difference_title):
+        tables.append(_difference_table(title, list(of_pair)))
     return Group(*tables)
 
 
@@ -93,10 +104,39 @@ def _table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column], n
     table.title, table.title_justify = escape(f"{what}: {model_name(rows[0])} on {rows[0].suite}"), "left"
     table.caption, table.caption_justify = escape("; ".join([_sizes(rows), *notes])), "left"
     for name, _ in columns:
-        table.add_column(escape(name), no_wrap=name != "category", overflow="fold")
+        table.add_column(
+            escape(name), no_wrap=name != "category" and columns is not CONTROL_COLUMNS, overflow="fold"
+        )
     for row in rows:
-        table.add_row(*(escape(cell(row)) for _, cell in columns), style="bold" if row.category == MEAN else None)
+        table.add_row(*(_coloured(cell(row)) for _, cell in columns), style=_style(row.category))
     return table
+
+
+def _difference_table(title: str, rows: Sequence[Difference]) -> "Table":
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=title, title_justify="left")
+    for name, _ in DIFFERENCE_COLUMNS:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*(_coloured(cell(row)) for _, cell in DIFFERENCE_COLUMNS), style=_style(row.category))
+    return table
+
+
+def _coloured(cell: str) -> "Text":
+    from rich.text import Text
+
+    return Text(cell, style="bold red" if cell.endswith(ABOVE_CHANCE) else "")
+
+
+def _style(category: str) -> str | None:
+    return "bold" if category == MEAN else None
+
+
+def _control_legend(rows: Sequence[RetentionRow]) -> str:
+    twin = f"; twin {rows[0].twin}" if rows[0].twin else ""
+    return f"held-out accuracy % without the model; selectivity of backbone / expert{twin}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> str:

@@ -40,12 +40,14 @@ class GroupScores:
 class Crossfit:
     """Mean scores above chance of the chosen sites, on episodes that had no part in choosing.
 
-    covariance: (2, 2) of the (expert, backbone) means, groups as the unit.
+    covariance: (2, 2) of the (expert, backbone) means, groups as the unit. held_out: (repeats, 2, G) correct
+    decisions of the sites chosen for (expert, backbone) per group.
     """
 
     expert: float
     backbone: float
     covariance: Matrix
+    held_out: Matrix
 
 
 def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: int) -> Crossfit:
@@ -56,15 +58,15 @@ def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: in
     (`benchmarks/retention_null.py` has the coverage of both).
     """
     n_groups, n_episodes = backbone.sizes.size, backbone.sizes.sum()
-    means, within = np.zeros((REPEATS, 2)), np.zeros((2, 2))
+    means, within, held_out = np.zeros((REPEATS, 2)), np.zeros((2, 2)), np.zeros((REPEATS, 2, n_groups))
     for repeat in range(REPEATS):
         fold_of = assign_folds(np.zeros(n_groups), np.arange(n_groups), FOLDS, seed + repeat)
-        sums = np.array([_held_out(expert, fold_of), _held_out(backbone, fold_of)])
+        sums = held_out[repeat] = np.array([_held_out(expert, fold_of), _held_out(backbone, fold_of)])
         means[repeat] = sums.sum(axis=1) / n_episodes
         rest = sums - means[repeat][:, None] * backbone.sizes
         within += rest @ rest.T * n_groups / (n_groups - 1) / n_episodes**2 / REPEATS
     above = means.mean(axis=0) - chance
-    return Crossfit(float(above[0]), float(above[1]), within + np.cov(means.T))
+    return Crossfit(float(above[0]), float(above[1]), within + np.cov(means.T), held_out)
 
 
 def _held_out(scores: GroupScores, fold_of: NDArray[np.intp]) -> Matrix:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.retention.measure import SIGNIFICANCE
+from probe_kit.train.controls import SIGNIFICANCE
 from probe_kit.train.curve import Curve
 from probe_kit.train.results import ProbeResults
 

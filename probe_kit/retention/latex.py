@@ -1,16 +1,24 @@
 """The retention table in LaTeX: booktabs rules, and five heat colours for retention."""
 
 from collections.abc import Sequence
+from itertools import groupby
 
 from probe_kit.retention.cells import (
+    ABOVE_CHANCE,
+    CONTROL_COLUMNS,
+    DIFFERENCE_COLUMNS,
+    controlled,
     debiased_value,
+    difference_title,
     model_name,
     number,
     peak,
     percent,
+    probed,
     retention_value,
     title,
 )
+from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import MEAN, RetentionRow
 
 HEAT = (
@@ -32,8 +40,45 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
 }
 
 
-def latex(rows: Sequence[RetentionRow]) -> str:
-    """A complete `table` environment; needs the packages booktabs and xcolor with its option `table`."""
+def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> str:
+    """Complete `table` environments: retention, then controls and differences between groups where there are any.
+
+    Needs the packages booktabs and xcolor with its option `table`.
+    """
+    parts = [_retention_table(rows)]
+    if controlled(rows):
+        names = ["Model", *(name for name, _ in CONTROL_COLUMNS)]
+        cells = [[model_name(row), *(cell(row) for _, cell in CONTROL_COLUMNS)] for row in probed(rows)]
+        parts.append(_plain_table(title("Controls", rows), names, cells))
+    for heading, of_pair in groupby(differences, key=difference_title):
+        cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
+        parts.append(_plain_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
+    return "\n".join(parts)
+
+
+def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(
+        [
+            r"\begin{table}",
+            rf"\caption{{{escape(caption)}}}",
+            rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
+            r"\toprule",
+            " & ".join(map(escape, columns)) + r" \\",
+            r"\midrule",
+            *(" & ".join(map(_coloured, cells)) + r" \\" for cells in rows),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def _coloured(cell: str) -> str:
+    return rf"\textcolor{{red}}{{{escape(cell)}}}" if cell.endswith(ABOVE_CHANCE) else escape(cell)
+
+
+def _retention_table(rows: Sequence[RetentionRow]) -> str:
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
     body: list[str] = []
     for row in rows:

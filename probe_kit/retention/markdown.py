@@ -1,10 +1,16 @@
 """Retention tables in Markdown."""
 
 from collections.abc import Sequence
+from itertools import groupby
 
 from probe_kit.retention.cells import (
+    ABOVE_CHANCE,
+    CONTROL_COLUMNS,
+    DIFFERENCE_COLUMNS,
     Column,
+    controlled,
     debiased_value,
+    difference_title,
     model_name,
     number,
     once_per_category,
@@ -15,6 +21,7 @@ from probe_kit.retention.cells import (
     success_interval,
     title,
 )
+from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import RetentionRow
 
 SUCCESS_COLUMNS: list[Column] = [
@@ -47,24 +54,40 @@ RETENTION_COLUMNS: list[Column] = [
 ]
 
 
-def markdown(rows: Sequence[RetentionRow]) -> str:
-    """Success rates and, where there are probes, retention."""
-    parts = [_markdown_table("Success rate", once_per_category(rows), SUCCESS_COLUMNS)]
+def markdown(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> str:
+    """Success rates and, where there are any, retention, controls and differences between groups."""
+    parts = [_rows_table("Success rate", once_per_category(rows), SUCCESS_COLUMNS)]
     if probed(rows):
-        parts.append(_markdown_table("Retention", probed(rows), RETENTION_COLUMNS))
+        parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
+    if controlled(rows):
+        columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–"), *CONTROL_COLUMNS]
+        parts.append(_rows_table("Controls", probed(rows), columns))
+    for heading, of_pair in groupby(differences, key=difference_title):
+        cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
+        parts.append(_markdown_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
     return "\n".join(parts)
 
 
-def _markdown_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:
+def _rows_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:
+    cells = [[cell(row) for _, cell in columns] for row in rows]
+    return _markdown_table(title(what, rows), [heading for heading, _ in columns], cells)
+
+
+def _markdown_table(heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [
-        f"**{title(what, rows)}**",
+        f"**{heading}**",
         "",
-        _markdown_line([heading for heading, _ in columns]),
+        _markdown_line(columns),
         _markdown_line(["---"] * len(columns)),
-        *(_markdown_line([cell(row).replace("|", r"\|") for _, cell in columns]) for row in rows),
+        *(_markdown_line([_marked(cell.replace("|", r"\|")) for cell in cells]) for cells in rows),
         "",
     ]
     return "\n".join(lines)
+
+
+def _marked(cell: str) -> str:
+    """Markdown has no colour that renders everywhere: a red sign and bold type."""
+    return f"🔴 **{cell}**" if cell.endswith(ABOVE_CHANCE) else cell
 
 
 def _markdown_line(cells: Sequence[str]) -> str:

@@ -12,9 +12,8 @@ from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
+from probe_kit.train.controls import SIGNIFICANCE
 from probe_kit.train.curve import Curve
-
-SIGNIFICANCE = 0.05
 
 Iterations = Literal["all", "last"] | int
 """Which expert iterations take part: all of them, the last one, or one by number."""
@@ -36,7 +35,7 @@ class Retention:
     plain: (best expert − chance) / (best backbone − chance), the published formula; NaN if the backbone's best is
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
     means nothing; `note` then says so. debiased: the same ratio scored on episodes that had no part in choosing
-    the sites, with its 95 % Fieller interval.
+    the sites, with its 95 % Fieller interval; held_out: those episodes' correct decisions, as in `Crossfit`.
     """
 
     chance: float
@@ -47,6 +46,7 @@ class Retention:
     note: str
     debiased: float
     interval: Interval
+    held_out: NDArray[np.float64]
 
 
 def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak | None:
@@ -86,6 +86,7 @@ def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 
         note=_note(backbone.p_fwe),
         debiased=_ratio(fit.expert, fit.backbone),
         interval=fieller_interval(fit.expert, fit.backbone, fit.covariance, _t_quantile(curve.n_groups - 1)),
+        held_out=fit.held_out,
     )
 
 

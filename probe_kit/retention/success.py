@@ -7,6 +7,7 @@ from math import comb, sqrt
 from statistics import NormalDist, fmean
 from typing import TYPE_CHECKING
 
+from probe_kit.env.outcome import SENSITIVITY_RADII, zone
 from probe_kit.errors import UsageError
 from probe_kit.train.scores import group_bootstrap
 
@@ -130,6 +131,22 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         side_preference=_rate(placed == "left"),
         paired=paired_items(episodes),
     )
+
+
+def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:
+    """Success rate by zone radius ε in metres, from where the cube ended: no episode runs again.
+
+    episodes: columns `distance_correct` and `distance_wrong`, metres; missing where the simulator broke, which
+    is no success. Empty for a table without these columns. Raises SceneError for a radius with overlapping zones.
+    """
+    columns = ["distance_correct", "distance_wrong"]
+    if not set(columns) <= set(episodes):
+        return {}
+    distances = episodes[columns].astype(float).to_numpy()
+    return {
+        radius: fmean(zone(correct, wrong, radius) == "correct" for correct, wrong in distances)
+        for radius in radii
+    }
 
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:

@@ -1,13 +1,17 @@
 """The retention table: several runs joined, and the ways to write it down."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import NoProbesError
+from probe_kit.env.outcome import SENSITIVITY_RADII
+from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention.differences import Difference, group_differences
+from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
-from probe_kit.retention.rows import RetentionRow, mean_row, run_rows
+from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 from probe_kit.train.store import load_results
@@ -21,11 +25,12 @@ if TYPE_CHECKING:
 class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
-    Runs are never averaged with each other, so no mean mixes suites.
+    Runs are never averaged with each other, so no mean mixes suites. differences: between groups of runs, if any.
     """
 
     rows: list[RetentionRow]
     means: list[RetentionRow]
+    differences: list[Difference] = field(default_factory=list)
 
     @property
     def all_rows(self) -> list[RetentionRow]:
@@ -33,75 +38,93 @@ class RetentionTable:
         return [
             row
             for mean in self.means
-            for row in [*(row for row in self.rows if (row.run, row.view) == (mean.run, mean.view)), mean]
+            for row in [
+                *(r for r in self.rows if (r.group, r.run, r.view) == (mean.group, mean.run, mean.view)),
+                mean,
+            ]
         ]
 
     def to_frame(self) -> "pd.DataFrame":
         """All rows as a data frame with the fields of `RetentionRow`.
 
-        Intervals become two columns, `sr_ci_low` and so on, and lists of categories become text.
+        Intervals become two columns, `sr_ci_low` and so on, what is kept by name one column per name, such as
+        `baselines.pixels`, and lists become text.
         """
         import pandas as pd
 
-        frame = pd.DataFrame([asdict(row) for row in self.all_rows])
-        for name in ("sr_ci", "retention_ci"):
-            limits = frame.pop(name)
-            frame[f"{name}_low"] = [None if pair is None else pair[0] for pair in limits]
-            frame[f"{name}_high"] = [None if pair is None else pair[1] for pair in limits]
-        for name in ("categories", "left_out"):
-            frame[name] = frame[name].map(" ".join)
-        return frame.convert_dtypes()
+        return pd.DataFrame([_flat(asdict(row)) for row in self.all_rows]).convert_dtypes()
+
+    def differences_frame(self) -> "pd.DataFrame":
+        """Differences between groups as a data frame with the fields of `Difference`, intervals as two columns."""
+        import pandas as pd
+
+        return pd.DataFrame([_flat(asdict(row)) for row in self.differences]).convert_dtypes()
 
     def to_json(self) -> str:
-        """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`."""
-        return json.dumps([asdict(row) for row in self.all_rows], indent=2, ensure_ascii=False, allow_nan=False)
+        """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
+
+        With groups, an object with the lists `rows` and `differences`.
+        """
+        rows = [asdict(row) for row in self.all_rows]
+        differences = [asdict(row) for row in self.differences]
+        content = {"rows": rows, "differences": differences} if differences else rows
+        return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
 
     def to_csv(self) -> str:
-        """All rows as comma-separated values with a header."""
+        """All rows as comma-separated values with a header; differences have `differences_frame`."""
         return self.to_frame().to_csv(index=False)
 
     def to_markdown(self) -> str:
-        """Success rates and retention as two Markdown tables."""
+        """Success rates, retention, controls and differences as Markdown tables."""
         from probe_kit.retention.markdown import markdown
 
-        return markdown(self.all_rows)
+        return markdown(self.all_rows, self.differences)
 
     def to_latex(self) -> str:
-        """The retention table in LaTeX, with booktabs rules and five heat colours."""
+        """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
         from probe_kit.retention.latex import latex
 
-        return latex(self.all_rows)
+        return latex(self.all_rows, self.differences)
 
     def to_rich(self) -> "Group":
-        """Success rates and retention as two tables for a rich console."""
+        """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.console import rich_tables
 
-        return rich_tables(self.all_rows)
+        return rich_tables(self.all_rows, self.differences)
 
 
 def retention(
-    runs: Sequence[RunReader],
+    runs: Sequence[RunReader] | Mapping[str, Sequence[RunReader]],
     views: Sequence[str] | None = None,
     *,
     iterations: Iterations = "all",
     keys: Sequence[str | None] | None = None,
+    epsilons: Sequence[float] = SENSITIVITY_RADII,
     seed: int = 0,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
-    views: those that were probed by default. iterations: which expert iterations take part. keys: which stored
-    probe results of each run to use, the newest by default. A run without activations or probes shows success
-    rates only. Raises UnknownSiteError for a view that was not probed and UsageError for an unknown key.
+    runs: a list, or lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared
+    with each other. views: those that were probed by default. iterations: which expert iterations take part.
+    keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
+    metres at which SR is scored again. A run without activations or probes shows success rates only.
+    Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
+    is not that of the runs, SceneError for overlapping zones.
     """
-    rows: list[RetentionRow] = []
+    groups = runs if isinstance(runs, Mapping) else {None: runs}
+    listed = [(name, run) for name, of_group in groups.items() for run in of_group]
+    if keys is not None and len(keys) != len(listed):
+        raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
+    settings = RowSettings(views, iterations, epsilons, seed)
+    drawn: list[Drawn] = []
     means: list[RetentionRow] = []
-    for run, key in zip(runs, keys or [None] * len(runs), strict=True):
-        found = run_rows(run, _results(run, key), views, iterations, seed)
-        rows += found
-        means += [
-            mean_row([row for row in found if row.view == view]) for view in dict.fromkeys(r.view for r in found)
-        ]
-    return RetentionTable(rows, means)
+    for (name, run), key in zip(listed, keys or [None] * len(listed), strict=True):
+        found = run_rows(run, _results(run, key), settings, name)
+        drawn += found
+        shown = dict.fromkeys(one.row.view for one in found)
+        means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
+    by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
+    return RetentionTable([one.row for one in drawn], means, group_differences(by_group))
 
 
 def _results(run: RunReader, key: str | None) -> ProbeResults | None:
@@ -109,3 +132,17 @@ def _results(run: RunReader, key: str | None) -> ProbeResults | None:
         return load_results(run, key)
     except NoProbesError:
         return None
+
+
+def _flat(row: dict[str, object]) -> dict[str, object]:
+    """One value per column: limits, names and lists spread or joined."""
+    flat: dict[str, object] = {}
+    for name, value in row.items():
+        if name.endswith("_ci"):
+            low, high = value if isinstance(value, tuple) else (None, None)
+            flat |= {f"{name}_low": low, f"{name}_high": high}
+        elif isinstance(value, dict):
+            flat |= {f"{name}.{key}": part for key, part in value.items()}
+        else:
+            flat[name] = " ".join(value) if isinstance(value, tuple) else value
+    return flat

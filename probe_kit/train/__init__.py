@@ -4,7 +4,10 @@ Needs a run (anything that is a `RunReader`), no simulator and no model.
 """
 
 from probe_kit.train.array_run import ArrayRun
+from probe_kit.train.baselines import BASELINES, Baseline
+from probe_kit.train.controls import BaselineScore, Controls, TwinScore
 from probe_kit.train.curve import Curve
+from probe_kit.train.directions import Direction
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings
 from probe_kit.train.store import load_results, save_results
@@ -12,14 +15,20 @@ from probe_kit.train.sweep import Progress, train_probes
 from probe_kit.train.targets import TARGETS, Target
 
 __all__ = [
+    "BASELINES",
     "TARGETS",
     "ArrayRun",
+    "Baseline",
+    "BaselineScore",
+    "Controls",
     "Curve",
+    "Direction",
     "ProbeResults",
     "ProbeSettings",
     "Progress",
     "RunReader",
     "Target",
+    "TwinScore",
     "load_results",
     "save_results",
     "train_probes",

@@ -1,7 +1,7 @@
 """A run made of arrays you already have."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -23,7 +23,8 @@ class ArrayRun:
     """A `RunReader` over features in memory, for activations that were not recorded by probe_kit.
 
     path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
-    features: (E, D) per site and view, rows in the order of `episodes`.
+    features: (E, D) per site and view, rows in the order of `episodes`. token_features: per site and role (None
+    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too.
     Raises UsageError if an array has another number of rows or dimensions.
     """
 
@@ -33,6 +34,9 @@ class ArrayRun:
     episodes: "pd.DataFrame"
     features: Mapping[tuple[Site, str], NDArray[np.floating]]
     random_weights: bool = False
+    token_features: Mapping[tuple[Site, str | None], tuple[NDArray[np.floating], NDArray[np.bool_]]] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         for (site, view), array in self.features.items():
@@ -45,12 +49,12 @@ class ArrayRun:
     @cached_property
     def settings_sha256(self) -> str:
         """Hash of all features: other arrays are another run."""
-        return sha256_json(
-            sorted(
-                [str(site), view, sha256(np.ascontiguousarray(array).tobytes()).hexdigest()]
-                for (site, view), array in self.features.items()
-            )
-        )
+        pooled = [[str(site), view, _sha256(array)] for (site, view), array in self.features.items()]
+        tokens = [
+            [str(site), f"tokens:{role}", _sha256(values), _sha256(mask)]
+            for (site, role), (values, mask) in self.token_features.items()
+        ]
+        return sha256_json(sorted(pooled) + sorted(tokens))
 
     @property
     def streams(self) -> Mapping[str, Stream]:
@@ -71,6 +75,13 @@ class ArrayRun:
             raise UnknownSiteError(f"there are no features of {site}, view {view!r}")
         return self.features[site, view].astype(np.float32)
 
+    def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(E, T, D) values and (E, T) mask of one site. Raises UnknownSiteError."""
+        if (site, role) not in self.token_features:
+            raise UnknownSiteError(f"there are no tokens of {site}, role {role!r}")
+        values, mask = self.token_features[site, role]
+        return values.astype(np.float32), mask
+
     def _stream(self, name: str) -> Stream:
         found = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
         steps = {site.iteration for site, _ in found} - {None}
@@ -80,3 +91,7 @@ class ArrayRun:
             width=found[0][1].shape[1],
             iterations=len(steps) or None,
         )
+
+
+def _sha256(array: NDArray[np.generic]) -> str:
+    return sha256(np.ascontiguousarray(array).tobytes()).hexdigest()

@@ -48,6 +48,11 @@ class Curve:
         """Positions of the sites of one stream."""
         return np.flatnonzero([site.stream == name for site in self.sites])
 
+    def best(self, stream: str) -> int:
+        """Position of the most accurate site of a stream, the first one on ties."""
+        rows = self.stream(stream)
+        return int(rows[self.correct[rows].mean(axis=1).argmax()])
+
     def depth(self, site: Site) -> float:
         """Layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
         last = max(other.layer for other in self.sites if other.stream == site.stream)
@@ -61,6 +66,11 @@ class Curve:
             rows = self.stream(name)
             p[rows] = family_p(accuracy[rows], self.null[rows])
         return p
+
+    @property
+    def control_accuracy(self) -> NDArray[np.float64]:
+        """(S,) mean accuracy on the control task: random labels, consistent within an item. NaN without any."""
+        return self.null.mean(axis=1) if self.null.shape[1] else np.full(len(self.sites), np.nan)
 
     def folds(self) -> list[Fold]:
         """The outer folds."""

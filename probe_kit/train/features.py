@@ -1,11 +1,11 @@
-"""From raw features to the few coordinates in which a probe is solved."""
+"""From raw features to the few coordinates in which a probe is solved; numpy arrays or torch tensors."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-Matrix = NDArray[np.float64]
+from probe_kit.train.arrays import Array, namespace, to_numpy
 
 
 @dataclass(frozen=True)
@@ -15,28 +15,29 @@ class Standardiser:
     kept: (D,) bool, features with non-zero variance. mean, scale: (kept,) float64.
     """
 
-    kept: NDArray[np.bool_]
-    mean: Matrix
-    scale: Matrix
+    kept: Array
+    mean: Array
+    scale: Array
 
     @classmethod
-    def fit(cls, features: NDArray[np.floating]) -> "Standardiser":
+    def fit(cls, features: Array) -> "Standardiser":
         """Learn from (N, D) training samples.
 
         A feature counts as constant when its deviation is below the rounding of its own mean.
         """
-        mean = features.mean(axis=0, dtype=np.float64)
-        scale = features.std(axis=0, dtype=np.float64)
-        rounding = 10 * np.finfo(features.dtype).eps * np.abs(mean)
+        xp = namespace(features)
+        mean = features.mean(axis=0, dtype=xp.float64)
+        scale = xp.sqrt(xp.square(features - mean).mean(axis=0))
+        rounding = 10 * xp.finfo(features.dtype).eps * abs(mean)
         kept = scale > rounding
         return cls(kept, mean[kept], scale[kept])
 
-    def __call__(self, features: NDArray[np.floating]) -> Matrix:
+    def __call__(self, features: Array) -> Array:
         """(N, D) samples as (N, kept) float64 with the training samples' mean 0 and deviation 1."""
-        return (features[:, self.kept].astype(np.float64) - self.mean) / self.scale
+        return (features[:, self.kept] - self.mean) / self.scale
 
 
-def principal_axes(samples: Matrix) -> Matrix:
+def principal_axes(samples: Array) -> Array:
     """Orthonormal axes whose span holds the rows of `samples`: (D, R) for (N, D), R = min(N, D).
 
     An L2-penalised linear model fitted on `samples @ axes` is the one fitted on `samples`: what lies outside
@@ -44,10 +45,11 @@ def principal_axes(samples: Matrix) -> Matrix:
     diagonal. Both factors are orthogonal to machine precision, also for nearly equal samples, which the
     eigenvectors of a Gram matrix, scaled back, are not.
     """
-    span = np.linalg.qr(samples.T)[0] if samples.shape[0] < samples.shape[1] else np.eye(samples.shape[1])
-    inside = samples @ span
-    axes: Matrix = span @ np.linalg.eigh(inside.T @ inside)[1]
-    return axes
+    linalg = namespace(samples).linalg
+    if samples.shape[0] < samples.shape[1]:
+        span = linalg.qr(samples.T)[0]
+        return span @ principal_axes(samples @ span)
+    return linalg.eigh(samples.T @ samples)[1]
 
 
 @dataclass(frozen=True)
@@ -58,27 +60,30 @@ class Coordinates:
     """
 
     standardise: Standardiser
-    axes: Matrix
-    train: Matrix
+    axes: Array
+    train: Array
 
     @classmethod
-    def fit(cls, features: NDArray[np.floating]) -> "Coordinates":
+    def fit(cls, features: Array) -> "Coordinates":
         """Learn from (N, D) training samples."""
         standardise = Standardiser.fit(features)
         samples = standardise(features)
         axes = principal_axes(samples)
         return cls(standardise, axes, _with_intercept(samples @ axes))
 
-    def __call__(self, features: NDArray[np.floating]) -> Matrix:
+    def __call__(self, features: Array) -> Array:
         """(N, D) other samples as (N, R + 1)."""
         return _with_intercept(self.standardise(features) @ self.axes)
 
-    def raw_weights(self, weights: Matrix) -> tuple[Matrix, float]:
+    def raw_weights(self, weights: Array) -> tuple[NDArray[np.float64], float]:
         """Weights (D,) and intercept on the raw features that decide like `weights` (R + 1,) do here."""
-        raw = np.zeros(self.standardise.kept.size)
-        raw[self.standardise.kept] = self.axes @ weights[:-1] / self.standardise.scale
-        return raw, float(weights[-1] - self.standardise.mean @ raw[self.standardise.kept])
+        kept = to_numpy(self.axes @ weights[:-1] / self.standardise.scale)
+        raw = np.zeros(self.standardise.kept.shape[0])
+        raw[to_numpy(self.standardise.kept)] = kept
+        return raw, float(weights[-1]) - float(to_numpy(self.standardise.mean) @ kept)
 
 
-def _with_intercept(coordinates: Matrix) -> Matrix:
-    return np.hstack([coordinates, np.ones((len(coordinates), 1))])
+def _with_intercept(coordinates: Array) -> Array:
+    xp = namespace(coordinates)
+    ones = xp.ones((len(coordinates), 1), dtype=xp.float64, device=coordinates.device)
+    return xp.hstack([coordinates, ones])

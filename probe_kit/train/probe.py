@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit.train.arrays import to_numpy
 from probe_kit.train.features import Coordinates
 from probe_kit.train.folds import Fold, grouped_folds
-from probe_kit.train.scores import correctness
+from probe_kit.train.samples import Samples
+from probe_kit.train.scores import correctness, log_loss
 from probe_kit.train.solver import LogisticSolver
 
 Matrix = NDArray[np.float64]
@@ -49,69 +51,100 @@ class SiteProbe:
 
     decisions: (E,) out-of-fold decision values; positive means label 1.
     strengths: (F,) the C chosen in each outer fold.
+    weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe, on raw features.
+    spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
     null: (P,) accuracies under the relabellings.
     """
 
     decisions: Matrix
     strengths: Matrix
+    weights: NDArray[np.float32]
+    intercepts: Matrix
+    spreads: Matrix
     null: Matrix
 
 
 def probe_site(
-    features: NDArray[np.floating],
+    samples: Samples,
     labels: NDArray[np.bool_],
     relabellings: NDArray[np.bool_],
     folds: list[NestedFold],
 ) -> SiteProbe:
-    """Probe (E, D) features for (E,) labels, and again for every column of (E, P) relabellings.
+    """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) relabellings.
 
     Raises ProbeNotConvergedError.
     """
     columns = np.column_stack([labels, relabellings])
-    decisions, strengths = cross_validate(features, columns, folds)
+    fitted = cross_validate(samples, columns, folds)
+    decisions = _out_of_fold(fitted, folds)
     return SiteProbe(
         decisions=decisions[:, 0],
-        strengths=strengths[:, 0],
+        strengths=np.array([fold.strengths[0] for fold in fitted]),
+        weights=np.stack([fold.weights for fold in fitted]).astype(np.float32),
+        intercepts=np.array([fold.intercept for fold in fitted]),
+        spreads=np.array([fold.spread for fold in fitted]),
         null=correctness(decisions, columns)[:, 1:].mean(axis=0),
     )
 
 
-def cross_validate(
-    features: NDArray[np.floating], labels: NDArray[np.bool_], folds: list[NestedFold]
-) -> tuple[Matrix, Matrix]:
-    """Out-of-fold decision values (E, K) and the C chosen per outer fold (F, K), every column on its own.
+@dataclass(frozen=True)
+class FittedFold:
+    """The probes of one outer fold.
 
-    features: (E, D). labels: (E, K). Raises ProbeNotConvergedError.
+    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column.
+    weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
+    training samples along them.
     """
-    decisions = np.full(labels.shape, np.nan)
-    strengths = np.empty((len(folds), labels.shape[1]))
-    for number, fold in enumerate(folds):
-        strengths[number] = choose_strengths(features, labels, fold.inner)
-        decisions[fold.outer.test] = _held_out_decisions(features, labels, fold.outer, strengths[number])
-    return decisions, strengths
+
+    decisions: Matrix
+    strengths: Matrix
+    weights: Matrix
+    intercept: float
+    spread: float
 
 
-def choose_strengths(features: NDArray[np.floating], labels: NDArray[np.bool_], folds: list[Fold]) -> Matrix:
+def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
+    """The probes of every outer fold, each column of (E, K) labels on its own.
+
+    Raises ProbeNotConvergedError.
+    """
+    return [_fit_fold(samples, labels, f.outer, choose_strengths(samples, labels, f.inner)) for f in folds]
+
+
+def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]) -> Matrix:
     """For each label column the C of the grid with the lowest held-out log-loss; the smaller one on ties."""
     loss = np.zeros((STRENGTHS.size, labels.shape[1]))
     for fold in folds:
-        coordinates = Coordinates.fit(features[fold.train])
-        held_out, truth = coordinates(features[fold.test]), labels[fold.test]
-        for step, weights in enumerate(LogisticSolver(coordinates.train).path(labels[fold.train], STRENGTHS)):
-            loss[step] += np.logaddexp(0.0, np.where(truth, -1.0, 1.0) * (held_out @ weights)).sum(axis=0)
+        train = samples.of(fold.train)
+        coordinates = Coordinates.fit(train.features)
+        held_out, truth = coordinates(samples.of(fold.test).means), labels[fold.test]
+        solver = LogisticSolver(coordinates.train)
+        for step, weights in enumerate(solver.path(train.repeat(labels[fold.train]), STRENGTHS)):
+            loss[step] += log_loss(to_numpy(held_out @ weights), truth) * fold.test.size
     chosen: Matrix = STRENGTHS[loss.round(9).argmin(axis=0)]  # rounded, so that equal losses are ties
     return chosen
 
 
-def _held_out_decisions(
-    features: NDArray[np.floating], labels: NDArray[np.bool_], fold: Fold, strengths: Matrix
-) -> Matrix:
-    coordinates = Coordinates.fit(features[fold.train])
+def _fit_fold(samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix) -> FittedFold:
+    train = samples.of(fold.train)
+    coordinates = Coordinates.fit(train.features)
     solver = LogisticSolver(coordinates.train)
-    held_out = coordinates(features[fold.test])
+    held_out, training_labels = coordinates(samples.of(fold.test).means), train.repeat(labels[fold.train])
     decisions = np.empty((fold.test.size, labels.shape[1]))
     for strength in np.unique(strengths):
         columns = np.flatnonzero(strengths == strength)
-        (weights,) = solver.path(labels[np.ix_(fold.train, columns)], np.array([strength]))
-        decisions[:, columns] = held_out @ weights
+        (weights,) = solver.path(training_labels[:, columns], np.array([strength]))
+        decisions[:, columns] = to_numpy(held_out @ weights)
+        if columns[0] == 0:
+            first = weights[:, 0]
+    raw, intercept = coordinates.raw_weights(first)
+    along = float(np.std(to_numpy(coordinates.train @ first)))
+    length = float(np.linalg.norm(raw))
+    return FittedFold(decisions, strengths, raw, intercept, along / length if length else 0.0)
+
+
+def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:
+    """(E, K) decisions, each episode's from the fold that tests it."""
+    tested = np.concatenate([fold.outer.test for fold in folds])
+    decisions: Matrix = np.concatenate([fold.decisions for fold in fitted])[np.argsort(tested)]
     return decisions

@@ -12,6 +12,7 @@ from probe_kit.identity import derive_seed
 from probe_kit.train.permutation import exchange_items, flip_items
 from probe_kit.train.probe import NestedFold, SiteProbe, nested_folds, probe_site
 from probe_kit.train.results import ProbeSettings
+from probe_kit.train.samples import Samples
 from probe_kit.train.scores import chance_level
 from probe_kit.train.targets import target_labels
 
@@ -27,7 +28,8 @@ POOLED = "all"
 class CategoryProblem:
     """What all sites of a category share: which episodes, their labels, folds and relabellings.
 
-    rows: (E,) positions in the run's episode table. labels: (E,). relabellings: (E, P).
+    rows: (E,) positions in the run's episode table. labels: (E,). relabellings: (E, P). token_permutations: how
+    many of them are fitted where every token is a sample.
     """
 
     rows: NDArray[np.intp]
@@ -37,10 +39,12 @@ class CategoryProblem:
     episodes: NDArray[np.str_]
     folds: list[NestedFold]
     relabellings: NDArray[np.bool_]
+    token_permutations: int
 
-    def probe(self, column: NDArray[np.floating]) -> SiteProbe:
-        """Probe one site; `column` has the features of all the run's episodes."""
-        return probe_site(column[self.rows], self.labels, self.relabellings, self.folds)
+    def probe(self, samples: Samples) -> SiteProbe:
+        """Probe one site; `samples` are those of all the run's episodes."""
+        drawn = self.relabellings if samples.pools else self.relabellings[:, : self.token_permutations]
+        return probe_site(samples.of(self.rows), self.labels, drawn, self.folds)
 
 
 def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:
@@ -68,6 +72,7 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
         episodes=table["episode_id"].to_numpy(dtype=str),
         folds=folds,
         relabellings=_relabel(table, labels, category, settings, folds),
+        token_permutations=settings.token_permutations,
     )
 
 
@@ -79,7 +84,8 @@ def _relabel(
     folds: list[NestedFold],
 ) -> NDArray[np.bool_]:
     """(E, P) relabellings, without those that leave a training fold with a single class: they have no probe."""
-    seed, count = derive_seed("relabelling", settings.seed, category), settings.permutations
+    seed = derive_seed("relabelling", settings.seed, category)
+    count = max(settings.permutations, settings.token_permutations)
     if settings.target == "chosen":
         drawn = exchange_items(labels, table["item_id"], table["layout"], count, seed)
     else:

@@ -54,3 +54,9 @@ class RunReader(Protocol):
 
     def column(self, site: Site, view: str) -> NDArray[np.float32]:
         """(E, D) features of one site, rows in the order of `episodes`."""
+
+    def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(E, T, D) values and (E, T) mask of one site: the tokens of `role`, or all but padding.
+
+        Every episode has at least one. Raises UnknownSiteError if no tokens were stored.
+        """

@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed, sha256_json
+from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
+from probe_kit.train.directions import Direction, Place
 from probe_kit.train.permutation import site_p
 from probe_kit.train.reader import RunReader
 from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss
@@ -35,6 +39,7 @@ class ProbeSettings:
     target: Target
     permutations: int
     seed: int
+    token_permutations: int = 0  # 0 where no token view is probed
     format: int = FORMAT
 
     @property
@@ -47,12 +52,15 @@ class ProbeSettings:
 class ProbeResults:
     """Probes of one run under one set of settings.
 
-    curves: one per (category, view).
+    curves: one per (category, view). directions: the probes' weights per (category, view, site). controls: what
+    the probes are held against, as far as that was asked for.
     created: when they were fitted (UTC, ISO 8601); not part of the key.
     """
 
     settings: ProbeSettings
     curves: Mapping[tuple[str, str], Curve]
+    directions: Mapping[Place, Direction] = field(default_factory=dict)
+    controls: Controls = field(default_factory=Controls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
 
     @property
@@ -66,7 +74,8 @@ class ProbeResults:
 
         `accuracy` with its 95 % interval over groups (`ci_low`, `ci_high`), `p` of the site alone, `p_fwe`
         against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per
-        outer fold.
+        outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
+        consistent within an item, `selectivity` the accuracy above it; NaN without relabellings.
         """
         import pandas as pd
 
@@ -76,6 +85,16 @@ class ProbeResults:
             for row in _score_rows(self, category, view, curve)
         ]
         return pd.DataFrame(rows).astype({"iteration": "Int64"})
+
+    def direction(self, category: str, view: str, site: Site) -> Direction:
+        """The probes' weights at a site, in raw features. Raises UnknownSiteError if it was not probed."""
+        try:
+            return self.directions[category, view, site]
+        except KeyError:
+            raise UnknownSiteError(
+                f"there is no direction of {site}, category {category!r}, view {view!r}; probed were the sites of "
+                f"categories {', '.join(self.settings.categories)} in views {', '.join(self.settings.views)}"
+            ) from None
 
 
 def episodes_sha256(run: RunReader) -> str:
@@ -87,7 +106,7 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
     settings, folds, correct = results.settings, curve.folds(), curve.correct
     accuracy = correct.mean(axis=1)
     low, high = group_bootstrap(correct.T, curve.groups, derive_seed("interval", settings.seed, category, view))
-    p, p_fwe = site_p(accuracy, curve.null), curve.p_fwe()
+    p, p_fwe, control = site_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
     return [
         {
             "model": settings.model,
@@ -108,6 +127,8 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
             "log_loss": float(log_loss(curve.decisions[row], curve.labels)),
             "p": p[row],
             "p_fwe": p_fwe[row],
+            "control_accuracy": control[row],
+            "selectivity": accuracy[row] - control[row],
             "n": curve.labels.size,
             "items": np.unique(curve.items).size,
             "groups": curve.n_groups,

@@ -55,10 +55,26 @@ def group_bootstrap(
 
     values: (E, S), a score per episode in each of S columns. groups: (E,). Returns low and high, (S,) each.
     """
+    low, high = np.percentile(bootstrap_means(values, groups, seed, draws), [2.5, 97.5], axis=0)
+    return low, high
+
+
+def bootstrap_means(
+    values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike, seed: int, draws: int = 2000
+) -> Matrix:
+    """Means over episodes in every draw of whole groups, (draws, S) from (E, S) values and (E,) groups.
+
+    The same names of groups and seed draw the same groups, whatever the values.
+    """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     sums = np.zeros((names.size, values.shape[1]))
     np.add.at(sums, group_of, values.astype(np.float64))
     sizes = np.bincount(group_of).astype(np.float64)
-    times = np.random.default_rng(seed).multinomial(names.size, np.full(names.size, 1 / names.size), size=draws)
-    low, high = np.percentile((times @ sums) / (times @ sizes)[:, None], [2.5, 97.5], axis=0)
-    return low, high
+    times = draw_groups(names.size, seed, draws)
+    means: Matrix = (times @ sums) / (times @ sizes)[:, None]
+    return means
+
+
+def draw_groups(count: int, seed: int, draws: int = 2000) -> NDArray[np.int64]:
+    """How often each of `count` groups is drawn, (draws, count)."""
+    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)

@@ -3,7 +3,8 @@
 The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
 Samples come in principal coordinates (`features.Coordinates`), whose columns are orthogonal: there the
 Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
-need a few products each, and all label columns share them as matrix–matrix products.
+need a few products each, and all label columns share them as matrix–matrix products. numpy arrays or torch
+tensors: samples on a GPU are solved there, in float64 as well.
 """
 
 from collections.abc import Iterator
@@ -13,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-
-Matrix = NDArray[np.float64]
+from probe_kit.train.arrays import Array, namespace
 
 MAX_NEWTON_STEPS = 100
 MAX_CG_STEPS = 100
@@ -24,13 +24,13 @@ MAX_CG_STEPS = 100
 class _Problems:
     """Problems still to be solved, one column each: where they are, and the objective there."""
 
-    columns: NDArray[np.intp]
-    signs: Matrix  # (N, K) labels as −1 and +1
-    weights: Matrix  # (R, K)
-    decisions: Matrix  # (N, K)
-    objective: Matrix  # (K,)
+    columns: Array
+    signs: Array  # (N, K) labels as −1 and +1
+    weights: Array  # (R, K)
+    decisions: Array  # (N, K)
+    objective: Array  # (K,)
 
-    def only(self, chosen: NDArray[np.bool_]) -> "_Problems":
+    def only(self, chosen: Array) -> "_Problems":
         return _Problems(*(member[..., chosen] for member in vars(self).values()))
 
 
@@ -42,15 +42,16 @@ class LogisticSolver:
     so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
     """
 
-    def __init__(self, samples: Matrix, tolerance: float = 1e-9) -> None:
+    def __init__(self, samples: Array, tolerance: float = 1e-9) -> None:
         self.samples = samples
         self.tolerance = tolerance
-        self.spectrum = np.square(samples).sum(axis=0)[:, None]
-        self.penalty = np.ones((samples.shape[1], 1))
+        self.xp = namespace(samples)
+        self.spectrum = self.xp.square(samples).sum(axis=0)[:, None]
+        self.penalty = self.xp.ones_like(self.spectrum)
         self.penalty[-1] = 0.0
-        self.rounding = 1e-15 * np.sqrt(self.spectrum.sum() * len(samples))
+        self.rounding = 1e-15 * (float(self.spectrum.sum()) * len(samples)) ** 0.5
 
-    def path(self, labels: NDArray[np.bool_], strengths: Matrix) -> Iterator[Matrix]:
+    def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
         """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
 
         Raises ProbeNotConvergedError rather than return a column that is not at its optimum, and
@@ -58,24 +59,26 @@ class LogisticSolver:
         """
         if (labels.all(axis=0) | ~labels.any(axis=0)).any():
             raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
-        signs = np.where(labels, 1.0, -1.0)
-        weights: Matrix = np.zeros((self.samples.shape[1], signs.shape[1]))
+        xp, device = self.xp, self.samples.device
+        signs = 2.0 * xp.asarray(labels, dtype=xp.float64, device=device) - 1.0
+        weights = xp.zeros((self.samples.shape[1], signs.shape[1]), dtype=xp.float64, device=device)
         for strength in strengths:
             weights = self.solve(signs, float(strength), weights)
             yield weights
 
-    def solve(self, signs: Matrix, strength: float, start: Matrix) -> Matrix:
+    def solve(self, signs: Array, strength: float, start: Array) -> Array:
         """Optimal weights (R, K) of labels −1/+1 (N, K) at C = `strength`, found from `start` (R, K)."""
-        solved = np.empty_like(start)
+        xp = self.xp
+        solved = xp.empty_like(start)
         decisions = self.samples @ start
         objective = self._objective(signs, strength, start, decisions)
-        todo = _Problems(np.arange(signs.shape[1]), signs, start, decisions, objective)
+        todo = _Problems(xp.arange(signs.shape[1], device=signs.device), signs, start, decisions, objective)
         for _ in range(MAX_NEWTON_STEPS):
             misfit = _sigmoid(-todo.signs * todo.decisions)
             gradient = self.penalty * todo.weights - strength * (self.samples.T @ (todo.signs * misfit))
-            size = np.linalg.norm(gradient, axis=0)
-            scale = np.maximum(np.linalg.norm(todo.weights[:-1], axis=0), size)
-            relative = size / np.maximum(scale, np.finfo(float).tiny)
+            size = xp.linalg.norm(gradient, axis=0)
+            scale = xp.maximum(xp.linalg.norm(todo.weights[:-1], axis=0), size)
+            relative = size / scale.clip(np.finfo(float).tiny)
             # Negated, so that NaN stays open and ends in an error.
             open_ = ~((relative <= self.tolerance) | (size <= self.rounding * strength))
             solved[:, todo.columns[~open_]] = todo.weights[:, ~open_]
@@ -83,7 +86,7 @@ class LogisticSolver:
                 return solved
             curvature = strength * (misfit * (1 - misfit))[:, open_]
             # A step more precise than the point it starts from is wasted work.
-            precision = np.minimum(0.1, np.sqrt(relative[open_]))
+            precision = xp.sqrt(relative[open_]).clip(max=0.1)
             step = self._newton_step(gradient[:, open_], curvature, precision)
             todo = self._moved(todo.only(open_), strength, gradient[:, open_], step)
         raise ProbeNotConvergedError(
@@ -92,14 +95,15 @@ class LogisticSolver:
             f"{relative.max():.1e}, expected at most {self.tolerance:.0e}. Look for extreme feature values."
         )
 
-    def _newton_step(self, gradient: Matrix, curvature: Matrix, precision: Matrix) -> Matrix:
+    def _newton_step(self, gradient: Array, curvature: Array, precision: Array) -> Array:
         """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision`.
 
         Columns that conjugate gradients do not settle in time are solved exactly.
         """
-        step = np.zeros_like(gradient)
-        todo = np.arange(gradient.shape[1])
-        target = precision * np.linalg.norm(gradient, axis=0)
+        xp = self.xp
+        step = xp.zeros_like(gradient)
+        todo = xp.arange(gradient.shape[1], device=gradient.device)
+        target = precision * xp.linalg.norm(gradient, axis=0)
         diagonal = self.penalty + self.spectrum * curvature.mean(axis=0)
         rest = -gradient
         direction = rest / diagonal
@@ -109,7 +113,7 @@ class LogisticSolver:
             length = slope / (direction * product).sum(axis=0)
             step[:, todo] += length * direction
             rest = rest - length * product
-            keep = np.linalg.norm(rest, axis=0) > target[todo]
+            keep = xp.linalg.norm(rest, axis=0) > target[todo]
             if not keep.any():
                 return step
             if not keep.all():
@@ -125,34 +129,30 @@ class LogisticSolver:
             step[:, column] = self._exact_newton_step(gradient[:, column], weight)
         return step
 
-    def _exact_newton_step(self, gradient: Matrix, curvature: Matrix) -> Matrix:
-        hessian = (self.samples.T * curvature) @ self.samples
-        hessian[np.diag_indices_from(hessian)] += self.penalty[:, 0]
-        step: Matrix = np.linalg.solve(hessian, -gradient).astype(np.float64)
-        return step
+    def _exact_newton_step(self, gradient: Array, curvature: Array) -> Array:
+        hessian = (self.samples.T * curvature) @ self.samples + self.xp.diag(self.penalty[:, 0])
+        return self.xp.linalg.solve(hessian, -gradient)
 
-    def _moved(self, todo: _Problems, strength: float, gradient: Matrix, step: Matrix) -> _Problems:
+    def _moved(self, todo: _Problems, strength: float, gradient: Array, step: Array) -> _Problems:
         """`todo` moved along `step`, which is halved per column until the objective falls enough."""
         change = self.samples @ step
         slope = (gradient * step).sum(axis=0)
-        length = np.ones(step.shape[1])
+        length = self.xp.ones_like(slope)
         while True:
             weights, decisions = todo.weights + length * step, todo.decisions + length * change
             objective = self._objective(todo.signs, strength, weights, decisions)
-            bound = todo.objective + 1e-4 * length * slope + 1e-12 * np.abs(todo.objective)
+            bound = todo.objective + 1e-4 * length * slope + 1e-12 * abs(todo.objective)
             too_far = objective > bound
             if not too_far.any():
                 return _Problems(todo.columns, todo.signs, weights, decisions, objective)
             length[too_far] /= 2
 
-    def _objective(self, signs: Matrix, strength: float, weights: Matrix, decisions: Matrix) -> Matrix:
+    def _objective(self, signs: Array, strength: float, weights: Array, decisions: Array) -> Array:
         margins = signs * decisions
-        loss = (np.maximum(-margins, 0.0) + np.log1p(np.exp(-np.abs(margins)))).sum(axis=0)
-        total: Matrix = strength * loss + 0.5 * (self.penalty * weights * weights).sum(axis=0)
-        return total
+        loss = ((-margins).clip(0.0) + self.xp.log1p(self.xp.exp(-abs(margins)))).sum(axis=0)
+        return strength * loss + 0.5 * (self.penalty * weights * weights).sum(axis=0)
 
 
-def _sigmoid(values: Matrix) -> Matrix:
+def _sigmoid(values: Array) -> Array:
     with np.errstate(over="ignore"):  # exp(large) = inf gives the right limit, 0
-        result: Matrix = 1.0 / (1.0 + np.exp(-values))
-    return result
+        return 1.0 / (1.0 + namespace(values).exp(-values))

@@ -12,13 +12,16 @@ import numpy as np
 
 from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.hooks.sites import Site
+from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
+from probe_kit.train.directions import StoredDirections, save_directions
 from probe_kit.train.probe import SiteProbe
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
 from probe_kit.train.targets import Target
 
 HOME = "probes"
+CONTROLS = "controls.json"
 
 
 def save_results(results: ProbeResults, run_path: Path) -> Path:
@@ -34,8 +37,17 @@ def save_results(results: ProbeResults, run_path: Path) -> Path:
         (draft / "settings.json").write_text(json.dumps(header, indent=2))
         results.scores.to_csv(draft / "scores.csv", index=False)
         np.savez_compressed(draft / "decisions.npz", allow_pickle=False, **_pack(results.curves))
+        save_directions(results.directions, draft / "directions.npz")
         shutil.move(draft, folder)
     return folder
+
+
+def save_controls(results: ProbeResults, run_path: Path) -> Path:
+    """Write the controls of stored results beside them, over former ones, and return that file."""
+    file = run_path / HOME / results.key / CONTROLS
+    draft = file.with_suffix(".draft")
+    draft.write_text(json.dumps(results.controls.to_json(), indent=2))
+    return draft.replace(file)
 
 
 def is_stored(run_path: Path, key: str) -> bool:
@@ -140,5 +152,8 @@ def _read_header(folder: Path) -> tuple[ProbeSettings, str]:
 
 def _read(folder: Path) -> ProbeResults:
     settings, created = _read_header(folder)
+    directions, controls = StoredDirections(folder / "directions.npz"), folder / CONTROLS
     with np.load(folder / "decisions.npz", allow_pickle=False) as arrays:
-        return ProbeResults(settings, _unpack(arrays), created)
+        curves = _unpack(arrays)
+    found = Controls.from_json(json.loads(controls.read_text())) if controls.exists() else Controls()
+    return ProbeResults(settings, curves, directions, found, created)

@@ -1,16 +1,20 @@
 """Probe every site of a run: `train_probes`."""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from probe_kit.errors import NonFiniteActivationError, NoProbesError, UnknownCategoryError, UnknownSiteError
-from probe_kit.hooks.sites import Site
+from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
+from probe_kit.train.add_controls import add_baselines, add_twin
+from probe_kit.train.arrays import check_device
+from probe_kit.train.baselines import Baseline
 from probe_kit.train.curve import Curve
+from probe_kit.train.directions import Direction
 from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
+from probe_kit.train.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.store import Unfinished, is_stored, load_results, save_results
 from probe_kit.train.targets import Target
 from probe_kit.train.workers import Key, Probed, probe_columns
@@ -25,33 +29,46 @@ def train_probes(
     views: Sequence[str] = ("mean",),
     *,
     permutations: int = 200,
+    token_permutations: int = 59,
     target: Target = "correct",
+    controls: Sequence[Baseline] = (),
+    suite: Path | None = None,
+    twin: RunReader | None = None,
     seed: int = 0,
     jobs: int | None = None,
+    device: str | None = None,
     progress: Progress | None = None,
 ) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
-    categories: each one by default; `all` pools every episode of the run. permutations: relabellings behind the
-    p-values. jobs: processes that probe, this one alone by default; with more than one, a script needs
-    `if __name__ == "__main__":`. The same settings on the same episodes are read back instead of fitted again;
-    an interrupted sweep continues after the last finished site.
+    categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
+    `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'.
+    permutations: relabellings behind the p-values, of which token views, many times as dear, take the first
+    `token_permutations`. controls: baselines that never see the model, of `position`, `instruction` and `pixels`,
+    which needs the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
+    jobs: processes that probe, this one alone by default; with more than one, a script needs
+    `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
+
+    The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
+    interrupted sweep continues after the last finished site; controls are added to what is stored.
     Raises NoProbesError for a run without activations, UnknownCategoryError, UnknownSiteError for a view no
-    stream has, TooFewGroupsError, ProbeNotConvergedError.
+    stream has, TooFewGroupsError, ProbeNotConvergedError, UsageError, and SuiteError for another suite.
     """
-    settings = _settings(run, categories, views, target, permutations, seed)
+    check_device(device)
+    if device is not None and (jobs or 1) > 1:
+        raise UsageError(f"device {device!r} is used by one process, got jobs={jobs}. Leave `jobs` out.")
+    settings = _settings(run, categories, views, target, permutations, token_permutations, seed)
     if is_stored(run.path, settings.key):
-        return load_results(run, settings.key)
-    problems = {category: category_problem(run.episodes, category, settings) for category in settings.categories}
-    probes = _probe_all(run, problems, settings, jobs, progress)
-    curves = {
-        (category, view): _curve(problem, category, view, probes)
-        for category, problem in problems.items()
-        for view in settings.views
-    }
-    results = ProbeResults(settings, curves)
-    save_results(results, run.path)
-    Unfinished.of(run.path, settings.key).discard()
+        results = load_results(run, settings.key)
+    else:
+        results = _fit(run, settings, jobs or 1, device, progress)
+    results = add_baselines(results, run, controls, suite)
+    if twin is not None:
+        others = train_probes(
+            twin, settings.categories, views, permutations=permutations, token_permutations=token_permutations,
+            target=target, seed=seed, jobs=jobs, device=device, progress=progress,
+        )  # fmt: skip
+        results = add_twin(results, run, others)
     return results
 
 
@@ -61,6 +78,7 @@ def _settings(
     views: Sequence[str],
     target: Target,
     permutations: int,
+    token_permutations: int,
     seed: int,
 ) -> ProbeSettings:
     if not run.streams:
@@ -80,24 +98,53 @@ def _settings(
         target=target,
         permutations=permutations,
         seed=seed,
+        token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
     )
 
 
-def _sites(run: RunReader, view: str) -> list[Site]:
-    """Sites that have `view`, over all streams."""
-    sites = [site for stream in run.streams if view in run.views(stream) for site in run.sites(stream)]
-    if not sites:
-        known = sorted({name for stream in run.streams for name in run.views(stream)})
-        raise UnknownSiteError(f"{run.path} has no view {view!r}; it has: {', '.join(known)}")
-    return sites
+def _fit(
+    run: RunReader, settings: ProbeSettings, jobs: int, device: str | None, progress: Progress | None
+) -> ProbeResults:
+    problems = {category: category_problem(run.episodes, category, settings) for category in settings.categories}
+    probes = _probe_all(run, problems, settings, jobs, device, progress)
+    curves = {
+        (category, view): _curve(problem, category, view, probes)
+        for category, problem in problems.items()
+        for view in settings.views
+    }
+    directions = {
+        (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
+        for (view, site), found in probes.items()
+        for category, probe in found.items()
+    }
+    results = ProbeResults(settings, curves, directions)
+    save_results(results, run.path)
+    Unfinished.of(run.path, settings.key).discard()
+    return load_results(run, settings.key)
 
 
-def _curve(
-    problem: CategoryProblem,
-    category: str,
-    view: str,
-    probes: Mapping[Key, Probed],
-) -> Curve:
+def _probe_all(
+    run: RunReader,
+    problems: Mapping[str, CategoryProblem],
+    settings: ProbeSettings,
+    jobs: int,
+    device: str | None,
+    progress: Progress | None,
+) -> dict[Key, Probed]:
+    """Every view and site, in order, for every category; what a former sweep finished is read back."""
+    keys = [(view, site) for view in settings.views for site in sites_of(run, view)]
+    unfinished = Unfinished.of(run.path, settings.key)
+    probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
+    columns = ((key, read_samples(run, *key)) for key in keys if key not in probes)
+    for key, found in probe_columns(columns, problems, jobs, device):
+        unfinished.keep(*key, found)
+        probes[key] = found
+        if progress is not None:
+            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
+    return {key: probes[key] for key in keys}
+
+
+def _curve(problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]) -> Curve:
     found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
     fold_of = np.empty(problem.labels.size, dtype=np.int64)
     for number, fold in enumerate(problem.folds):
@@ -113,35 +160,3 @@ def _curve(
         strengths=np.stack([probe.strengths for probe in found.values()]),
         null=np.stack([probe.null for probe in found.values()]),
     )
-
-
-def _probe_all(
-    run: RunReader,
-    problems: Mapping[str, CategoryProblem],
-    settings: ProbeSettings,
-    jobs: int | None,
-    progress: Progress | None,
-) -> dict[Key, Probed]:
-    """Every view and site, in order, for every category; what a former sweep finished is read back."""
-    keys = [(view, site) for view in settings.views for site in _sites(run, view)]
-    unfinished = Unfinished.of(run.path, settings.key)
-    probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
-    columns = ((key, _finite_column(run, *key)) for key in keys if key not in probes)
-    for key, found in probe_columns(columns, problems, jobs or 1):
-        unfinished.keep(*key, found)
-        probes[key] = found
-        if progress is not None:
-            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
-    return {key: probes[key] for key in keys}
-
-
-def _finite_column(run: RunReader, view: str, site: Site) -> NDArray[np.float32]:
-    column = run.column(site, view)
-    broken = np.flatnonzero(~np.isfinite(column).all(axis=1))
-    if broken.size:
-        raise NonFiniteActivationError(
-            f"{site}, view {view!r}, of {run.path} holds NaN or infinity in {broken.size} of {len(column)} "
-            f"episodes, the first {run.episodes['episode_id'].iloc[broken[0]]!r}; expected finite features. "
-            "Extract these episodes again."
-        )
-    return column

@@ -184,6 +184,11 @@ def test_a_missing_picture_stops_the_reset_and_leaves_the_environment_usable(sha
     assert shared_env.task == "built-in:o"
 
 
+def test_an_item_that_is_none_is_refused(shared_env):
+    with pytest.raises(SceneError, match="is a str; expected an Item"):
+        shared_env.reset(options={"item": "color-0001"})
+
+
 def test_unknown_options_are_refused(shared_env):
     with pytest.raises(SceneError, match="'itme'"):
         shared_env.reset(options={"itme": None})

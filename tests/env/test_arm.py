@@ -1,8 +1,12 @@
+from pathlib import Path
+
 import numpy as np
+import pybullet_data
 import pytest
 
 from probe_kit.env.arm_models import ARMS
 from probe_kit.env.rotations import from_rpy
+from probe_kit.errors import SceneError
 
 STAY_OPEN = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
@@ -47,6 +51,22 @@ def test_the_fingers_stay_symmetric(arm, arm_env):
     arm_env.advance(np.zeros(7))
     left, right = (arm_env.scene.client.getJointState(arm.body, f)[0] for f in arm.model.fingers)
     assert left == pytest.approx(right, abs=1e-3)
+
+
+def test_a_description_of_ones_own_takes_the_place_of_ours(make_env, play):
+    theirs = ARMS["panda"].urdf(None)
+    assert play(make_env(arm_urdf=theirs, early_stop=True), seed=0) == play(make_env(early_stop=True), seed=0)
+
+
+def test_a_missing_description_is_named(make_env):
+    with pytest.raises(SceneError, match=r"no arm description nowhere\.urdf"):
+        make_env(arm_urdf=Path("nowhere.urdf")).reset(seed=0)
+
+
+def test_a_description_of_another_robot_is_refused(make_env):
+    other = Path(pybullet_data.getDataPath()) / "r2d2.urdf"
+    with pytest.raises(SceneError, match="does not describe this arm"):
+        make_env(arm_urdf=other).reset(seed=0)
 
 
 @pytest.mark.parametrize("model", ARMS.values(), ids=ARMS)

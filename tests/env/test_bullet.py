@@ -35,8 +35,11 @@ def test_closing_twice_is_fine_and_spares_the_others():
     other.close()
 
 
-def test_importing_the_environment_loads_neither_the_simulator_nor_torch():
-    code = "import sys, probe_kit.env; print({'pybullet', 'torch', 'lerobot'} & set(sys.modules))"
+def test_making_an_environment_loads_neither_the_simulator_nor_torch():
+    code = (
+        "import sys, probe_kit.env; probe_kit.env.Act2AnswerEnv(); "
+        "print({'pybullet', 'torch', 'lerobot'} & set(sys.modules))"
+    )
     root = Path(__file__).parents[2]
     assert run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root).stdout.strip() == "set()"
 

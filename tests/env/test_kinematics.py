@@ -72,6 +72,16 @@ def test_a_small_step_needs_only_a_few_iterations(arm, arm_env):
     assert arm.chain.solve(target, home, posture, iterations=4).error < 1e-5
 
 
+def test_a_redundant_arm_does_not_wander_off_when_the_tool_goes_round_in_circles(shared_env):
+    shared_env.reset(seed=0)
+    chain, home = shared_env.scene.arm.chain, shared_env.scene.home_q
+    centre, q = chain.pose(home), home
+    for angle in np.linspace(0, 10 * np.pi, 250):
+        offset = 0.1 * np.array([np.cos(angle) - 1, np.sin(angle), 0])
+        q = chain.solve(Pose(centre.position + offset, centre.rotation), q, home).q
+    np.testing.assert_allclose(q, home, atol=0.1)
+
+
 def test_an_unreachable_place_is_reported_by_its_error(arm, arm_env):
     home = arm_env.scene.home_q
     target = Pose(np.array([5.0, 0.0, 0.3]), np.array(arm.model.down))

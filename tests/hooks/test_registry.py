@@ -31,7 +31,7 @@ def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pyte
 
 def test_a_third_party_cannot_replace_an_embedded_family(monkeypatch: pytest.MonkeyPatch) -> None:
     impostor = Family("pi0", "not pi0", None, "nowhere:nothing")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [SimpleNamespace(load=lambda: impostor)])
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [SimpleNamespace(load=lambda: impostor)])
     assert families()["pi0"] is not impostor
 
 

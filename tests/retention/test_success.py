@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from probe_kit.errors import UsageError
-from probe_kit.retention import Regime, chance_margin, normalised_score, success_rate
+from probe_kit.errors import SceneError, UsageError
+from probe_kit.retention import Regime, chance_margin, normalised_score, sensitivity, success_rate
 from probe_kit.retention.success import paired_items, regime
 
 Outcomes = Callable[..., pd.DataFrame]
@@ -83,3 +83,21 @@ def test_a_layout_that_did_not_run_has_no_rate(outcome_table: Outcomes) -> None:
 def test_no_episodes_have_no_success_rate(outcome_table: Outcomes) -> None:
     with pytest.raises(UsageError, match="no finished episodes"):
         success_rate(outcome_table(correct=1, wrong=0, oob=0)[:0])
+
+
+def test_success_is_scored_again_for_every_radius(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(2, 2, 0).assign(
+        distance_correct=[0.05, 0.06, 0.2, None], distance_wrong=[0.2, 0.2, 0.06, None]
+    )
+    assert sensitivity(episodes) == {0.055: 0.25, 0.065: 0.5, 0.081: 0.5}
+    assert sensitivity(episodes, (0.01,)) == {0.01: 0.0}
+
+
+def test_a_radius_that_makes_zones_overlap_is_refused(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(1, 0, 0).assign(distance_correct=0.05, distance_wrong=0.06)
+    with pytest.raises(SceneError, match="overlap"):
+        sensitivity(episodes, (0.07,))
+
+
+def test_a_table_without_distances_has_no_sensitivity(outcome_table: Outcomes) -> None:
+    assert sensitivity(outcome_table(1, 0, 0)) == {}

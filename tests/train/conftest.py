@@ -1,17 +1,25 @@
 """Runs in memory with a signal planted where a test wants it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from threadpoolctl import threadpool_limits
 
 from probe_kit.hooks import Site, Stream
 from probe_kit.identity import derive_seed
 from probe_kit.train import ArrayRun
 
 PlantedRun = Callable[..., ArrayRun]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> Iterator[None]:
+    """The matrices are tiny: on a busy machine more threads wait for each other."""
+    with threadpool_limits(1):
+        yield
 
 
 def episode_table(n_items: int, category: str, seed: int = 0) -> pd.DataFrame:
@@ -31,6 +39,7 @@ def episode_table(n_items: int, category: str, seed: int = 0) -> pd.DataFrame:
                     "category": category,
                     "group_id": f"{category}-group-{number // 2}",
                     "layout": layout,
+                    "instruction": f"put the cube on picture {number % 7}",
                     "side_correct": side,
                     "side_placed": placed,
                     "outcome": outcome,

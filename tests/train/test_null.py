@@ -5,6 +5,7 @@ import pytest
 
 from probe_kit.train.permutation import family_p, flip_items, site_p
 from probe_kit.train.probe import nested_folds, probe_site
+from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness
 
 ITEMS = np.repeat(np.arange(20), 2)
@@ -18,7 +19,8 @@ def p_values(seed: int, sites: int, relabellings: int) -> tuple[np.ndarray, np.n
     columns = flip_items(LABELS, ITEMS, relabellings, seed)
     folds = nested_folds(LABELS, ITEMS, seed)
     probes = [
-        probe_site(shared + generator.standard_normal((40, 6)), LABELS, columns, folds) for _ in range(sites)
+        probe_site(Samples.pooled(shared + generator.standard_normal((40, 6))), LABELS, columns, folds)
+        for _ in range(sites)
     ]
     accuracy = np.array([correctness(probe.decisions, LABELS).mean() for probe in probes])
     null = np.stack([probe.null for probe in probes])

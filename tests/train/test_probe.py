@@ -5,11 +5,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import TooFewGroupsError
+from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import flip_items
-from probe_kit.train.probe import STRENGTHS, NestedFold, cross_validate, nested_folds, probe_site
+from probe_kit.train.probe import STRENGTHS, NestedFold, nested_folds, probe_site
+from probe_kit.train.samples import Samples
 
 ITEMS = np.repeat(np.arange(30), 2)
 LABELS = np.tile([True, False], 30)
+NONE = np.empty((60, 0), dtype=bool)
 FEATURES = np.random.default_rng(0).standard_normal((60, 90)) + 0.25 * np.where(LABELS, 1, -1)[:, None]
 
 
@@ -38,18 +41,19 @@ def scikit_learn_nested(folds: list[NestedFold]) -> tuple[np.ndarray, list[float
 def test_nested_cross_validation_equals_the_same_loops_over_scikit_learn() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
     expected, chosen = scikit_learn_nested(folds)
-    decisions, strengths = cross_validate(FEATURES, LABELS[:, None], folds)
-    np.testing.assert_allclose(decisions[:, 0], expected, atol=1e-6 * np.abs(expected).max())
-    assert strengths[:, 0].tolist() == chosen
+    probe = probe_site(Samples.pooled(FEATURES), LABELS, NONE, folds)
+    np.testing.assert_allclose(probe.decisions, expected, atol=1e-6 * np.abs(expected).max())
+    assert probe.strengths.tolist() == chosen
 
 
 def test_relabelled_columns_are_probed_like_real_labels() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
     relabelled = flip_items(LABELS, ITEMS, 3, seed=0)
-    null = probe_site(FEATURES, LABELS, relabelled, folds).null
+    samples = Samples.pooled(FEATURES)
+    null = probe_site(samples, LABELS, relabelled, folds).null
     for draw in range(3):
-        alone, _ = cross_validate(FEATURES, relabelled[:, [draw]], folds)
-        assert null[draw] == ((alone[:, 0] > 0) == relabelled[:, draw]).mean()
+        alone = probe_site(samples, relabelled[:, draw], NONE, folds).decisions
+        assert null[draw] == ((alone > 0) == relabelled[:, draw]).mean()
 
 
 def test_inner_folds_stay_inside_the_outer_training_side_and_keep_groups_whole() -> None:
@@ -67,8 +71,9 @@ def test_leaking_groups_on_purpose_inflates_accuracy() -> None:
     features = generator.standard_normal((40, 400))[pair] + 0.1 * generator.standard_normal((80, 400))
 
     def accuracy(groups: np.ndarray) -> float:
-        decisions, _ = cross_validate(features, labels[:, None], nested_folds(labels, groups, seed=0))
-        return float(((decisions[:, 0] > 0) == labels).mean())
+        none = np.empty((80, 0), dtype=bool)
+        probe = probe_site(Samples.pooled(features), labels, none, nested_folds(labels, groups, seed=0))
+        return float(((probe.decisions > 0) == labels).mean())
 
     assert accuracy(pair) < 0.6
     assert accuracy(np.arange(80)) > 0.75
@@ -82,5 +87,73 @@ def test_too_few_groups_for_the_inner_folds_say_so() -> None:
 def test_ties_go_to_the_smaller_strength() -> None:
     """Without any varying feature every C gives the same probe."""
     folds = nested_folds(LABELS, ITEMS, seed=0)
-    _, strengths = cross_validate(np.ones((60, 5)), LABELS[:, None], folds)
-    assert (strengths == STRENGTHS[0]).all()
+    probe = probe_site(Samples.pooled(np.ones((60, 5))), LABELS, NONE, folds)
+    assert (probe.strengths == STRENGTHS[0]).all()
+
+
+# -- tokens ----------------------------------------------------------------------------------------------------
+
+MASK = np.random.default_rng(2).random((60, 4)) < 0.7
+MASK[:, 0] = True
+VALUES = np.random.default_rng(3).standard_normal((60, 4, 6)) + 0.4 * np.where(LABELS, 1, -1)[:, None, None]
+
+
+def scikit_learn_token_logits(strength: float, fold: Fold) -> np.ndarray:
+    """Mean token logit of every test episode, each token of the training episodes being a sample."""
+    probe = make_pipeline(
+        StandardScaler(), LogisticRegression(C=strength, tol=1e-10, solver="newton-cholesky", max_iter=1000)
+    )
+    labels = np.repeat(LABELS[fold.train], MASK[fold.train].sum(axis=1))
+    probe.fit(VALUES[fold.train][MASK[fold.train]], labels)
+    return np.array([probe.decision_function(VALUES[test][MASK[test]]).mean() for test in fold.test])
+
+
+def test_token_probes_equal_scikit_learn_on_every_token_with_logits_averaged_per_episode() -> None:
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    probe = probe_site(Samples.tokens(VALUES, MASK), LABELS, NONE, folds)
+    expected = np.empty(60)
+    for number, fold in enumerate(folds):
+        loss = np.zeros(STRENGTHS.size)
+        for step, strength in enumerate(STRENGTHS):
+            for inner in fold.inner:
+                signed = np.where(LABELS[inner.test], 1, -1) * scikit_learn_token_logits(strength, inner)
+                loss[step] += np.logaddexp(0, -signed).sum()
+        assert probe.strengths[number] == STRENGTHS[loss.argmin()]
+        expected[fold.outer.test] = scikit_learn_token_logits(probe.strengths[number], fold.outer)
+    np.testing.assert_allclose(probe.decisions, expected, atol=1e-6 * np.abs(expected).max())
+
+
+# -- weights ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "samples", [Samples.pooled(FEATURES), Samples.tokens(VALUES, MASK)], ids=["mean", "tokens"]
+)
+def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Samples) -> None:
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    probe = probe_site(samples, LABELS, NONE, folds)
+    for number, fold in enumerate(folds):
+        held_out = samples.means[fold.outer.test] @ probe.weights[number] + probe.intercepts[number]
+        np.testing.assert_allclose(held_out, probe.decisions[fold.outer.test], atol=1e-5)
+        along = samples.of(fold.outer.train).features @ probe.weights[number]
+        assert probe.spreads[number] == pytest.approx(
+            along.std() / np.linalg.norm(probe.weights[number]), rel=1e-5
+        )
+
+
+# -- torch -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "samples", [Samples.pooled(FEATURES), Samples.tokens(VALUES, MASK)], ids=["mean", "tokens"]
+)
+def test_torch_gives_the_numbers_of_numpy(samples: Samples) -> None:
+    pytest.importorskip("torch").set_num_threads(1)
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    relabelled = flip_items(LABELS, ITEMS, 5, seed=0)
+    numpy_probe = probe_site(samples, LABELS, relabelled, folds)
+    torch_probe = probe_site(samples.to("cpu"), LABELS, relabelled, folds)
+    scale = np.abs(numpy_probe.decisions).max()
+    np.testing.assert_allclose(torch_probe.decisions, numpy_probe.decisions, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_array_equal(torch_probe.strengths, numpy_probe.strengths)
+    np.testing.assert_array_equal(torch_probe.null, numpy_probe.null)

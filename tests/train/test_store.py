@@ -26,7 +26,9 @@ def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun)
     run = planted_run()
     results = train_probes(run, permutations=2)
     folder = run.path / "probes" / results.key
-    assert sorted(path.name for path in folder.iterdir()) == ["decisions.npz", "scores.csv", "settings.json"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "decisions.npz", "directions.npz", "scores.csv", "settings.json",
+    ]  # fmt: skip
     scores = pd.read_csv(folder / "scores.csv")
     np.testing.assert_allclose(scores["accuracy"], results.scores["accuracy"])
     assert (scores["settings"] == results.key).all()

@@ -1,3 +1,4 @@
+import shutil
 from collections.abc import Callable
 
 import numpy as np
@@ -9,6 +10,7 @@ from probe_kit.errors import (
     TooFewGroupsError,
     UnknownCategoryError,
     UnknownSiteError,
+    UsageError,
 )
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, train_probes
@@ -81,6 +83,62 @@ def test_the_same_settings_are_read_back_and_others_are_fitted(planted_run: Plan
     assert train_probes(run, permutations=2).created == first.created
     assert not read
     assert train_probes(run, permutations=3).key != first.key
+
+
+def with_tokens(run: ArrayRun, strength: float) -> ArrayRun:
+    """Three tokens per episode at every site, one of them padding in every second episode."""
+    sign = np.where(run.episodes["side_correct"] == "left", strength, -strength)
+    mask = np.ones((80, 3), bool)
+    mask[::2, 2] = False
+    for number, (site, _) in enumerate(list(run.features)):
+        values = np.random.default_rng(number).standard_normal((80, 3, 6))
+        values[:, :, 0] += sign[:, None]
+        values[~mask] = 1e6
+        run.token_features[site, None] = (values, mask)  # type: ignore[index]
+    return run
+
+
+def test_token_views_are_probed_beside_pooled_ones_with_fewer_relabellings(planted_run: PlantedRun) -> None:
+    run = with_tokens(planted_run(), strength=2.0)
+    results = train_probes(run, views=("mean", "tokens"), permutations=30, token_permutations=20)
+    mean, tokens = results.curves["color", "mean"], results.curves["color", "tokens"]
+    assert (mean.null.shape[1], tokens.null.shape[1]) == (30, 20)
+    assert (tokens.correct.mean(axis=1) > 0.95).all()
+    assert (mean.correct.mean(axis=1) < 0.7).all()
+    assert (tokens.fold_of == mean.fold_of).all()
+
+
+def test_the_number_of_token_relabellings_matters_only_for_token_views(planted_run: PlantedRun) -> None:
+    run = with_tokens(planted_run(), strength=2.0)
+    pooled = [train_probes(run, permutations=3, token_permutations=count).key for count in (1, 2)]
+    tokens = [train_probes(run, views=("tokens",), permutations=3, token_permutations=n).key for n in (1, 2)]
+    assert pooled[0] == pooled[1]
+    assert tokens[0] != tokens[1]
+
+
+def test_selectivity_is_the_accuracy_above_random_labels_of_items(planted_run: PlantedRun) -> None:
+    results = train_probes(planted_run({PLANTED: 2.0}), permutations=20)
+    control = results.curves["color", "mean"].null.mean(axis=1)
+    np.testing.assert_allclose(results.scores["control_accuracy"], control)
+    np.testing.assert_allclose(results.scores["selectivity"], results.scores["accuracy"] - control)
+    assert train_probes(planted_run(), permutations=0).scores["selectivity"].isna().all()
+
+
+def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun) -> None:
+    pytest.importorskip("torch").set_num_threads(1)
+    run = planted_run({PLANTED: 2.0}, n_items=20)
+    by_torch = train_probes(run, permutations=2, device="cpu")
+    shutil.rmtree(run.path)
+    by_numpy = train_probes(run, permutations=2)
+    assert by_torch.key == by_numpy.key
+    one, other = (results.curves["color", "mean"].decisions for results in (by_torch, by_numpy))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * np.abs(other).max())
+
+
+def test_a_device_is_not_shared_by_processes(planted_run: PlantedRun) -> None:
+    pytest.importorskip("torch")
+    with pytest.raises(UsageError, match="one process"):
+        train_probes(planted_run(), device="cpu", jobs=2)
 
 
 def test_progress_counts_every_site(planted_run: PlantedRun) -> None:

@@ -6,6 +6,7 @@ from probe_kit.hooks import Site
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import nested_folds
 from probe_kit.train.problem import CategoryProblem
+from probe_kit.train.samples import Samples
 from probe_kit.train.workers import Key, probe_columns
 
 ITEMS = np.repeat(np.arange(10), 2)
@@ -18,14 +19,15 @@ PROBLEM = CategoryProblem(
     episodes=np.arange(20).astype(str),
     folds=nested_folds(LABELS, ITEMS, 0),
     relabellings=flip_items(LABELS, ITEMS, 3, 0),
+    token_permutations=0,
 )
 
 
-def columns(read: list[Key]) -> Iterator[tuple[Key, np.ndarray]]:
+def columns(read: list[Key]) -> Iterator[tuple[Key, Samples]]:
     for layer in range(6):
         key = ("mean", Site("backbone", layer))
         read.append(key)
-        yield key, np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32)
+        yield key, Samples.pooled(np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32))
 
 
 def test_processes_give_the_same_numbers_as_this_one() -> None:

@@ -1,0 +1,92 @@
+"""Groups of runs against each other: what co-training, fine-tuning or RL changed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from probe_kit.retention.estimates import Estimate, Estimates, Limits, average
+from probe_kit.retention.mean_row import average_estimates
+from probe_kit.retention.rows import MEAN
+from probe_kit.retention.run_rows import Drawn
+
+
+@dataclass(frozen=True)
+class Difference:
+    """`group` minus `minus` in one category and view, each group the mean of its runs; 95 % intervals.
+
+    paired: whether both ran the same items, which are then drawn together; otherwise each group's on its own.
+    Retention is the debiased one, None unless it is defined in both groups. In a row of category `mean`, numbers
+    are averages over the categories that both groups have.
+    """
+
+    group: str
+    minus: str
+    category: str
+    view: str | None
+    paired: bool
+    sr: float
+    sr_ci: Limits
+    prefix_accuracy: float | None = None
+    prefix_ci: Limits | None = None
+    action_accuracy: float | None = None
+    action_ci: Limits | None = None
+    retention: float | None = None
+    retention_ci: Limits | None = None
+
+
+def group_differences(groups: Mapping[str, Sequence[Drawn]]) -> list[Difference]:
+    """Every group minus every later one, per view and category and over all of them."""
+    found = []
+    for name, other in combinations(groups, 2):
+        here, there = (_by_view(groups[one]) for one in (name, other))
+        for view in here:
+            if view in there:
+                found += _compare(name, other, view, here[view], there[view])
+    return found
+
+
+def _by_view(drawn: Sequence[Drawn]) -> dict[str | None, dict[str, Estimates]]:
+    """Estimates per view and category, averaged over runs; a quantity that a run lacks is left out."""
+    views: dict[str | None, dict[str, list[Estimates]]] = {}
+    for one in drawn:
+        views.setdefault(one.row.view, {}).setdefault(one.row.category, []).append(one.estimates)
+    return {
+        view: {category: _average_common(found) for category, found in categories.items()}
+        for view, categories in views.items()
+    }
+
+
+def _average_common(found: Sequence[Estimates]) -> Estimates:
+    return {name: average([one[name] for one in found]) for name in found[0] if all(name in one for one in found)}
+
+
+def _compare(
+    group: str, minus: str, view: str | None, here: Mapping[str, Estimates], there: Mapping[str, Estimates]
+) -> list[Difference]:
+    common = [category for category in here if category in there]
+    gaps = {
+        category: {
+            name: estimate - there[category][name]
+            for name, estimate in here[category].items()
+            if name in there[category]
+        }
+        for category in common
+    }
+    paired = {category: here[category]["sr"].units == there[category]["sr"].units for category in common}
+    rows = [_row(group, minus, category, view, paired[category], gap) for category, gap in gaps.items()]
+    if rows:
+        rows.append(_row(group, minus, MEAN, view, all(paired.values()), average_estimates(list(gaps.values()))))
+    return rows
+
+
+def _row(group: str, minus: str, category: str, view: str | None, paired: bool, gap: Estimates) -> Difference:
+    prefix, action, retention = (
+        _value(gap.get(name)) for name in ("prefix_accuracy", "action_accuracy", "retention_debiased")
+    )
+    return Difference(
+        group, minus, category, view, paired, gap["sr"].value, gap["sr"].ci, *prefix, *action, *retention
+    )
+
+
+def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:
+    return (None, None) if estimate is None else (estimate.value, estimate.ci)

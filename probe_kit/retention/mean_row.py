@@ -1,0 +1,78 @@
+"""The average over the categories of one run, with its intervals."""
+
+from collections.abc import Sequence
+from statistics import fmean
+from typing import Any
+
+from probe_kit.retention.estimates import Estimates, Limits, average
+from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.run_rows import Drawn
+from probe_kit.retention.success import normalised_score
+
+_AVERAGED = (
+    "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "chance", "prefix_accuracy",
+    "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin", "action_twin",
+)  # fmt: skip
+
+
+def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
+    """The category average of rows of one run and view; retention over the categories where it is defined.
+
+    Intervals: items, or groups for probes, drawn within each category.
+    """
+    rows = [one.row for one in drawn]
+    estimates = average_estimates([one.estimates for one in drawn])
+    first, counted = rows[0], [row for row in rows if row.retention_defined]
+    left_out = tuple(row.category for row in rows if row.view is not None and not row.retention_defined)
+    note = f"without {', '.join(left_out)}" if left_out else ""
+    return RetentionRow(
+        run=first.run,
+        model=first.model,
+        random_weights=first.random_weights,
+        suite=first.suite,
+        run_settings=first.run_settings,
+        probe_settings=first.probe_settings,
+        group=first.group,
+        category=MEAN,
+        view=first.view,
+        n_episodes=sum(row.n_episodes for row in rows),
+        n_items=sum(row.n_items for row in rows),
+        normalised_score=normalised_score([row.sr for row in rows]),
+        sr=fmean(row.sr for row in rows),
+        sr_ci=_limits(estimates, "sr"),
+        prefix_ci=_limits(estimates, "prefix_accuracy"),
+        action_ci=_limits(estimates, "action_accuracy"),
+        **{name: _mean(rows, name) for name in _AVERAGED},
+        sr_by_epsilon=_mean_by_key([row.sr_by_epsilon for row in rows]),
+        baselines=_mean_by_key([row.baselines for row in rows]),
+        leaks=tuple(dict.fromkeys(name for row in rows for name in row.leaks)),
+        twin=first.twin,
+        retention=_mean(counted, "retention"),
+        retention_debiased=_mean(counted, "retention_debiased"),
+        retention_ci=_limits(estimates, "retention_debiased"),
+        retention_defined=bool(counted),
+        retention_note=note if counted else first.retention_note,
+        categories=tuple(row.category for row in rows),
+        left_out=left_out,
+    )
+
+
+def average_estimates(estimates: Sequence[Estimates]) -> Estimates:
+    """Every quantity averaged over those that have it."""
+    names = dict.fromkeys(name for found in estimates for name in found)
+    return {name: average([found[name] for found in estimates if name in found]) for name in names}
+
+
+def _limits(estimates: Estimates, name: str) -> Limits | None:
+    return estimates[name].ci if name in estimates else None
+
+
+def _mean(rows: Sequence[RetentionRow], name: str) -> Any:
+    """Average of a column over the rows that have it; None if none has."""
+    values = [value for row in rows if (value := getattr(row, name)) is not None]
+    return fmean(values) if values else None
+
+
+def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Average per key, for the keys that all have."""
+    return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}

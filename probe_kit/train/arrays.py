@@ -1,0 +1,48 @@
+"""Arrays of numpy or torch: the linear algebra is written once, in the names that both share."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import MissingExtraError, UsageError
+
+Array = Any
+"""A numpy array, or a torch tensor on any device."""
+
+
+def namespace(array: Array) -> Any:
+    """The module that made `array`: numpy or torch."""
+    return import_module(type(array).__module__.partition(".")[0])
+
+
+def to_device(array: NDArray[Any], device: str | None) -> Array:
+    """`array` as a torch tensor on `device`, or as it is without one."""
+    if device is None:
+        return array
+    import torch
+
+    return torch.as_tensor(array, device=device)
+
+
+def to_numpy(array: Array) -> NDArray[Any]:
+    """`array` as a numpy array in this machine's memory."""
+    return array if isinstance(array, np.ndarray) else np.asarray(array.cpu())
+
+
+def check_device(device: str | None) -> None:
+    """Raises MissingExtraError without torch, and UsageError for a device torch does not know or see."""
+    if device is None:
+        return
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(f"device {device!r} needs torch. Install it, or leave `device` out.") from error
+    try:
+        torch.zeros(1, dtype=torch.float64, device=device)
+    except (RuntimeError, AssertionError, TypeError) as error:  # what torch raises: unknown, absent, no float64
+        reason = str(error).partition("\n")[0]
+        raise UsageError(
+            f"device {device!r} cannot be used: {reason}. Try 'cuda', or leave `device` out."
+        ) from error

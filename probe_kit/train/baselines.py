@@ -1,0 +1,108 @@
+"""Features that never saw the model: what layout, instruction and pictures alone give away."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.suite import Suite
+
+Baseline = Literal["position", "instruction", "pixels"]
+BASELINES: dict[str, str] = {
+    "position": "the layout alone",
+    "instruction": "the words of the instruction, alone and with the layout",
+    "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
+}
+THUMBNAIL = 32
+
+Features = NDArray[np.float32]
+
+
+def baseline_features(run: RunReader, name: Baseline, suite: Path | None) -> Features:
+    """(E, D) features of a baseline, rows in the order of the run's episodes.
+
+    Raises UsageError for an unknown name, a missing column or a missing suite, SuiteError for another suite.
+    """
+    if name == "position":
+        return _layout(run.episodes)
+    if name == "instruction":
+        return _words(run)
+    if name == "pixels":
+        if suite is None:
+            raise UsageError(
+                "the pixel baseline needs the pictures: give the folder of the run's suite as `suite`"
+            )
+        return _pixels(run.episodes, suite_of(run, suite))
+    raise UsageError(f"unknown control {name!r}; expected one of {', '.join(BASELINES)}")
+
+
+def suite_of(run: RunReader, folder: Path) -> "Suite":
+    """The suite in `folder`, if it is the run's, or holds the run's items as part of it.
+
+    Raises SuiteError if neither hash is the one the run was extracted with.
+    """
+    from probe_kit.suite import load_suite
+    from probe_kit.suite.suite import content_sha256
+
+    suite, ids = load_suite(folder), set(run.episodes["item_id"])
+    expected = run.suite.rpartition("#")[2]
+    part = content_sha256(item for item in suite.items if item.item_id in ids)
+    if not (suite.content_sha256.startswith(expected) or part.startswith(expected)):
+        raise SuiteError(
+            f"{folder} holds {suite.identity}, and its items that {run.path} has hash to {part[:12]}; the run was "
+            f"extracted from {run.suite}. Give that suite's folder, and a run with all its episodes."
+        )
+    return suite
+
+
+def _layout(episodes: "pd.DataFrame") -> Features:
+    """(E, 1): +1 in the original layout, −1 in the swapped one."""
+    original = (episodes["layout"] == "original").to_numpy()
+    return np.where(original, np.float32(1), np.float32(-1))[:, None]
+
+
+def _words(run: RunReader) -> Features:
+    """(E, 2 W): how often each word occurs in the instruction, then the same times the layout's sign.
+
+    The second half shows a word whose picture always lies on one side.
+    """
+    if "instruction" not in run.episodes:
+        raise UsageError(f"the episodes of {run.path} have no column 'instruction'; leave that control out")
+    words = [str(text).lower().split() for text in run.episodes["instruction"]]
+    known = {word: number for number, word in enumerate(sorted({word for text in words for word in text}))}
+    counts = np.zeros((len(words), len(known)), np.float32)
+    for row, text in enumerate(words):
+        for word in text:
+            counts[row, known[word]] += 1
+    return np.hstack([counts, counts * _layout(run.episodes)])
+
+
+def _pixels(episodes: "pd.DataFrame", suite: "Suite") -> Features:
+    """(E, 6144): the left and the right picture of every episode, RGB from 0 to 1."""
+    from probe_kit.suite import Episode
+
+    items = {item.item_id: item for item in suite.items}
+    thumbnails: dict[Path, Features] = {}
+    rows = []
+    for item_id, layout in zip(episodes["item_id"], episodes["layout"], strict=True):
+        episode = Episode(items[item_id], layout)
+        pictures = [episode.picture("left"), episode.picture("right")]
+        thumbnails |= {path: _thumbnail(path) for path in pictures if path not in thumbnails}
+        rows.append(np.concatenate([thumbnails[path] for path in pictures]))
+    return np.stack(rows)
+
+
+def _thumbnail(path: Path) -> Features:
+    from PIL import Image
+
+    from probe_kit.suite import load_picture
+
+    small = load_picture(path).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+    return np.asarray(small, np.float32).ravel() / np.float32(255)

@@ -1,0 +1,106 @@
+"""What a probe learns from: one sample per episode (pooled views), or one per token."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
+from probe_kit.hooks.sites import Site
+from probe_kit.train.arrays import Array, to_device
+from probe_kit.train.reader import RunReader
+
+TOKENS = "tokens"
+"""View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Features of M samples that belong to E episodes.
+
+    features: (M, D), the samples of an episode in consecutive rows. counts: (E,) samples per episode.
+    means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the samples.
+    """
+
+    features: Array
+    counts: NDArray[np.intp]
+    means: Array
+
+    @classmethod
+    def pooled(cls, column: NDArray[np.floating]) -> "Samples":
+        """One sample per episode, from (E, D)."""
+        return cls(column, np.ones(len(column), np.intp), column)
+
+    @classmethod
+    def tokens(cls, values: NDArray[np.floating], mask: NDArray[np.bool_]) -> "Samples":
+        """One sample per token of `mask`, from (E, T, D) values and (E, T) mask; every episode has a token."""
+        features, counts = values[mask], mask.sum(axis=1)
+        sums = np.add.reduceat(features, _starts(counts), axis=0, dtype=np.float64)
+        return cls(features, counts, sums / counts[:, None])
+
+    @property
+    def pools(self) -> bool:
+        """Whether every episode is a single sample."""
+        return len(self.counts) == len(self.features)
+
+    def of(self, episodes: NDArray[np.intp]) -> "Samples":
+        """The samples of some episodes, in this order."""
+        counts = self.counts[episodes]
+        shift = _starts(self.counts)[episodes] - _starts(counts)
+        rows = np.repeat(shift, counts) + np.arange(counts.sum())
+        return Samples(self.features[rows], counts, self.means[episodes])
+
+    def repeat(self, of_episodes: NDArray[Any]) -> NDArray[Any]:
+        """(M, K): what is true of each episode (E, K), for each of its samples."""
+        return np.repeat(of_episodes, self.counts, axis=0)
+
+    def to(self, device: str | None) -> "Samples":
+        """The same with features and means as torch tensors on `device`; unchanged without one."""
+        return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
+
+
+def sites_of(run: RunReader, view: str) -> list[Site]:
+    """Sites that have `view`, over all streams; a role's tokens are where its mean is. Raises UnknownSiteError."""
+    if view == TOKENS:
+        return [site for stream in run.streams for site in run.sites(stream)]
+    pooled = f"mean:{role_of(view)}" if is_token_view(view) else view
+    sites = [site for stream in run.streams if pooled in run.views(stream) for site in run.sites(stream)]
+    if not sites:
+        known = sorted({name for stream in run.streams for name in run.views(stream)})
+        raise UnknownSiteError(
+            f"{run.path} has no view {view!r}; it has: {', '.join(known)}, and with stored tokens: {TOKENS} or "
+            f"{TOKENS}:ROLE for every mean:ROLE"
+        )
+    return sites
+
+
+def is_token_view(view: str) -> bool:
+    """Whether every token is a sample in `view`."""
+    return view.partition(":")[0] == TOKENS
+
+
+def role_of(view: str) -> str | None:
+    """The role whose tokens a token view takes, None for all but padding."""
+    return view.partition(":")[2] or None
+
+
+def read_samples(run: RunReader, view: str, site: Site) -> Samples:
+    """All samples of one site. Raises NonFiniteActivationError naming the first broken episode."""
+    if is_token_view(view):
+        samples = Samples.tokens(*run.tokens(site, role_of(view)))
+    else:
+        samples = Samples.pooled(run.column(site, view))
+    broken = np.flatnonzero(~np.isfinite(samples.means).all(axis=1))
+    if broken.size:
+        raise NonFiniteActivationError(
+            f"{site}, view {view!r}, of {run.path} holds NaN or infinity in {broken.size} of "
+            f"{len(samples.counts)} episodes, the first {run.episodes['episode_id'].iloc[broken[0]]!r}; expected "
+            "finite features. Extract these episodes again."
+        )
+    return samples
+
+
+def _starts(counts: NDArray[np.intp]) -> NDArray[np.intp]:
+    starts: NDArray[np.intp] = np.cumsum(counts) - counts
+    return starts

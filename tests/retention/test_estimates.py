@@ -1,0 +1,113 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.retention import best_site, measure_retention
+from probe_kit.retention.estimates import Estimate, average, probe_estimates, sr_estimate
+from probe_kit.train import Curve
+from probe_kit.train.scores import group_bootstrap
+
+CurveOf = Callable[..., Curve]
+Outcomes = Callable[..., pd.DataFrame]
+
+
+def estimates_of(curve: Curve, suite: str = "s@1#0") -> dict[str, Estimate]:
+    peaks = {"prefix": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
+    found = {name: peak for name, peak in peaks.items() if peak is not None}
+    return probe_estimates(curve, found, measure_retention(curve), suite, seed=0)
+
+
+def test_intervals_are_those_of_the_bootstrap_over_groups(curve_of: CurveOf, outcome_table: Outcomes) -> None:
+    curve = curve_of(outcome_table(100, 100, 0), [0.5, 0.9], [[0.6, 0.7]])
+    found = estimates_of(curve)["prefix_accuracy"]
+    low, high = group_bootstrap(curve.correct[[1]].T, curve.groups, found.units)
+    assert found.value == 0.9
+    assert found.ci == (low[0], high[0])
+
+
+def test_draws_of_retention_spread_like_its_fieller_interval(curve_of: CurveOf, outcome_table: Outcomes) -> None:
+    curve = curve_of(outcome_table(200, 200, 0), [0.5, 0.9, 0.7], [[0.6, 0.7]])
+    exact = measure_retention(curve)
+    assert exact is not None
+    low, high = estimates_of(curve)["retention_debiased"].ci
+    assert low == pytest.approx(exact.interval.low, abs=0.04)
+    assert high == pytest.approx(exact.interval.high, abs=0.04)
+
+
+def test_every_cross_fit_takes_its_turn_and_a_backbone_at_chance_gives_no_ratio(
+    curve_of: CurveOf, outcome_table: Outcomes
+) -> None:
+    curve = curve_of(outcome_table(100, 100, 0), [0.9], [[0.7]])
+    retention = measure_retention(curve)
+    assert retention is not None
+
+    def draws(expert: list[float], backbone: float) -> np.ndarray:
+        """Of cross-fits in which every group of two episodes has these accuracies."""
+        held_out = np.tile(2 * np.array([[[share], [backbone]] for share in expert]), (1, 1, 100))
+        peak = best_site(curve, "backbone")
+        assert peak is not None
+        known = replace(retention, held_out=held_out)  # type: ignore[type-var]
+        return probe_estimates(curve, {"prefix": peak}, known, "s@1#0", 0)["retention_debiased"].draws
+
+    np.testing.assert_allclose(draws([0.6, 0.8], 0.9)[:4], [0.25, 0.75, 0.25, 0.75])
+    assert np.isnan(draws([0.6], 0.4)).all()
+
+
+def test_retention_without_backbone_signal_is_not_estimated(curve_of: CurveOf, outcome_table: Outcomes) -> None:
+    assert set(estimates_of(curve_of(outcome_table(100, 100, 0), [0.55], [[0.6]]))) == {
+        "prefix_accuracy",
+        "action_accuracy",
+    }
+
+
+def test_the_same_items_are_drawn_together_and_others_apart(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(100, 60, 40)
+    here, again, elsewhere = (sr_estimate(episodes, suite, 0) for suite in ("s@1#0", "s@1#0", "t@1#1"))
+    fewer = sr_estimate(episodes[:150], "s@1#0", 0)
+    assert here.units == again.units
+    assert len({here.units, elsewhere.units, fewer.units}) == 3
+    assert (here - again).ci == (0.0, 0.0)
+    low, high = (here - elsewhere).ci
+    assert low is not None
+    assert high is not None
+    assert low < 0 < high
+
+
+def test_an_average_of_independent_estimates_is_narrower_by_the_root_of_their_number() -> None:
+    generator = np.random.default_rng(0)
+    many = [Estimate(0.5, generator.normal(0.5, 0.1, 4000), units) for units in range(9)]
+    assert average(many).draws.std() == pytest.approx(0.1 / 3, rel=0.1)
+    assert average(many[:1]).units == many[0].units
+
+
+def test_too_many_draws_without_meaning_leave_no_limits() -> None:
+    draws = np.linspace(0, 1, 1000)
+    draws[:20] = np.nan
+    assert Estimate(0.5, draws, 0).ci[0] is not None
+    draws[:30] = np.nan
+    assert Estimate(0.5, draws, 0).ci == (None, None)
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_difference_covers_the_truth() -> None:
+    """Two policies that share half of what makes an item easy."""
+    covered = []
+    for seed in range(400):
+        generator = np.random.default_rng(seed)
+        ease = generator.standard_normal(100).repeat(2)
+        tables = [
+            pd.DataFrame(
+                {
+                    "item_id": np.arange(100).repeat(2).astype(str),
+                    "outcome": np.where(ease + generator.standard_normal(200) < 0, "correct", "wrong"),
+                }
+            )
+            for _ in range(2)
+        ]
+        gap = sr_estimate(tables[0], "s", seed) - sr_estimate(tables[1], "s", seed)
+        low, high = gap.ci
+        covered.append(low is not None and high is not None and low <= 0 <= high)
+    assert 0.92 <= np.mean(covered) <= 0.98
