@@ -16,7 +16,8 @@ from probe_kit.suite.commands import app as suite_app
 if TYPE_CHECKING:
     from probe_kit.extract import Run
     from probe_kit.hooks.verify import Verification
-    from probe_kit.train import ProbeResults, Target
+    from probe_kit.retention.measure import Iterations
+    from probe_kit.train import Baseline, ProbeResults, Target
 
 INTERRUPTED = 130
 
@@ -180,14 +181,27 @@ def _print_verification(verification: "Verification") -> None:
 @app.command()
 def train(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
-    views: Annotated[str, typer.Option(help="Comma-separated pooled views: mean, last, mean:language …")] = "mean",
+    categories: Annotated[
+        str | None, typer.Option(help="Comma-separated; default each of the run. all: every episode pooled.")
+    ] = None,
+    views: Annotated[
+        str, typer.Option(help="Comma-separated: mean, last, mean:language …, tokens, tokens:ROLE.")
+    ] = "mean",
     permutations: Annotated[int, typer.Option(help="Relabellings behind the p-values.")] = 200,
+    token_permutations: Annotated[int, typer.Option(help="Relabellings for token views.")] = 59,
     target: Annotated[
         str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
     ] = "correct",
+    controls: Annotated[
+        str | None, typer.Option(help="Comma-separated baselines: position, instruction, pixels.")
+    ] = None,
+    suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels.")] = None,
+    twin: Annotated[
+        Path | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[int, typer.Option(help="Processes that share the sites.")] = 1,
+    device: Annotated[str | None, typer.Option(help="Solve with torch there, such as cuda; one process.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
 ) -> None:
     """Fit logistic probes at every site and store their scores in the run.
@@ -204,13 +218,27 @@ def train(
             split(categories),
             split(views) or ("mean",),
             permutations=permutations,
+            token_permutations=token_permutations,
             target=_target(target),
+            controls=_baselines(controls),
+            suite=suite,
+            twin=None if twin is None else open_run(twin, allow_partial=partial),
             seed=seed,
             jobs=jobs,
+            device=device,
             progress=counter(bar, "sites"),
         )
     _print_peaks(results, opened.random_weights)
     err.print(f"next: [bold]probe-kit retention {run}[/]", highlight=False, soft_wrap=True)
+
+
+def _baselines(names: str | None) -> "tuple[Baseline, ...]":
+    from probe_kit.train import BASELINES
+
+    for name in split(names) or ():
+        if name not in BASELINES:
+            raise UsageError(f"unknown control {name!r}; expected some of {', '.join(BASELINES)}")
+    return cast("tuple[Baseline, ...]", split(names) or ())
 
 
 def _target(name: str) -> "Target":
@@ -244,26 +272,65 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
 
 @app.command()
 def retention(
-    runs: Annotated[list[Path], typer.Argument(help="One or more run folders.")],
+    runs: Annotated[list[Path] | None, typer.Argument(help="One or more run folders.")] = None,
+    group: Annotated[
+        list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
+    ] = None,
     style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
     views: Annotated[str | None, typer.Option(help="Comma-separated; default all probed ones.")] = None,
+    iterations: Annotated[str, typer.Option(help="Expert iterations that count: all, last or a number.")] = "all",
+    epsilons: Annotated[
+        str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
+    ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for layer curves as PNG.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
     from probe_kit.extract import open_run
     from probe_kit.retention import retention as make_table
+    from probe_kit.retention.success import SENSITIVITY_RADII
 
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
-    opened = [open_run(path, allow_partial=partial) for path in runs]
-    table = make_table(opened, views=split(views))
+    if bool(runs) == bool(group):
+        raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
+    grouped = _groups(group) if group else {"": tuple(runs or ())}
+    opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
+    radii = SENSITIVITY_RADII if epsilons is None else [_number(part) for part in split(epsilons) or ()]
+    table = make_table(
+        opened if group else opened[""], split(views), iterations=_iterations(iterations), epsilons=radii
+    )
     if style == "table":
         out.print(table.to_rich())
     else:
         typer.echo(getattr(table, f"to_{style}")())
     if figures is not None:
-        _save_figures(opened, figures)
+        _save_figures([run for listed in opened.values() for run in listed], figures)
+
+
+def _groups(texts: list[str]) -> dict[str, tuple[Path, ...]]:
+    groups = {}
+    for text in texts:
+        name, separator, paths = text.partition("=")
+        if not (separator and name and split(paths)):
+            raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
+        groups[name] = tuple(Path(part) for part in split(paths) or ())
+    return groups
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a number of metres") from None
+
+
+def _iterations(text: str) -> "Iterations":
+    if text.isdigit():
+        return int(text)
+    if text not in ("all", "last"):
+        raise UsageError(f"iterations {text!r}; expected all, last or a number")
+    return cast("Iterations", text)
 
 
 _FORMATS = ("table", "json", "csv", "markdown", "latex")

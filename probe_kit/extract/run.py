@@ -75,6 +75,12 @@ class Run:
         return str(self.settings["model"])
 
     @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted; None for a scripted run."""
+        weights: str | None = self.settings["weights_sha256"]
+        return weights
+
+    @property
     def random_weights(self) -> bool:
         """Whether nobody trained the weights this run was made with."""
         return bool(self.settings["random_weights"])

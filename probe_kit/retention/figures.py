@@ -108,6 +108,8 @@ def _caption(results: ProbeResults, view: str, figure: "Figure") -> str:
     sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
     n = f"{min(sizes)}" if min(sizes) == max(sizes) else f"{min(sizes)}–{max(sizes)}"
     parts = [settings.model, settings.suite, f"n = {n} episodes per category", f"probes {results.key}"]
+    if settings.weights:
+        parts.insert(1, f"weights {settings.weights[:12]}")
     if settings.random_weights:
         parts.insert(1, "RANDOM WEIGHTS")
     if settings.target != "correct":

@@ -29,6 +29,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         run=first.run,
         model=first.model,
         random_weights=first.random_weights,
+        weights_sha256=first.weights_sha256,
         suite=first.suite,
         run_settings=first.run_settings,
         probe_settings=first.probe_settings,

@@ -23,6 +23,7 @@ class RetentionRow:
     run: str
     model: str
     random_weights: bool
+    weights_sha256: str | None
     suite: str
     run_settings: str
     probe_settings: str | None

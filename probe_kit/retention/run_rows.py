@@ -85,6 +85,7 @@ def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
         "run": str(run.path),
         "model": run.model,
         "random_weights": run.random_weights,
+        "weights_sha256": run.weights_sha256,
         "suite": run.suite,
         "run_settings": run.settings_sha256,
         "probe_settings": None if results is None else results.key,

@@ -34,6 +34,7 @@ class ArrayRun:
     episodes: "pd.DataFrame"
     features: Mapping[tuple[Site, str], NDArray[np.floating]]
     random_weights: bool = False
+    weights_sha256: str | None = None
     token_features: Mapping[tuple[Site, str | None], tuple[NDArray[np.floating], NDArray[np.bool_]]] = field(
         default_factory=dict
     )

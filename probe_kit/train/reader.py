@@ -25,6 +25,10 @@ class RunReader(Protocol):
         """Name of the policy."""
 
     @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted; None for a policy without weights."""
+
+    @property
     def random_weights(self) -> bool:
         """Whether the policy was never trained; marked in every table and figure."""
 

@@ -31,6 +31,7 @@ class ProbeSettings:
 
     model: str
     random_weights: bool
+    weights: str | None
     suite: str
     run_settings: str
     episodes: str  # sha256 of the episode ids, so that a run that grew is probed again

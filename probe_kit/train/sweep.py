@@ -90,6 +90,7 @@ def _settings(
     return ProbeSettings(
         model=run.model,
         random_weights=run.random_weights,
+        weights=run.weights_sha256,
         suite=run.suite,
         run_settings=run.settings_sha256,
         episodes=episodes_sha256(run),

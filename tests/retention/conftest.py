@@ -95,6 +95,7 @@ def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
         settings = ProbeSettings(
             model=model,
             random_weights=random_weights,
+            weights=None,
             suite=suite,
             run_settings=run.settings_sha256,
             episodes=episodes_sha256(run),

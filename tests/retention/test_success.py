@@ -101,3 +101,21 @@ def test_a_radius_that_makes_zones_overlap_is_refused(outcome_table: Outcomes) -
 
 def test_a_table_without_distances_has_no_sensitivity(outcome_table: Outcomes) -> None:
     assert sensitivity(outcome_table(1, 0, 0)) == {}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "expected"), [("correct", (0.025 ** (1 / 10), 1)), ("oob", (0, 1 - 0.025 ** (1 / 10)))]
+)
+def test_an_interval_has_a_width_even_where_all_episodes_agree(
+    outcome: str, expected: tuple[float, float]
+) -> None:
+    """A bootstrap would claim certainty; Clopper and Pearson's interval for ten items does not."""
+    rows = [
+        {"item_id": f"i{item}", "layout": layout, "side_correct": side, "outcome": outcome, "side_placed": "none"}
+        for item in range(10)
+        for layout, side in (("original", "left"), ("swapped", "right"))
+    ]
+    found = success_rate(pd.DataFrame(rows)).ci
+    assert found == pytest.approx(expected)
+    exact = binomtest(10 if outcome == "correct" else 0, 10).proportion_ci(0.95, "exact")
+    assert found == pytest.approx((exact.low, exact.high))

@@ -11,7 +11,9 @@ PlantedRun = Callable[..., ArrayRun]
 
 
 def settings(target: Target = "correct") -> ProbeSettings:
-    return ProbeSettings("m", False, "s@1#0", "0", "0", ("color",), ("mean",), target, permutations=30, seed=0)
+    return ProbeSettings(
+        "m", False, None, "s@1#0", "0", "0", ("color",), ("mean",), target, permutations=30, seed=0
+    )
 
 
 def test_relabelling_the_correct_side_flips_whole_items(planted_run: PlantedRun) -> None:

@@ -8,7 +8,9 @@ from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, ProbeResults, ProbeSettings, train_probes
 
 PlantedRun = Callable[..., ArrayRun]
-SETTINGS = ProbeSettings("m", False, "s@1#0", "0", "0", ("color",), ("mean",), "correct", permutations=9, seed=0)
+SETTINGS = ProbeSettings(
+    "m", False, None, "s@1#0", "0", "0", ("color",), ("mean",), "correct", permutations=9, seed=0
+)
 
 
 @pytest.fixture
