@@ -286,9 +286,9 @@ def retention(
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
+    from probe_kit.env.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention as make_table
-    from probe_kit.retention.success import SENSITIVITY_RADII
 
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
