@@ -251,20 +251,19 @@ def _target(name: str) -> "Target":
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
+    from rich import box
     from rich.table import Table
 
-    mark = "  RANDOM WEIGHTS" if random_weights else ""
-    table = Table("category", "view", "stream", "best site", "accuracy", "95 % interval", "family-wise p", "n")
-    table.title = f"best site per stream{mark}"
+    mark = ", RANDOM WEIGHTS" if random_weights else ""
     peaks = results.scores.sort_values("accuracy", ascending=False, kind="stable")
-    for names, rows in peaks.groupby(["category", "view", "stream"]):
-        best = rows.iloc[0]
-        interval = f"{100 * best['ci_low']:.1f} – {100 * best['ci_high']:.1f}"
-        accuracy, p = f"{100 * best['accuracy']:.1f} %", f"{best['p_fwe']:.3f}"
-        table.add_row(
-            *map(str, cast("tuple[str, ...]", names)), best["site"], accuracy, interval, p, str(best["n"])
-        )
-    out.print(table)
+    for view, of_view in peaks.groupby("view", sort=False):
+        columns = ("category", "best site", "accuracy % [95 %]", "family-wise p", "n")
+        table = Table(*columns, title=f"best site per stream, view {view}{mark}", box=box.SIMPLE_HEAD)
+        for _, rows in of_view.groupby(["category", "stream"]):
+            best = rows.iloc[0]
+            accuracy = f"{100 * best['accuracy']:.1f} [{100 * best['ci_low']:.1f}, {100 * best['ci_high']:.1f}]"
+            table.add_row(best["category"], best["site"], accuracy, f"{best['p_fwe']:.3f}", str(best["n"]))
+        out.print(table)
 
 
 # -- retention -------------------------------------------------------------------------------------------------

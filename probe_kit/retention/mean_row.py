@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+
 from probe_kit.retention.estimates import Estimates, Limits, average
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.run_rows import Drawn
@@ -65,7 +67,9 @@ def average_estimates(estimates: Sequence[Estimates]) -> Estimates:
 
 
 def _limits(estimates: Estimates, name: str) -> Limits | None:
-    return estimates[name].ci if name in estimates else None
+    """None also where all draws agree: a bootstrap of rates that are all 0 or 1 knows no interval."""
+    found = estimates.get(name)
+    return None if found is None or np.ptp(found.draws) == 0 else found.ci
 
 
 def _mean(rows: Sequence[RetentionRow], name: str) -> Any:
