@@ -135,9 +135,9 @@ def _load(settings: ExtractSettings) -> Extraction:
     return Extraction(settings, plan, controller.identity, controller)
 
 
-def extract_run(settings: ExtractSettings, out: Path, progress: Progress | None = None) -> Run:
+def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
     """Extract a run into folder `out`, or continue the one that is there."""
-    return prepare(settings).run(out, progress=progress)
+    return prepare(settings).run(Path(out), progress=progress)
 
 
 def _find_family(name: str) -> None:

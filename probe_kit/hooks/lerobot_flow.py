@@ -171,7 +171,16 @@ class LerobotFlow(Policy):
 
     def _notes(self) -> tuple[str, ...]:
         masked = self.cameras[1:]
-        return (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
+        cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
+        return (*cameras, f"units: {self._units()}")
+
+    def _units(self) -> str:
+        """Where the statistics come from that turn actions into metres, or why there are none."""
+        try:
+            action, state = self.action_units, self.state_units
+        except CheckpointError as error:
+            return f"cannot act in metres: {error}"
+        return f"action {action.mode} from {action.source}, state {state.mode} from {state.source}"
 
     # -- acting ------------------------------------------------------------------------------------------
 

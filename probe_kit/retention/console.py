@@ -74,12 +74,17 @@ def _retention(row: RetentionRow) -> str:
     return number(row.retention) if row.retention_defined else "n/a"
 
 
+def _outside(row: RetentionRow) -> str:
+    """Out of bounds, and the part of it where the cube never moved."""
+    return percent(row.p_oob) + ("" if row.p_never_moved is None else f" ({percent(row.p_never_moved)})")
+
+
 _SUCCESS_COLUMNS: list[Column] = [
     ("category", lambda row: row.category),
     ("SR % [95 %]", success_interval),
     ("Δ", lambda row: percent(row.delta)),
     ("wrong", lambda row: percent(row.p_wrong)),
-    ("outside", lambda row: percent(row.p_oob)),
+    ("outside (unmoved)", _outside),
     ("left/right", lambda row: f"{_whole(row.sr_left)} / {_whole(row.sr_right)}"),
     ("regime", _regime),
 ]

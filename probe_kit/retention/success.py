@@ -43,7 +43,8 @@ class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
     ci: 95 % interval of `sr`, whole items resampled. sr_original, sr_swapped: per layout, and layout_mean their
-    mean. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
+    mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None if it was not
+    recorded. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
     guessing explains, for N = episodes; delta_items: the same for N = items, conservative. side_preference:
     share placed left among episodes placed in a zone. A rate over no episodes is None.
     """
@@ -59,6 +60,7 @@ class SuccessRate:
     sr_right: float | None
     p_wrong: float
     p_oob: float
+    p_never_moved: float | None
     delta: float
     delta_items: float
     regime: Regime
@@ -128,6 +130,7 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         sr_right=_rate(correct[episodes["side_correct"] == "right"]),
         p_wrong=p_wrong,
         p_oob=p_oob,
+        p_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
         delta=delta,
         delta_items=chance_margin(n_items),
         regime=name,

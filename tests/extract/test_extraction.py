@@ -1,10 +1,12 @@
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from torch import nn
 
 from probe_kit.env import SceneSpec, ScriptedExpert
 from probe_kit.errors import (
@@ -12,12 +14,15 @@ from probe_kit.errors import (
     EpisodesFailedError,
     RunIncompleteError,
     SettingsMismatchError,
+    SiteNeverFiredError,
     SuiteError,
     UnknownCategoryError,
     UnknownModelError,
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.hooks import Site, Tap
+from probe_kit.hooks.pi0 import Pi0
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -211,3 +216,20 @@ def test_the_first_episode_can_be_filmed(two_items: Suite, tmp_path: Path) -> No
     assert "color-correct" in film.name
     with Image.open(film) as gif:
         assert gif.n_frames > 10
+
+
+def test_a_broken_hook_stops_the_run_at_the_first_episode_with_the_sites_name(
+    two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A layer the model never calls: the run must not store something else instead."""
+    sound = Pi0.tap
+
+    def broken(policy: Pi0, site: Site) -> Tap:
+        tap = sound(policy, site)
+        return replace(tap, module=nn.Identity()) if site == Site("backbone", 2) else tap
+
+    monkeypatch.setattr(Pi0, "tap", broken)
+    settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT)
+    with pytest.raises(SiteNeverFiredError, match=r"backbone\.02\.residual"):
+        extract_run(settings, tmp_path / "run")
+    assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
