@@ -1,5 +1,6 @@
 """Sealing: pooled rows turned into one block per site and view, and roles into a column."""
 
+import fcntl
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from probe_kit.extract.layout import COLUMNS, codecs
+from probe_kit.extract.layout import COLUMNS, PLAN_FILE, RUN_FILE, codecs
 from probe_kit.extract.rows import PADDING
 from probe_kit.extract.run import Run
 
@@ -22,8 +23,16 @@ def seal(path: Path | str) -> bool:
     """Write the columns of the run at `path` unless they are up to date; True if this call wrote them.
 
     Same commits give the same bytes. Written aside and renamed, so that a crash leaves the old columns or none.
+    Processes that seal one run at once take turns, and all but the first find it done.
     """
-    run = Run(Path(path))
+    folder = Run(Path(path)).path
+    with (folder / RUN_FILE).open() as run_file, (folder / PLAN_FILE).open() as turn:
+        fcntl.flock(run_file, fcntl.LOCK_SH)
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        return _seal(Run(folder))
+
+
+def _seal(run: Run) -> bool:
     if not run.streams or run.episodes.empty or run.sealed:
         return False
     aside = Path(tempfile.mkdtemp(dir=run.path, prefix=COLUMNS, suffix=".tmp"))

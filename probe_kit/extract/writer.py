@@ -96,17 +96,19 @@ class RunWriter:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Own the run while the body runs, and begin by clearing what killed processes left behind.
+        """Work on the run while the body runs, and begin by clearing what killed processes left behind.
 
-        A second process that extracts into the same folder is a guest: it works along and clears nothing.
+        Every process that works holds a shared lock, so only one that finds itself alone may clear: what looks
+        like a leftover could be another's work in progress.
         """
         with (self.path / RUN_FILE).open() as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                yield
-                return
-            self._clear_orphans()
+                pass
+            else:
+                self._clear_orphans()
+            fcntl.flock(file, fcntl.LOCK_SH)
             yield
 
     def _clear_orphans(self) -> None:

@@ -84,7 +84,7 @@ _SUCCESS_COLUMNS: list[Column] = [
     ("SR % [95 %]", success_interval),
     ("Δ", lambda row: percent(row.delta)),
     ("wrong", lambda row: percent(row.p_wrong)),
-    ("outside (unmoved)", _outside),
+    ("oob (unmoved)", _outside),
     ("left/right", lambda row: f"{_whole(row.sr_left)} / {_whole(row.sr_right)}"),
     ("regime", _regime),
 ]

@@ -13,7 +13,8 @@ from probe_kit.retention.success import normalised_score
 
 _AVERAGED = (
     "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "chance",
-    "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin", "action_twin",
+    "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
+    "action_twin",
 )  # fmt: skip
 
 
