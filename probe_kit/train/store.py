@@ -17,7 +17,7 @@ from probe_kit.train.curve import Curve
 from probe_kit.train.directions import StoredDirections, save_directions
 from probe_kit.train.probe import SiteProbe
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
+from probe_kit.train.results import FORMAT, ProbeResults, ProbeSettings, episodes_sha256
 from probe_kit.train.targets import Target
 
 HOME = "probes"
@@ -58,18 +58,19 @@ def is_stored(run_path: Path, key: str) -> bool:
 def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
     """The stored results called `key`, or else the newest for `target` on the episodes the run has now.
 
+    Results of another format, written by another version of probe_kit, are passed over.
     Raises NoProbesError if there are none, and UsageError for a key that is not there.
     """
-    stored = {path.parent.name: path.parent for path in sorted((run.path / HOME).glob("[!.]*/settings.json"))}
+    headers = sorted((run.path / HOME).glob("[!.]*/settings.json"))
+    stored = {path.parent.name: path.parent for path in headers if _format(path) == FORMAT}
     if key is not None:
         if key not in stored:
             raise UsageError(f"{run.path} has no probe results {key!r}; it has: {', '.join(stored) or 'none'}")
         return _read(stored[key])
     episodes = episodes_sha256(run)
-    headers = {folder: _read_header(folder) for folder in stored.values()}
     current = {
         folder: str(created)
-        for folder, (settings, created) in headers.items()
+        for folder, (settings, created) in ((folder, _read_header(folder)) for folder in stored.values())
         if (settings.target, settings.run_settings, settings.episodes) == (target, run.settings_sha256, episodes)
     }
     if not current:
@@ -139,6 +140,10 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
         pair: Curve(**{**found, "sites": tuple(Site.parse(str(name)) for name in found["sites"])})
         for pair, found in members.items()
     }
+
+
+def _format(header: Path) -> int:
+    return int(json.loads(header.read_text())["settings"]["format"])
 
 
 def _read_header(folder: Path) -> tuple[ProbeSettings, str]:

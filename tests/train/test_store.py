@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable
 
 import numpy as np
@@ -71,3 +72,17 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     file.write_text("edited by hand")
     save_results(results, run.path)
     assert file.read_text() == "edited by hand"
+
+
+def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> None:
+    """An older version's settings have other fields; they must neither be read as ours nor stop us."""
+    run = planted_run()
+    older = train_probes(run, permutations=1)
+    header = run.path / "probes" / older.key / "settings.json"
+    content = json.loads(header.read_text())
+    content["settings"] = {"format": 1, "model": "m"}
+    header.write_text(json.dumps(content))
+    with pytest.raises(NoProbesError):
+        load_results(run)
+    newer = train_probes(run, permutations=2)
+    assert load_results(run).key == newer.key
