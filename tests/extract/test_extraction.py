@@ -127,11 +127,12 @@ def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suit
 
 
 @pytest.mark.slow
-def test_sixty_expert_episodes_prove_environment_and_scoring(small_suite: Suite, tmp_path: Path) -> None:
+def test_sixty_expert_episodes_prove_environment_and_scoring(tmp_path: Path) -> None:
+    suite = build_suite(tmp_path / "suite", ["color"], 30)
     for model, rate in (("expert", 1.0), ("expert-mirrored", 0.0)):
-        run = extract_run(ExtractSettings(model, suite=small_suite.folder), tmp_path / model)
-        chosen = run.episodes.iloc[:60]
-        assert (chosen["outcome"] == "correct").mean() == rate
+        run = extract_run(ExtractSettings(model, suite=suite.folder), tmp_path / model)
+        assert len(run.episodes) == 60
+        assert (run.episodes["outcome"] == "correct").mean() == rate
 
 
 def test_both_layouts_of_an_item_start_from_the_same_scene_with_their_own_noise(two_items: Suite) -> None:
