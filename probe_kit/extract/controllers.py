@@ -73,7 +73,7 @@ class ScriptedController:
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Never asked: a scripted stage plays to the end by itself."""
-        raise NotImplementedError(f"a scripted stage asked for {len(turns)} actions")
+        raise AssertionError(f"a scripted stage asked for {len(turns)} actions")
 
     def certificate(self) -> dict[str, Any]:
         """Nothing was loaded."""
