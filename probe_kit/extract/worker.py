@@ -9,8 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 from PIL import Image
 
+from probe_kit.env import save_gif
 from probe_kit.extract.controllers import Controller
 from probe_kit.extract.disk import full_disk_in_words
 from probe_kit.extract.layout import VIDEOS
@@ -133,7 +135,9 @@ def _versions() -> dict[str, Any]:
 
 def _save_film(folder: Path, rollout: Rollout) -> None:
     folder.mkdir(exist_ok=True)
-    frames = [Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS) for frame in rollout.frames]
+    frames = [
+        np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
+    ]
     planned = rollout.planned
     name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
-    frames[0].save(folder / name, save_all=True, append_images=frames[1:], duration=200, loop=0)
+    save_gif(folder / name, frames)

@@ -31,7 +31,7 @@ SUCCESS_COLUMNS: list[Column] = [
     ("Δ %", lambda row: percent(row.delta)),
     ("wrong %", lambda row: percent(row.p_wrong)),
     ("outside %", lambda row: percent(row.p_oob)),
-    ("of these unmoved %", lambda row: percent(row.p_never_moved)),
+    ("never moved %", lambda row: percent(row.p_never_moved)),
     ("original / swapped %", lambda row: f"{percent(row.sr_original)} / {percent(row.sr_swapped)}"),
     ("left / right %", lambda row: f"{percent(row.sr_left)} / {percent(row.sr_right)}"),
     ("regime", lambda row: row.regime or f"normalised score {number(row.normalised_score, 1)}"),
