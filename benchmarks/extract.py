@@ -1,12 +1,13 @@
 """How fast runs are written and read: codecs, columns against rows and plain files, and the real loop.
 
-    python benchmarks/extract.py [--episodes 860] [--width 512] [--loop 16]
+    python benchmarks/extract.py [--episodes 860] [--width 512] [--loop 8] [--repeats 5] [--only loop]
 
 Rivals of the columns hold the same float32 numbers: HDF5 (if h5py is there) and one .npy per episode. The loop is
-the real one with pi0-tiny and a pause in every inference that stands for a large model on a GPU.
+the real one with a pi0 of 66 million random parameters on the CPU.
 """
 
 import argparse
+import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -16,19 +17,23 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from probe_kit.extract import ExtractSettings, open_run, prepare, seal
-from probe_kit.extract.controllers import PolicyController
+from probe_kit.env import SceneSpec
+from probe_kit.extract import Extraction, ExtractSettings, open_run, prepare, seal
 from probe_kit.extract.layout import CODECS, StoredStream
+from probe_kit.extract.location import locate
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.rollout import Rollout
 from probe_kit.extract.staging import EpisodeBuffers
 from probe_kit.extract.writer import RunWriter
+from probe_kit.hooks import Observation
 from probe_kit.hooks.sites import Site
+from probe_kit.models import pi0_tiny
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 from probe_kit.suite import Suite, build_suite
 
 LAYERS, VIEWS, TOKENS = 19, ("mean", "last", "mean:language", "mean:image"), 816
 SITE = Site("backbone", 11)
-PAUSE_S = 0.25
 
 
 def seconds(work: Callable[[], object]) -> tuple[float, float]:
@@ -71,7 +76,9 @@ def bench_codecs(suite: Suite, folder: Path, width: int) -> None:
 
 def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw: float) -> None:
     """One line of the table of codecs."""
-    writer = RunWriter(path, plan, {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic"})
+    writer = RunWriter(
+        locate(path), plan, {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic"}
+    )
     wall, cpu = seconds(lambda: [writer.write(rollout) for rollout in rollouts])
     size = sum(p.stat().st_size for p in (path / "data.zarr/backbone/tokens").rglob("*") if p.is_file())
     run = open_run(path, allow_partial=True)
@@ -84,7 +91,7 @@ def bench_columns(suite: Suite, folder: Path, episodes: int, width: int) -> None
     stream = StoredStream("backbone", LAYERS, width, None, TOKENS, VIEWS)
     plan = make_plan(suite, [stream], 0, 1, False)
     settings = {"captured_calls": 1, "tokens": "pooled", "codec": "zstd", "model": "synthetic"}
-    writer = RunWriter(folder / "columns", plan, settings)
+    writer = RunWriter(locate(folder / "columns"), plan, settings)
     for number in range(episodes):
         writer.write(synthetic(plan, stream, number, False))
     rows = open_run(folder / "columns", allow_partial=True).rows("backbone")
@@ -120,43 +127,66 @@ def bench_h5(path: Path, values: np.ndarray) -> None:
     print(f"HDF5      {1e3 * h5:9.1f}   (shuffle + lzf, one chunk per episode)")
 
 
-class Paused:
-    """A policy whose every inference waits, as a large model on a GPU would let the host wait."""
-
-    def __init__(self, policy: object) -> None:
-        self._policy, self._act = policy, policy.act
-
-    def __enter__(self) -> None:
-        def act(*arguments: object) -> object:
-            time.sleep(PAUSE_S)
-            return self._act(*arguments)
-
-        self._policy.act = act
-
-    def __exit__(self, *_: object) -> None:
-        del self._policy.act
+def write_mid_sized(folder: Path) -> None:
+    """A pi0 of 66 million random parameters: one inference takes a core about 0.3 s."""
+    size = Pi0Size(
+        vlm=GemmaSize(width=512, depth=10, mlp_dim=2048, num_heads=8, num_kv_heads=1, head_dim=64),
+        expert=GemmaSize(width=384, depth=10, mlp_dim=1536, num_heads=8, num_kv_heads=1, head_dim=64),
+        vision=SiglipSize(hidden=256, layers=6, heads=4, inter=1024, patch=16),
+        vocab_size=pi0_tiny.SIZE.vocab_size,
+    )
+    policy = build_pi0(pi0_tiny.new_pi0_tiny(0).config, size)
+    initialise(policy, 0)
+    pi0_tiny.write_checkpoint(folder, policy, pi0_tiny.GUESSED, "random, for a benchmark")
+    (folder / "dims.json").write_text(json.dumps(size.to_json()))
 
 
-def bench_loop(suite: Suite, folder: Path, items: int) -> None:
-    """Episodes per second of the real loop; `off` runs the same loop and captures nothing."""
-    print(f"\nreal loop, {2 * items} episodes of 12 actions, {PAUSE_S} s pause per inference\ncapture  episodes/s")
-    base = ExtractSettings("pi0-tiny", suite=suite.folder, items=items, codec="fast")
-    base = replace(base, scene=replace(base.scene, max_steps=12))
-    for name, tokens in (("off", "pooled"), ("pooled", "pooled"), ("all", "all")):
-        print(f"{name:8} {episodes_per_second(replace(base, tokens=tokens), folder / name, name == 'off'):9.2f}")
+def bench_loop(suite: Suite, folder: Path, items: int, repeats: int) -> None:
+    """Seconds per episode of the real loop; `off` is the same loop and captures nothing.
+
+    An episode is one inference and the actions it gives, so every inference is captured: the dearest case.
+    Modes take turns, and the one that begins changes, so that other work on the machine meets all of them.
+    """
+    write_mid_sized(folder / "checkpoint")
+    base = ExtractSettings(
+        "pi0-tiny", str(folder / "checkpoint"), suite=suite.folder, items=items, codec="fast",
+        scene=SceneSpec(max_steps=4),
+    )  # fmt: skip
+    pooled, every = prepare(base), prepare(replace(base, tokens="all"))
+    modes = [("off", pooled, 0), ("pooled", pooled, 1), ("all", every, 1)]
+    megabytes = {"off": 0.0, "pooled": pooled.plan.bytes / 1e6, "all": every.plan.bytes / 1e6}
+    print(f"\nreal loop, {2 * items} episodes of one inference each ({inference_cpu(pooled):.2f} CPU-s)")
+    costs: dict[str, list[tuple[float, float]]] = {name: [] for name, _, _ in modes}
+    for repeat in range(repeats):
+        for name, extraction, calls in modes[repeat % 3 :] + modes[: repeat % 3]:
+            costs[name].append(episode_cost(extraction, calls, folder / f"{name}-{repeat}"))
+    print("capture  MB/episode  wall s (ratio to off)  CPU s (ratio to off)   medians of", repeats)
+    off_wall, off_cpu = np.median(costs["off"], axis=0)
+    for name, measured in costs.items():
+        wall, cpu = np.median(measured, axis=0)
+        print(
+            f"{name:8} {megabytes[name] / (2 * items):10.2f} {wall:8.3f} ({wall / off_wall:.2f})"
+            f" {cpu:14.3f} ({cpu / off_cpu:.2f})   wall: " + ", ".join(f"{wall:.3f}" for wall, _ in measured)
+        )
 
 
-def episodes_per_second(settings: ExtractSettings, out: Path, off: bool) -> float:
-    """Of one extraction, its start left out; `off`: captures nothing."""
-    extraction = prepare(settings)
-    controller = extraction.controller
-    assert isinstance(controller, PolicyController)
-    if off:
-        controller.captured_calls = 0
-    stamps: list[float] = []
-    with Paused(controller.policy):
-        extraction.run(out, progress=lambda *_: stamps.append(time.perf_counter()))
-    return (len(stamps) - 2) / (stamps[-1] - stamps[1])
+def inference_cpu(extraction: Extraction) -> float:
+    """CPU seconds of one inference by itself, the least of three."""
+    policy = extraction.controller.policy
+    seen = Observation(
+        np.zeros((480, 640, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red square"
+    )
+    return min(seconds(lambda: policy.act([seen], [0]))[1] for _ in range(3))
+
+
+def episode_cost(extraction: Extraction, captured_calls: int, out: Path) -> tuple[float, float]:
+    """Wall-clock and CPU seconds per episode of this process, its start left out; it does not simulate."""
+    extraction.controller.captured_calls = captured_calls
+    stamps: list[tuple[float, float]] = []
+    extraction.run(out, progress=lambda *_: stamps.append((time.perf_counter(), time.process_time())))
+    begin, end = np.array(stamps[1]), np.array(stamps[-1])
+    wall, cpu = (end - begin) / (len(stamps) - 2)
+    return float(wall), float(cpu)
 
 
 def main() -> None:
@@ -164,15 +194,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--episodes", type=int, default=860)
     parser.add_argument("--width", type=int, default=512)
-    parser.add_argument("--loop", type=int, default=16, help="items of the real loop")
+    parser.add_argument("--loop", type=int, default=8, help="items of the real loop")
+    parser.add_argument("--repeats", type=int, default=5, help="of the real loop")
+    parser.add_argument("--only", choices=("codecs", "columns", "loop"), help="one table")
     arguments = parser.parse_args()
     print(f"zarr {zarr.__version__}, numpy {np.__version__}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         suite = build_suite(folder / "suite", ["color"], arguments.episodes // 2)
-        bench_codecs(suite, folder, arguments.width)
-        bench_columns(suite, folder, arguments.episodes, arguments.width)
-        bench_loop(suite, folder, arguments.loop)
+        if arguments.only in (None, "codecs"):
+            bench_codecs(suite, folder, arguments.width)
+        if arguments.only in (None, "columns"):
+            bench_columns(suite, folder, arguments.episodes, arguments.width)
+        if arguments.only in (None, "loop"):
+            bench_loop(suite, folder, arguments.loop, arguments.repeats)
 
 
 if __name__ == "__main__":

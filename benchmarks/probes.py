@@ -20,6 +20,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
+from probe_kit.extract.rows import TokenBlock
 from probe_kit.train.features import Coordinates
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site
@@ -95,7 +96,7 @@ def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
     for name, samples, tolerance in (
         ("scikit-learn, tol 1e-10", raw, 1e-10),
         ("scikit-learn, default tol", raw, 1e-4),
-        ("scikit-learn, reduced features, tol 1e-10", coordinates.train[:, :-1], 1e-10),
+        ("scikit-learn, reduced features, tol 1e-10", coordinates.train.samples[:, :-1], 1e-10),
     ):
         each = scikit_learn_seconds(samples, columns, tolerance)
         table.add_row(
@@ -124,7 +125,8 @@ def token_cases(lengths: list[int]) -> dict[str, Samples]:
     cases = {}
     for length in lengths:
         tokens = features(60 * length)[:, :256].reshape(60, length, 256)
-        cases[f"N = 60 × {length} tokens, D = 256"] = Samples.tokens(tokens, np.ones((60, length), bool))
+        mask = np.ones((60, length), bool)
+        cases[f"N = 60 × {length} tokens, D = 256"] = Samples.tokens([TokenBlock(0, tokens, mask)], mask)
     return cases
 
 

@@ -1,11 +1,12 @@
 """What retention says where the truth is known: bias, coverage, and how often silence is called signal.
 
-    python benchmarks/retention_null.py [--draws 500]
+    python benchmarks/retention_null.py [--draws 500] [--rival-draws 100]
 
 Cells: correctness of 300 episodes (150 items) at 19 backbone and 180 expert sites, neighbours correlated 0.9,
-items 0.3, streams 0.25. The rival interval is a percentile bootstrap over items that repeats the whole cross-fit,
-choosing sites anew, in every resample. Probes: real nested probes on features without signal, all 99 relabellings
-refitted.
+items 0.3, streams 0.25. The rivals are percentile bootstraps over items that choose sites anew in each of 100
+resamples, by the same estimate (20 splits instead of 100) on the first of those draws. In one of them the copies
+of an item stay in one half, as they must; in the other they are items of their own and can be on both sides of a
+choice. Probes: real nested probes on features without signal, all 99 relabellings refitted.
 """
 
 import argparse
@@ -15,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
-from scipy.special import ndtri, stdtrit
+from scipy.special import ndtri
 
-from probe_kit.retention.crossfit import GroupScores, crossfit
+from probe_kit.retention.crossfit import GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimates import Estimate, average, retention_draws
-from probe_kit.retention.fieller import Interval, fieller_interval
+from probe_kit.retention.fieller import Interval
+from probe_kit.retention.measure import retention_interval
 from probe_kit.train.permutation import family_p, flip_items
 from probe_kit.train.probe import nested_folds, probe_site
 from probe_kit.train.samples import Samples
@@ -41,6 +43,15 @@ class World:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """A bootstrap's coverage and median width, and our median width on the same draws."""
+
+    coverage: float
+    width: float
+    own_width: float
+
+
+@dataclass(frozen=True)
 class Study:
     """What was measured over many draws of one world."""
 
@@ -50,7 +61,11 @@ class Study:
     coverage: float
     unbounded: float
     width: float
-    reselecting_width: float
+    rivals: list[Rival]
+
+    def width_ratio(self, rival: int) -> float:
+        """Median width over the rival's, both on the rival's draws."""
+        return self.rivals[rival].own_width / self.rivals[rival].width
 
 
 def correlated(generator: np.random.Generator, cells: int, episodes: int) -> NDArray[np.float64]:
@@ -78,28 +93,30 @@ def draw(world: World, generator: np.random.Generator) -> tuple[Correct, Correct
     return backbone, expert
 
 
-def study(world: World, draws: int) -> Study:
-    """Plain and debiased retention of `draws` data sets."""
+def study(world: World, draws: int, rival_draws: int) -> Study:
+    """Plain and debiased retention of `draws` data sets, and the rivals' intervals on the first of them."""
     items = np.repeat(np.arange(ITEMS), 2)
-    plain, debiased, intervals, reselecting = [], [], [], []
+    plain, debiased, intervals = [], [], []
+    rivals: tuple[list[Interval], list[Interval]] = ([], [])
     for seed in range(draws):
         generator = np.random.default_rng(seed)
         backbone, expert = (GroupScores.of(part, items) for part in draw(world, generator))
         plain.append((best_mean(expert) - 0.5) / (best_mean(backbone) - 0.5))
         fit = crossfit(backbone, expert, 0.5, seed)
         debiased.append(np.divide(fit.expert, fit.backbone))
-        quantile = float(stdtrit(ITEMS - 1, 0.975))
-        intervals.append(fieller_interval(fit.expert, fit.backbone, fit.covariance, quantile))
-        if seed < draws // 50:
-            reselecting.append(width(reselecting_interval(backbone, expert, generator)))
+        intervals.append(retention_interval(fit))
+        if seed < rival_draws:
+            for found, together in zip(rivals, (True, False), strict=True):
+                found.append(reselecting_interval(backbone, expert, generator, together))
+    own_width = median_width(intervals[:rival_draws])
     return Study(
         world,
         plain=float(np.median(plain)),
         debiased=float(np.median(debiased)),
-        coverage=float(np.mean([interval.low <= world.retention <= interval.high for interval in intervals])),
+        coverage=coverage(intervals, world.retention),
         unbounded=float(np.mean([not interval.bounded for interval in intervals])),
-        width=float(np.median([width(interval) for interval in intervals])),
-        reselecting_width=float(np.median(reselecting)),
+        width=median_width(intervals),
+        rivals=[Rival(coverage(found, world.retention), median_width(found), own_width) for found in rivals],
     )
 
 
@@ -124,7 +141,7 @@ def estimate(world: World, generator: np.random.Generator, category: int) -> Est
     """Debiased retention of one data set, with draws that belong to `category`."""
     items = np.repeat(np.arange(ITEMS), 2)
     fit = crossfit(*(GroupScores.of(part, items) for part in draw(world, generator)), 0.5, category)
-    drawn = retention_draws(fit.held_out, np.full(ITEMS, 2), 0.5, category)
+    drawn = retention_draws(fit, 0.5, category)
     return Estimate(fit.expert / fit.backbone, drawn, category)
 
 
@@ -140,21 +157,38 @@ def best_mean(scores: GroupScores) -> np.float64:
     return best
 
 
-def reselecting_interval(backbone: GroupScores, expert: GroupScores, generator: np.random.Generator) -> Interval:
-    """Percentile bootstrap over items that chooses sites anew in each of 100 resamples."""
+def reselecting_interval(
+    backbone: GroupScores, expert: GroupScores, generator: np.random.Generator, together: bool
+) -> Interval:
+    """Percentile bootstrap over items that chooses sites anew in each of 100 resamples.
+
+    together: whether all copies of an item are in one half.
+    """
     ratios = []
-    for resample in range(100):
-        drawn = generator.integers(ITEMS, size=ITEMS)
-        again = (GroupScores(part.sums[:, drawn], part.sizes[drawn]) for part in (backbone, expert))
-        fit = crossfit(*again, 0.5, resample)
-        ratios.append(np.divide(fit.expert, fit.backbone))
+    for _ in range(100):
+        times = generator.multinomial(ITEMS, np.full(ITEMS, 1 / ITEMS))
+        kept = np.arange(ITEMS) if together else np.repeat(np.arange(ITEMS), times)
+        weight = times if together else np.ones(ITEMS)
+        splits = random_halves(generator, np.flatnonzero(weight[: kept.size]), kept.size, 20)
+        above = [
+            held_out_scores(GroupScores(part.sums[:, kept] * weight, part.sizes[kept] * weight), splits).sum()
+            / (20 * part.sizes[kept] @ weight)
+            - 0.5
+            for part in (expert, backbone)
+        ]
+        ratios.append(np.divide(*above))
     low, high = np.percentile(ratios, [2.5, 97.5])
     return Interval(float(low), float(high))
 
 
-def width(interval: Interval) -> float:
-    """Length of an interval."""
-    return interval.high - interval.low
+def coverage(intervals: list[Interval], truth: float) -> float:
+    """Share of intervals that hold the truth."""
+    return float(np.mean([interval.low <= truth <= interval.high for interval in intervals]))
+
+
+def median_width(intervals: list[Interval]) -> float:
+    """Median length of intervals."""
+    return float(np.median([interval.high - interval.low for interval in intervals]))
 
 
 def false_alarms(draws: int) -> float:
@@ -172,12 +206,55 @@ def false_alarms(draws: int) -> float:
     return alarms / draws
 
 
+def table_of(studies: list[Study], draws: int) -> Table:
+    """One row per world."""
+    table = Table(
+        "backbone", "true", "plain", "debiased", "coverage", "unbounded", "width", "/ rival", "its coverage",
+        "/ copies apart", "its coverage", title=f"Retention over {draws} draws: medians, nominal 95 % intervals",
+    )  # fmt: skip
+    for column in table.columns:
+        column.no_wrap = True
+    for one in studies:
+        planted = one.world.top > 0
+        table.add_row(
+            one.world.name,
+            f"{one.world.retention:.2f}" if planted else "–",
+            f"{one.plain:.2f}",
+            f"{one.debiased:.2f}",
+            f"{one.coverage:.1%}" if planted else "–",
+            f"{one.unbounded:.0%}",
+            f"{one.width:.2f}",
+            *(
+                cell
+                for number, rival in enumerate(one.rivals)
+                for cell in (f"{one.width_ratio(number):.2f}", f"{rival.coverage:.0%}" if planted else "–")
+            ),
+        )
+    return table
+
+
+def verdicts(planted: list[Study]) -> list[str]:
+    """Coverage and width over all worlds with a signal."""
+    covered = [one.coverage for one in planted]
+    lines = [f"coverage over the {len(planted)} worlds: mean {np.mean(covered):.1%}, least {min(covered):.1%}"]
+    for number, name in enumerate(("copies together", "copies apart")):
+        ratios = [one.width_ratio(number) for one in planted]
+        theirs = [one.rivals[number].coverage for one in planted]
+        lines.append(
+            f"width / that of the re-selecting bootstrap, {name}: median {np.median(ratios):.2f}, most "
+            f"{max(ratios):.2f}; its coverage: mean {np.mean(theirs):.1%}, least {min(theirs):.1%}"
+        )
+    return lines
+
+
 @np.errstate(divide="ignore", invalid="ignore")  # a dead backbone can score exactly chance
 def main() -> None:
     """Run both studies and print them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=500)
-    draws = parser.parse_args().draws
+    parser.add_argument("--rival-draws", type=int, default=100)
+    arguments = parser.parse_args()
+    draws = arguments.draws
     worlds = [World("dead", 0.0, 0.35, 0.0)]
     worlds += [
         World(f"{strength}, {shape}", top, peak, retention)
@@ -185,29 +262,13 @@ def main() -> None:
         for shape, peak in (("broad", 0.35), ("narrow", 0.15))
         for retention in RETENTIONS
     ]
-    table = Table(
-        "backbone", "true", "plain", "debiased", "coverage", "unbounded", "width", "reselecting width",
-        title=f"Retention over {draws} draws: medians, nominal 95 % intervals",
-    )  # fmt: skip
-    planted = []
+    console = Console(width=140)
+    found = []
     for world in worlds:
-        found = study(world, draws)
-        planted += [found.coverage] * (world.top > 0)
-        table.add_row(
-            world.name,
-            f"{world.retention:.2f}" if world.top else "–",
-            f"{found.plain:.2f}",
-            f"{found.debiased:.2f}",
-            f"{found.coverage:.1%}" if world.top else "–",
-            f"{found.unbounded:.0%}",
-            f"{found.width:.2f}",
-            f"{found.reselecting_width:.2f}",
-        )
-    console = Console(width=120)
-    console.print(table)
-    console.print(
-        f"coverage over the {len(planted)} worlds: mean {np.mean(planted):.1%}, least {min(planted):.1%}"
-    )
+        found.append(study(world, draws, arguments.rival_draws))
+        console.print(f"{world.name} {world.retention:.2f}: covered {found[-1].coverage:.1%}", highlight=False)
+    console.print(table_of(found, draws))
+    console.print(*verdicts([one for one in found if one.world.top > 0]), sep="\n")
     mean, difference = joined_coverage(draws)
     console.print(f"bootstrap over four categories: mean covers {mean:.1%}, difference of groups {difference:.1%}")
     alarms = false_alarms(draws)

@@ -20,13 +20,26 @@ if TYPE_CHECKING:
     from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.retention import retention as retention_table
-    from probe_kit.retention.figures import layer_curve
+    from probe_kit.retention.displays import (
+        FinalPositionsDisplay,
+        IterationMapDisplay,
+        KnowledgeActionDisplay,
+        LayerCurveDisplay,
+        ModelDepthDisplay,
+        layer_curve,
+    )
+    from probe_kit.retention.report import write_report
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
     from probe_kit.train import load_results, train_probes
 
 __all__ = [
     "Act2AnswerEnv",
     "ExtractSettings",
+    "FinalPositionsDisplay",
+    "IterationMapDisplay",
+    "KnowledgeActionDisplay",
+    "LayerCurveDisplay",
+    "ModelDepthDisplay",
     "ProbeKitError",
     "Run",
     "SceneSpec",
@@ -43,6 +56,7 @@ __all__ = [
     "open_run",
     "retention_table",
     "train_probes",
+    "write_report",
 ]
 
 # `import probe_kit` must not load torch.
@@ -51,6 +65,11 @@ __getattr__ = lazy_names(
     {
         "Act2AnswerEnv": "env",
         "ExtractSettings": "extract",
+        "FinalPositionsDisplay": "retention.displays",
+        "IterationMapDisplay": "retention.displays",
+        "KnowledgeActionDisplay": "retention.displays",
+        "LayerCurveDisplay": "retention.displays",
+        "ModelDepthDisplay": "retention.displays",
         "ProbeKitError": "errors",
         "Run": "extract",
         "SceneSpec": "env",
@@ -60,12 +79,13 @@ __getattr__ = lazy_names(
         "capture": "hooks",
         "default_suite": "suite",
         "extract_run": "extract",
-        "layer_curve": "retention.figures",
+        "layer_curve": "retention.displays",
         "load_policy": "hooks",
         "load_results": "train",
         "load_suite": "suite",
         "open_run": "extract",
         "retention_table": "retention:retention",
         "train_probes": "train",
+        "write_report": "retention.report",
     },
 )

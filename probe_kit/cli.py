@@ -14,8 +14,10 @@ from probe_kit.extract.commands import export, extract, run_app
 from probe_kit.suite.commands import app as suite_app
 
 if TYPE_CHECKING:
+    from probe_kit.doctor import Finding
     from probe_kit.extract import Run
     from probe_kit.hooks.verify import Verification
+    from probe_kit.retention import RetentionTable
     from probe_kit.retention.measure import Iterations
     from probe_kit.train import Baseline, ProbeResults, Target
 
@@ -70,13 +72,30 @@ def demo(
     out_folder: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
         "probe-kit-demo"
     ),
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare",
+            help="Test the instrument instead: policies of which the truth is known, expected beside measured.",
+        ),
+    ] = False,
 ) -> None:
     """Run the whole pipeline on the embedded default: episodes, activations, probes, retention.
 
-    Takes under 5 minutes on 2 cores and downloads nothing.
+    Takes under 5 minutes on 2 cores and downloads nothing. With --compare it does so for three policies and
+    takes three times as long.
     """
-    from probe_kit.demo import run_demo
+    from probe_kit.demo import compare_organisms, run_demo
 
+    if compare:
+        from probe_kit.organisms import to_rich
+
+        with progress() as bar:
+            findings = compare_organisms(out_folder, lambda stage: counter(bar, stage))
+        out.print(to_rich(findings))
+        if not all(finding.agrees for finding in findings):
+            raise typer.Exit(1)
+        return
     with progress() as bar:
         made = run_demo(out_folder, lambda stage: counter(bar, stage))
     out.print(made.table.to_rich())
@@ -89,7 +108,7 @@ def demo(
 @app.command()
 def models(
     name: Annotated[str | None, typer.Argument(help="Show one model only.")] = None,
-    run: Annotated[Path | None, typer.Option(help="Show the certificate of this run instead.")] = None,
+    run: Annotated[str | None, typer.Option(help="Show the certificate of this run instead.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """List the models that can be run: checkpoints, streams, what this machine lacks for them."""
@@ -180,7 +199,7 @@ def _print_verification(verification: "Verification") -> None:
 
 @app.command()
 def train(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
     categories: Annotated[
         str | None, typer.Option(help="Comma-separated; default each of the run. all: every episode pooled.")
     ] = None,
@@ -197,10 +216,13 @@ def train(
     ] = None,
     suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels.")] = None,
     twin: Annotated[
-        Path | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
+        str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Processes that share the sites.")] = 1,
+    jobs: Annotated[
+        int | None, typer.Option(help="Processes that share the sites; default 1, with --ray one for every core.")
+    ] = None,
+    ray: Annotated[str | None, typer.Option(help="Share the sites on a Ray cluster: ADDRESS or auto.")] = None,
     device: Annotated[str | None, typer.Option(help="Solve with torch there, such as cuda; one process.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
 ) -> None:
@@ -226,6 +248,7 @@ def train(
             seed=seed,
             jobs=jobs,
             device=device,
+            ray=ray,
             progress=counter(bar, "sites"),
         )
     _print_peaks(results, opened.random_weights)
@@ -271,17 +294,20 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
 
 @app.command()
 def retention(
-    runs: Annotated[list[Path] | None, typer.Argument(help="One or more run folders.")] = None,
+    runs: Annotated[list[str] | None, typer.Argument(help="One or more run folders or URLs.")] = None,
     group: Annotated[
         list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
     ] = None,
     style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
     views: Annotated[str | None, typer.Option(help="Comma-separated; default all probed ones.")] = None,
-    iterations: Annotated[str, typer.Option(help="Expert iterations that count: all, last or a number.")] = "all",
+    iterations: Annotated[
+        str, typer.Option(help="Expert iterations or action tokens that count: all, last or a number.")
+    ] = "all",
     epsilons: Annotated[
         str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
     ] = None,
-    figures: Annotated[Path | None, typer.Option(help="Folder for layer curves as PNG.")] = None,
+    html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
@@ -303,17 +329,24 @@ def retention(
         out.print(table.to_rich())
     else:
         typer.echo(getattr(table, f"to_{style}")())
+    listed = [run for of_group in opened.values() for run in of_group]
     if figures is not None:
-        _save_figures([run for listed in opened.values() for run in listed], figures)
+        _save_figures(listed, table, figures)
+    if html is not None:
+        from probe_kit.retention.report import write_report
+
+        with err.status("drawing the report"):
+            written = write_report(listed, html, table)
+        err.print(f"report: {written}", highlight=False, soft_wrap=True)
 
 
-def _groups(texts: list[str]) -> dict[str, tuple[Path, ...]]:
+def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
     groups = {}
     for text in texts:
         name, separator, paths = text.partition("=")
         if not (separator and name and split(paths)):
             raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
-        groups[name] = tuple(Path(part) for part in split(paths) or ())
+        groups[name] = split(paths) or ()
     return groups
 
 
@@ -335,13 +368,42 @@ def _iterations(text: str) -> "Iterations":
 _FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
-def _save_figures(runs: "list[Run]", folder: Path) -> None:
-    from probe_kit.retention.figures import layer_curve
-    from probe_kit.train import load_results
+def _save_figures(runs: "list[Run]", table: "RetentionTable", folder: Path) -> None:
+    from probe_kit.retention.displays import gallery, save_figures
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for run in runs:
-        if run.streams:
-            path = folder / f"{run.path.resolve().name}-layer-curves.png"
-            layer_curve(load_results(run)).savefig(path)
-            err.print(f"figure: {path}", highlight=False, soft_wrap=True)
+    for path in save_figures(gallery(runs, table), folder):
+        err.print(f"figure: {path}", highlight=False, soft_wrap=True)
+
+
+# -- doctor ----------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Say what works on this machine, and what to do about the rest; exit 1 if the demo could not run."""
+    from probe_kit.doctor import examine
+
+    with err.status("looking around"):
+        findings = examine()
+    if as_json:
+        print_json([finding.to_json() for finding in findings])
+    else:
+        _print_findings(findings)
+    raise typer.Exit(1 if any(finding.state == "missing" for finding in findings) else 0)
+
+
+def _print_findings(findings: "list[Finding]") -> None:
+    from rich.table import Table
+
+    colours = {"ok": "green", "note": "yellow", "missing": "red"}
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        advice = f"\n[dim]{escape(finding.advice)}[/]" if finding.advice else ""
+        mark = f"[{colours[finding.state]}]{finding.state}[/]"
+        table.add_row(mark, finding.subject, escape(finding.seen) + advice)
+    out.print(table)

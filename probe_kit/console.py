@@ -1,6 +1,8 @@
 """What the commands share: two consoles, progress bars, comma-separated lists."""
 
 import json
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,7 +18,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-out = Console()
+PAGE = 120
+"""Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""
+
+out = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else PAGE)
 """Results: what a script would read."""
 err = Console(stderr=True)
 """Progress, plans and notes."""

@@ -7,14 +7,16 @@ from pathlib import Path
 
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.extract.layout import VIDEOS
+from probe_kit.organisms import Finding, compare
 from probe_kit.retention import RetentionTable, retention
-from probe_kit.retention.figures import layer_curve
-from probe_kit.suite import build_suite
+from probe_kit.retention.displays import layer_curve
+from probe_kit.retention.report import write_report
+from probe_kit.suite import Suite, build_suite
 from probe_kit.train import train_probes
 
-CATEGORIES = ("color", "shape", "counting")
-ITEMS = 12
-PERMUTATIONS = 100
+CATEGORIES = ("color", "shape", "state", "counting")
+ITEMS = 24
+PERMUTATIONS = 200
 
 Progress = Callable[..., None]
 Stage = Callable[[str], Progress]
@@ -31,7 +33,8 @@ class Demo:
     def next_steps(self) -> str:
         """Where to look, and what to try."""
         lines = [
-            f"[bold]Look at[/] {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
+            f"[bold]Look at[/] {self.folder / 'report.html'}  everything on one page, in a browser",
+            f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
             f"        {self.folder / 'episode.gif'}  what one episode looks like",
             f"        {self.folder / 'table.md'}  the tables above",
             f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
@@ -44,18 +47,28 @@ class Demo:
         return "\n".join(lines)
 
 
+def compare_organisms(folder: Path, stage: Stage) -> list[Finding]:
+    """The demo's questions put to policies of which the truth is known; see `probe_kit.organisms`."""
+    return compare(_questions(folder, stage), folder, PERMUTATIONS, stage)
+
+
+def _questions(folder: Path, stage: Stage) -> Suite:
+    return build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
+
+
 def run_demo(folder: Path, stage: Stage) -> Demo:
-    """Suite, episodes, probes, table, figure and film in `folder`; called again, it continues.
+    """Suite, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
 
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
-    suite = build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
+    suite = _questions(folder, stage)
     settings = ExtractSettings("pi0-tiny", suite=suite.folder, video="first")
     run = extract_run(settings, folder / "run", progress=stage("episodes"))
     results = train_probes(run, permutations=PERMUTATIONS, progress=stage("probing sites"))
     table = retention([run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     (folder / "table.md").write_text(table.to_markdown())
+    write_report([run], folder / "report.html", table)
     film = next((run.path / VIDEOS).glob("*.gif"))
     shutil.copyfile(film, folder / "episode.gif")
     return Demo(folder, run, table)

@@ -124,6 +124,12 @@ class DiskSpaceError(ProbeKitError):
     exit_code = 3
 
 
+class StoreError(ProbeKitError):
+    """An object store cannot be reached, refuses, or cannot keep several writers apart."""
+
+    exit_code = 3
+
+
 class RunDamagedError(ProbeKitError):
     """Stored bytes are missing or differ from what was committed."""
 

@@ -43,6 +43,16 @@ def golden_smolvla() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_openvla() -> Path:
+    return _golden("openvla")
+
+
+@pytest.fixture(scope="session")
+def golden_prismatic() -> Path:
+    return _golden("prismatic")
+
+
+@pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
     from probe_kit.hooks.pi0 import load_pi0_tiny
 
@@ -53,7 +63,7 @@ def pi0_tiny() -> "Pi0":
 def observation() -> "Observation":
     from probe_kit.hooks import Observation
 
-    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     state = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
     return Observation(image, state, "Put the cube on the red shape")
 

@@ -37,10 +37,15 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     assert made.stdout.strip() == str(run)
     trained = probe_kit("train", run, "--permutations", 20)
     assert trained.returncode == 0, trained.stderr
-    printed = probe_kit("retention", run, "--format", "json")
+    shown = ("--html", tmp_path / "report.html", "--figures", tmp_path / "figures")
+    printed = probe_kit("retention", run, "--format", "json", *shown)
     assert printed.returncode == 0, printed.stderr
     rows = json.loads(printed.stdout)
     assert {row["category"] for row in rows} == {"color", "shape", "mean"}
+    assert "data:image/svg+xml" in (tmp_path / "report.html").read_text()
+    assert {"run-layer-curves.png", "run-final-positions.pdf"} <= {
+        p.name for p in (tmp_path / "figures").iterdir()
+    }
     assert all(row.keys() >= KEYS for row in rows)
     for style in ("table", "csv", "markdown", "latex"):
         assert "random" in probe_kit("retention", run, "--format", style).stdout.lower()
@@ -150,7 +155,7 @@ def test_the_demo_makes_everything_it_promises(tmp_path: Path) -> None:
     answer = probe_kit("demo", "--out", tmp_path / "demo")
     assert answer.returncode == 0, answer.stderr
     assert "random weights" in answer.stdout
-    for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif"):
+    for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif", "report.html"):
         assert (tmp_path / "demo" / name).is_file()
 
 

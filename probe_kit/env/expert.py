@@ -35,11 +35,18 @@ class ScriptedExpert:
     """Carries the cube to the correct tile (`mirrored`: to the wrong one), through the public actions alone.
 
     env: an Act2AnswerEnv, wrapped or not. Call `reset` after each reset of the environment.
+    grasp_height: of the tool, metres; None for the middle of the cube.
+    tolerance: distance in metres at which a way-point counts as reached. Demonstrations whose executed actions
+    are noisy need a wider one, or the expert lingers.
     """
 
-    def __init__(self, env: Any, mirrored: bool = False) -> None:
+    def __init__(
+        self, env: Any, mirrored: bool = False, grasp_height: float | None = None, tolerance: float = 1e-4
+    ) -> None:
         self._env: Act2AnswerEnv = env.unwrapped
         self._mirrored = mirrored
+        self._height = grasp_height
+        self._tolerance = tolerance
         self._actions: Iterator[Array] | None = None
 
     def reset(self) -> None:
@@ -96,7 +103,7 @@ class ScriptedExpert:
 
     def _arrived(self, waypoint: Waypoint) -> bool:
         shift, turn = self._remaining(waypoint)
-        return bool(np.linalg.norm(shift) < 1e-4 and abs(turn) < 1e-3)
+        return bool(np.linalg.norm(shift) < self._tolerance and abs(turn) < 1e-3)
 
     def _remaining(self, waypoint: Waypoint) -> tuple[Array, float]:
         """Translation and turn about +z from the commanded pose to the way-point."""
@@ -115,5 +122,7 @@ class ScriptedExpert:
 
     def _grasp_height(self) -> float:
         """Height of the tool when the cube lies on the table between the fingers."""
+        if self._height is not None:
+            return self._height
         model = self._env.scene.arm.model
         return max(self._env.scene_spec.cube_side / 2 + model.hand_drop, model.clearance)

@@ -4,6 +4,7 @@ Frame: the world frame is the base frame of the WidowX of BridgeV2. +x points aw
 left, +z up, and the table top is z = 0. Units: metres, radians, seconds, kilograms, newtons.
 """
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from difflib import get_close_matches
@@ -169,9 +170,13 @@ class SceneSpec:
         return self.tile_left if side == "left" else self.tile_right
 
     def to_json(self) -> dict[str, Any]:
-        """The record as plain JSON values, with the outcome radius that is really used."""
+        """The record as plain JSON values, with the outcome radius that is really used.
+
+        A file is named by the sha256 of what is in it, because its path says nothing about that.
+        Raises SceneError if it cannot be read.
+        """
         plain = asdict(self) | {"epsilon": self.zone_radius}
-        return {key: str(value) if isinstance(value, Path) else value for key, value in plain.items()}
+        return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
 
     def _check_values(self) -> None:
         positive = {
@@ -207,6 +212,15 @@ class SceneSpec:
                     f"a cube that starts at {self.cube_xy} may lie in the zone of the tile at {tile} without "
                     "having been moved. Use a smaller `epsilon` or `start_jitter`, or start it elsewhere."
                 )
+
+
+def _content_sha256(path: Path) -> str:
+    try:
+        return f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+    except OSError as error:
+        raise SceneError(
+            f"{path} cannot be read ({error.strerror}). Give another file, or leave it out."
+        ) from error
 
 
 PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(

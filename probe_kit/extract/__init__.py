@@ -7,6 +7,7 @@ from probe_kit.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.extract.export import export_run
     from probe_kit.extract.extraction import Extraction, extract_run, prepare
+    from probe_kit.extract.location import Location, locate
     from probe_kit.extract.run import Run, open_run
     from probe_kit.extract.sealing import seal
     from probe_kit.extract.settings import ExtractSettings
@@ -15,10 +16,12 @@ if TYPE_CHECKING:
 __all__ = [
     "ExtractSettings",
     "Extraction",
+    "Location",
     "Run",
     "Verification",
     "export_run",
     "extract_run",
+    "locate",
     "open_run",
     "prepare",
     "seal",
@@ -33,6 +36,8 @@ __getattr__ = lazy_names(
         "export_run": "export",
         "extract_run": "extraction",
         "prepare": "extraction",
+        "Location": "location",
+        "locate": "location",
         "Run": "run",
         "open_run": "run",
         "seal": "sealing",

@@ -11,22 +11,47 @@ from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.extract import Extraction, Run
+    from probe_kit.extract.location import Location
 
 run_app = typer.Typer(help="Look after runs.", no_args_is_help=True)
 DAMAGED = 1
 
 SCENE = "Scene (recorded with the run)"
+FAMILY = "Model (only some families have these)"
 
 
 def extract(
     model: Annotated[str, typer.Option(help="A model of `probe-kit models`, or expert, expert-mirrored.")],
     out_folder: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default runs/<model>-<settings hash>.")
+        str | None,
+        typer.Option("--out", help="Folder or s3://BUCKET/PREFIX/RUN; default runs/<model>-<settings hash>."),
     ] = None,
     checkpoint: Annotated[str | None, typer.Option(help="Folder or hub id; default the family's.")] = None,
     random_weights: Annotated[
         bool, typer.Option("--random-weights", help="Untrained twin of the same architecture, as a control.")
     ] = False,
+    unnorm_key: Annotated[
+        str | None,
+        typer.Option(help="Data set whose units actions get; default bridge_orig.", rich_help_panel=FAMILY),
+    ] = None,
+    prompt: Annotated[
+        str | None,
+        typer.Option(help="openvla, openvla-v01 or a template with {instruction}.", rich_help_panel=FAMILY),
+    ] = None,
+    centre_crop: Annotated[
+        bool,
+        typer.Option(
+            "--centre-crop", help="Show 0.9 of the area: fine-tunes with augmentation.", rich_help_panel=FAMILY
+        ),
+    ] = False,
+    tokenizer: Annotated[
+        str | None,
+        typer.Option(help="Folder of a tokenizer; bytes: for development checkpoints.", rich_help_panel=FAMILY),
+    ] = None,
+    bits: Annotated[
+        int | None,
+        typer.Option(help="8 or 4: quantised, not exact (extra quantized, GPU).", rich_help_panel=FAMILY),
+    ] = None,
     suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
     items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
@@ -74,6 +99,9 @@ def extract(
     dtype: Annotated[str | None, typer.Option(help="float32 or bfloat16; default the checkpoint's.")] = None,
     codec: Annotated[str, typer.Option(help="zstd, fast or none.")] = "zstd",
     video: Annotated[str, typer.Option(help="GIF of the first episode, of all, or none.")] = "none",
+    frames: Annotated[
+        str, typer.Option(help="ends: thumbnails of first and last frames, for the report. none: no pictures.")
+    ] = "ends",
     batch: Annotated[
         int, typer.Option(help="Observations per policy call; above 1, numbers repeat up to float rounding.")
     ] = 1,
@@ -95,7 +123,15 @@ def extract(
     """
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, prepare
+    from probe_kit.extract.location import locate
 
+    options = {
+        "unnorm_key": unnorm_key,
+        "prompt": prompt,
+        "centre_crop": centre_crop or None,
+        "tokenizer": tokenizer,
+        "bits": bits,
+    }
     asked = {
         "max_steps": max_steps,
         "tile_side": tile_side,
@@ -114,6 +150,7 @@ def extract(
         model=model,
         checkpoint=checkpoint,
         random_weights=random_weights,
+        options={name: value for name, value in options.items() if value is not None},
         suite=suite,
         categories=split(categories),
         items=items,
@@ -126,6 +163,7 @@ def extract(
         device=device,
         dtype=dtype,
         video=video,
+        frames=frames,
         batch=batch,
         env_workers=env_workers,
         workers=workers,
@@ -133,12 +171,12 @@ def extract(
     )
     with err.status("loading suite and model"):
         extraction = prepare(settings)
-    folder = out_folder or Path("runs") / extraction.default_name()
-    _print_plan(extraction, folder)
+    location = locate(out_folder or Path("runs") / extraction.default_name())
+    _print_plan(extraction, location)
     if dry_run:
         return
     with progress() as bar:
-        run = extraction.run(folder, force=force, progress=counter(bar, "episodes"))
+        run = extraction.run(location, force=force, progress=counter(bar, "episodes"))
     _print_outcomes(run)
 
 
@@ -152,12 +190,10 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _print_plan(extraction: "Extraction", folder: Path) -> None:
+def _print_plan(extraction: "Extraction", location: "Location") -> None:
     from rich.table import Table
 
-    from probe_kit.extract.disk import free_bytes
-
-    plan, identity = extraction.plan, extraction.identity()
+    plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     weights = (identity["weights_sha256"] or "scripted")[:12]
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
@@ -166,8 +202,8 @@ def _print_plan(extraction: "Extraction", folder: Path) -> None:
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
-        "disk": f"{free_bytes(folder) / 1e9:,.1f} GB free",
-        "run": str(folder),
+        "disk": "no bound" if free is None else f"{free / 1e9:,.1f} GB free",
+        "run": str(location),
     }
     table = Table(show_header=False, title="plan", box=None)
     for name, value in rows.items():
@@ -185,8 +221,8 @@ def _print_outcomes(run: "Run") -> None:
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     err.print(f"{len(run.episodes)} episodes: {text}", highlight=False)
     step = "retention" if not run.streams else "train"
-    err.print(f"next: [bold]probe-kit {step} {run.path}[/]", highlight=False, soft_wrap=True)
-    out.print(str(run.path), highlight=False, soft_wrap=True)
+    err.print(f"next: [bold]probe-kit {step} {run.location}[/]", highlight=False, soft_wrap=True)
+    out.print(str(run.location), highlight=False, soft_wrap=True)
 
 
 # -- run -----------------------------------------------------------------------------------------------
@@ -194,7 +230,7 @@ def _print_outcomes(run: "Run") -> None:
 
 @run_app.command("verify")
 def verify(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
     deep: Annotated[bool, typer.Option("--deep", help="Read every byte, not only sizes.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
@@ -203,7 +239,7 @@ def verify(
 
     found = verify_run(run, deep)
     if as_json:
-        print_json({**asdict(found), "path": str(found.path), "ok": found.ok})
+        print_json({**asdict(found), "ok": found.ok})
     else:
         checked = "every byte" if deep else "sizes"
         sealed = "sealed" if found.sealed else "not sealed"
@@ -216,7 +252,7 @@ def verify(
 
 
 @run_app.command("seal")
-def seal_run(run: Annotated[Path, typer.Argument(help="Run folder.")]) -> None:
+def seal_run(run: Annotated[str, typer.Argument(help="Run folder or URL.")]) -> None:
     """Build the columns that make probing fast; `extract` does it by itself at the end."""
     from probe_kit.extract import seal
 
@@ -224,7 +260,7 @@ def seal_run(run: Annotated[Path, typer.Argument(help="Run folder.")]) -> None:
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
     style: Annotated[str, typer.Option("--format", help="h5, safetensors or parquet.")],
     out_file: Annotated[
         Path | None, typer.Option("--out", help="File to write; default <run>.<format> beside the run.")
@@ -233,7 +269,9 @@ def export(
 ) -> None:
     """Write a run as one ordinary file, with its sha256 beside it."""
     from probe_kit.extract import export_run
+    from probe_kit.extract.location import locate
 
-    target = out_file or run.with_name(f"{run.resolve().name}.{style}")
+    location = locate(run)
+    target = out_file or location.beside(f"{location.name}.{style}")
     with err.status("exporting"):
-        out.print(str(export_run(run, style, target, partial)), highlight=False, soft_wrap=True)
+        out.print(str(export_run(location, style, target, partial)), highlight=False, soft_wrap=True)

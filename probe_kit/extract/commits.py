@@ -1,10 +1,7 @@
 """Commits: the small record that makes an episode count, written last and exactly once."""
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import google_crc32c
@@ -14,6 +11,7 @@ from zarr.storage import WrapperStore
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.layout import COMMITS, DATA, FAILED
+from probe_kit.extract.location import Location
 from probe_kit.identity import canonical_json, sha256_json
 
 Commit = dict[str, Any]
@@ -47,33 +45,24 @@ def crc32c(content: bytes) -> str:
     return f"{google_crc32c.value(content):08x}"
 
 
-def create_once(path: Path, content: Mapping[str, Any]) -> bool:
-    """Write canonical JSON under `path` unless it exists; True if this call wrote it.
-
-    Exclusive and atomic: written aside, flushed to the disk, then linked to its name.
-    """
-    handle, aside = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "w") as file:
-            json.dump(content, file, sort_keys=True, indent=1, allow_nan=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.link(aside, path)
-    except FileExistsError:
-        return False
-    finally:
-        Path(aside).unlink()
-    return True
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """The one way JSON is written in a run: keys sorted, a line each."""
+    return json.dumps(content, sort_keys=True, indent=1, allow_nan=False).encode()
 
 
-def write_commit(run: Path, number: int, commit: Commit) -> bool:
+def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:
+    """Write JSON under `key` unless it exists; True if this call wrote it. Exclusive and atomic."""
+    return location.create(key, as_json(content))
+
+
+def write_commit(location: Location, number: int, commit: Commit) -> bool:
     """Make episode `number` count; False if another writer was first."""
-    return create_once(commit_path(run, number), {**commit, CHECKSUM: commit_checksum(commit)})
+    return create_once(location, commit_key(number), {**commit, CHECKSUM: commit_checksum(commit)})
 
 
-def commit_path(run: Path, number: int) -> Path:
+def commit_key(number: int) -> str:
     """Where the commit of episode `number` lies."""
-    return run / COMMITS / f"{number:08d}.json"
+    return f"{COMMITS}/{number:08d}.json"
 
 
 def commit_checksum(commit: Commit) -> str:
@@ -81,23 +70,30 @@ def commit_checksum(commit: Commit) -> str:
     return crc32c(canonical_json({key: value for key, value in commit.items() if key != CHECKSUM}).encode())
 
 
-def read_commits(run: Path) -> dict[int, Commit]:
+def read_commits(location: Location) -> dict[int, Commit]:
     """All commits by episode number, each checked against the sizes of the objects it names.
 
     Raises RunDamagedError naming the first object that is missing or has another size.
     """
-    commits = {}
-    for path in sorted((run / COMMITS).glob("*.json")):
-        commit = json.loads(path.read_text())
+    commits: dict[int, Commit] = {
+        int(name.removesuffix(".json")): json.loads(text)
+        for name, text in location.read_all(COMMITS, ".json").items()
+    }
+    sizes = committed_sizes(location, commits)
+    for number, commit in commits.items():
         for key, (length, _) in commit["objects"].items():
-            problem = wrong_size(run, key, length)
+            problem = wrong_size(sizes, key, length)
             if problem:
                 raise RunDamagedError(
-                    f"{run / DATA / key} of episode {commit['episode_id']} {problem}. Delete "
-                    f"{COMMITS}/{path.name} and run the same `probe-kit extract` again to redo the episode"
+                    f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. Delete "
+                    f"{commit_key(number)} and run the same `probe-kit extract` again to redo the episode"
                 )
-        commits[int(path.stem)] = commit
     return commits
+
+
+def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[str, int]:
+    """Bytes of every object that a commit names, as far as it is there."""
+    return location.sizes(DATA, (key for commit in commits.values() for key in commit["objects"]))
 
 
 def stamp_of(commits: Mapping[int, Commit]) -> str:
@@ -105,22 +101,19 @@ def stamp_of(commits: Mapping[int, Commit]) -> str:
     return sha256_json([[number, commits[number]] for number in sorted(commits)])
 
 
-def wrong_size(run: Path, key: str, length: int) -> str | None:
+def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
     """What is wrong with the size of a committed object, or None."""
-    path = run / DATA / key
-    if not path.is_file():
+    if key not in sizes:
         return "is missing"
-    found = path.stat().st_size
-    return None if found == length else f"has {found} bytes; its commit says {length} bytes"
+    return None if sizes[key] == length else f"has {sizes[key]} bytes; its commit says {length} bytes"
 
 
-def write_failure(run: Path, number: int, episode_id: str, reason: str) -> None:
+def write_failure(location: Location, number: int, episode_id: str, reason: str) -> None:
     """Record why an episode was given up."""
-    (run / FAILED).mkdir(exist_ok=True)
-    create_once(run / FAILED / f"{number:08d}.json", {"episode_id": episode_id, "reason": reason})
+    create_once(location, f"{FAILED}/{number:08d}.json", {"episode_id": episode_id, "reason": reason})
 
 
-def read_failures(run: Path) -> dict[str, str]:
+def read_failures(location: Location) -> dict[str, str]:
     """Reason by episode id of every episode that was given up."""
-    records = [json.loads(path.read_text()) for path in sorted((run / FAILED).glob("*.json"))]
+    records = [json.loads(text) for text in location.read_all(FAILED, ".json").values()]
     return {record["episode_id"]: record["reason"] for record in records}

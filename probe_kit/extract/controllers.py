@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CaptureChangedActionError
+from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.extract.layout import StoredStream
 from probe_kit.identity import derive_seed
 
@@ -87,6 +87,8 @@ class PolicyController:
         self, policy: "Policy", name: str, instructions: Sequence[str], execute: int | None, captured_calls: int,
         with_tokens: bool,
     ) -> None:  # fmt: skip
+        if policy.card.chunk < 1:
+            raise UsageError(f"{name} does not act, so it has no episodes; choose a policy of `probe-kit models`")
         self.policy = policy
         self.execute = execute or policy.card.execute
         self.captured_calls, self.with_tokens = captured_calls, with_tokens
@@ -102,6 +104,8 @@ class PolicyController:
             "dtype": card.dtype,
             "execute": self.execute,
         }
+        if card.settings:
+            self.identity["policy"] = dict(card.settings)
         self._fires: dict[str, int] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:

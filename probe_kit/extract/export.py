@@ -16,11 +16,12 @@ import numpy as np
 from probe_kit.errors import UsageError
 from probe_kit.extract.extras import require
 from probe_kit.extract.layout import StoredStream
+from probe_kit.extract.location import Location
 from probe_kit.extract.rows import Rows
 from probe_kit.extract.run import Run, open_run
 
 
-def export_run(path: Path | str, style: str, out: Path, allow_partial: bool = False) -> Path:
+def export_run(path: Path | str | Location, style: str, out: Path, allow_partial: bool = False) -> Path:
     """Write the run at `path` to the file `out` and its sha256 to `out`.sha256; returns `out`.
 
     h5: `<stream>/pooled`, `<stream>/tokens`, and a dataset per column under `episodes`.

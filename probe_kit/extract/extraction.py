@@ -1,15 +1,17 @@
 """Extraction: plan, load, let the workers play every remaining episode, seal."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from probe_kit.errors import EpisodesFailedError
+from probe_kit.errors import EpisodesFailedError, StoreError
 from probe_kit.extract.commits import write_failure
 from probe_kit.extract.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
-from probe_kit.extract.disk import full_disk_in_words, refuse_if_full
+from probe_kit.extract.disk import refuse_if_full
 from probe_kit.extract.layout import RUN_FILE
+from probe_kit.extract.location import Location, locate
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.run import Run, open_run
 from probe_kit.extract.scheduler import Done, Event, Scheduler
@@ -24,6 +26,10 @@ from probe_kit.suite import Suite, default_suite, load_suite
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
 HOPELESS = 3
+
+
+class SingleWriterWarning(UserWarning):
+    """The object store cannot keep two writers apart; this process must stay the only one."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +60,36 @@ class Extraction:
         """Folder name that repeats for the same settings, so that the same command finds its run again."""
         return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
 
-    def run(self, out: Path, force: bool = False, progress: Progress | None = None) -> Run:
+    def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
         """Play and commit every episode that is not committed yet, seal the run and open it.
 
         progress: called with (episodes done, episodes planned, outcome of the last one).
-        Raises SettingsMismatchError or DiskSpaceError before anything is written, EpisodesFailedError at the end
-        if episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay, and
-        the same call continues behind them.
+        Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
+        object store that cannot be used so, EpisodesFailedError at the end if episodes were given up, and whatever
+        is wrong with all episodes at once. Committed episodes stay, and the same call continues behind them.
         """
-        if not force and not (out / RUN_FILE).is_file():
-            refuse_if_full(self.plan, out)
-        writer = RunWriter(out, self.plan, self.identity())
-        with writer.owned(), full_disk_in_words(out):
-            remaining = writer.remaining()
-            if remaining:
-                self._play(writer, remaining, progress)
-            seal(out)
-        return open_run(out)
+        location = locate(out)
+        if not force and not location.exists(RUN_FILE):
+            refuse_if_full(self.plan, location)
+        with location.in_words():
+            writer = RunWriter(location, self.plan, self.identity())
+            with writer.owned():
+                self._check_exclusive(writer)
+                remaining = writer.remaining()
+                if remaining:
+                    self._play(writer, remaining, progress)
+                seal(location)
+        return open_run(location)
+
+    def _check_exclusive(self, writer: RunWriter) -> None:
+        if writer.several_may_write():
+            return
+        seen = (
+            f"{writer.location}: the store ignores conditional puts (If-None-Match) and keeps no two writers apart"
+        )
+        if self.settings.workers > 1 or self.settings.ray:
+            raise StoreError(f"{seen}. Leave out --workers and --ray, or use another store")
+        warnings.warn(f"{seen}; make sure that no second process extracts here", SingleWriterWarning, stacklevel=3)
 
     def _play(self, writer: RunWriter, remaining: list[int], progress: Progress | None) -> None:
         scheduler = Scheduler(remaining)
@@ -81,18 +100,18 @@ class Extraction:
                 progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
             if event.number in scheduler.given_up:
                 episode = self.plan.episodes[event.number].episode
-                write_failure(writer.path, event.number, episode.episode_id, scheduler.given_up[event.number])
+                write_failure(writer.location, event.number, episode.episode_id, scheduler.given_up[event.number])
             if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
                 raise self._failure(scheduler)
 
         if self.settings.ray:
-            run_on_ray(self.settings, writer.path, scheduler, heard)
+            run_on_ray(self.settings, writer.location.address, scheduler, heard)
         elif self.settings.workers:
-            run_in_processes(self.settings, writer.path, scheduler, heard)
+            run_in_processes(self.settings, writer.location.address, scheduler, heard)
         else:
             run_here(self, writer, scheduler, heard)
         if scheduler.given_up:
-            seal(writer.path)
+            seal(writer.location)
             raise self._failure(scheduler)
 
     def _failure(self, scheduler: Scheduler) -> EpisodesFailedError:
@@ -117,11 +136,11 @@ def prepare(settings: ExtractSettings) -> Extraction:
     return _load(settings)
 
 
-def load_worker(settings: ExtractSettings, run: Path) -> Worker:
+def load_worker(settings: ExtractSettings, run: str) -> Worker:
     """A worker for a run that exists, with a model of its own. Raises SettingsMismatchError if they differ."""
     extraction = _load(settings)
     assert extraction.controller is not None
-    writer = RunWriter(run, extraction.plan, extraction.identity())
+    writer = RunWriter(locate(run), extraction.plan, extraction.identity())
     return Worker(writer, settings, extraction.controller, len(writer.remaining()))
 
 
@@ -136,8 +155,8 @@ def _load(settings: ExtractSettings) -> Extraction:
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
-    """Extract a run into folder `out`, or continue the one that is there."""
-    return prepare(settings).run(Path(out), progress=progress)
+    """Extract a run to a folder or a URL such as `s3://bucket/prefix/run`, or continue the one that is there."""
+    return prepare(settings).run(out, progress=progress)
 
 
 def _find_family(name: str) -> None:
@@ -159,7 +178,12 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
     from probe_kit.hooks import load_policy
 
     policy = load_policy(
-        settings.model, settings.checkpoint, settings.device, settings.dtype, settings.random_weights
+        settings.model,
+        settings.checkpoint,
+        settings.device,
+        settings.dtype,
+        settings.random_weights,
+        **settings.options,
     )
     instructions = sorted({item.instruction for item in suite.items})
     return PolicyController(

@@ -1,16 +1,5 @@
-"""Optional libraries, imported when they are needed."""
+"""Optional libraries, imported when they are needed; see `probe_kit.extras`."""
 
-from importlib import import_module
-from typing import Any
+from probe_kit.extras import require
 
-from probe_kit.errors import MissingExtraError
-
-
-def require(module: str, extra: str) -> Any:
-    """The module, or MissingExtraError naming the extra of probe-kit that brings it."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise MissingExtraError(
-            f"this needs {module.partition('.')[0]}, which is not installed; `pip install 'probe-kit[{extra}]'`"
-        ) from error
+__all__ = ["require"]

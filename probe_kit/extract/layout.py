@@ -10,27 +10,32 @@
       columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
       probes/            results of `probe-kit train`
       videos/            GIFs, if asked for
+      frames/<n>.webp    first and last frame of an episode, see `thumbnails`
 
 Token arrays hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
 """
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.codec import BytesBytesCodec
+from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from probe_kit.hooks.sites import Site, Stream
+
+if TYPE_CHECKING:
+    from probe_kit.extract.location import Location
 
 SCHEMA_VERSION = 1
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
+FRAMES = "frames"
 CODECS = ("zstd", "fast", "none")
 
 
@@ -94,14 +99,14 @@ class StoredStream:
 
 
 def create_arrays(
-    path: Path, streams: list[StoredStream], episodes: int, steps: int, with_tokens: bool, codec: str
+    store: Store, streams: list[StoredStream], episodes: int, steps: int, with_tokens: bool, codec: str
 ) -> None:
     """Create every array at its final size; afterwards only chunks are written.
 
     Pooled rows: float32 (episode, step, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens.
     """
-    root = zarr.open_group(path, mode="w-", zarr_format=3)
+    root = zarr.open_group(store, mode="w-", zarr_format=3)
     for stream in streams:
         group = root.create_group(stream.name)
         pooled = (*stream.lead, len(stream.views), stream.width)
@@ -147,9 +152,10 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
     return [blosc, Crc32cCodec()]
 
 
-def open_array(group: Path, name: str) -> "zarr.Array[Any]":
+def open_array(location: "Location", group: str, name: str) -> "zarr.Array[Any]":
     """Open one array for reading; a missing chunk is an error, never a fill value."""
-    return zarr.open_array(group / name, mode="r", config={"read_missing_chunks": False})
+    store = location.store(group, read_only=True)
+    return zarr.open_array(store, path=name, mode="r", config={"read_missing_chunks": False})
 
 
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -2,23 +2,22 @@
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Self
 
-from probe_kit.extract.commits import commit_path
+from probe_kit.extract.commits import commit_key
 from probe_kit.extract.extras import require
+from probe_kit.extract.location import locate
 from probe_kit.extract.scheduler import Done, Event, Scheduler
 from probe_kit.extract.settings import ExtractSettings
 
 # Episodes per call, so that a worker always has something to simulate while it infers; fewer towards the end.
 EPISODES_PER_CALL = 8
-RESTARTS = 3
 
 
 class RayActor:
     """What runs on a node: the same worker as everywhere."""
 
-    def __init__(self, settings: ExtractSettings, run: Path) -> None:
+    def __init__(self, settings: ExtractSettings, run: str) -> None:
         from probe_kit.extract.extraction import load_worker
 
         self._worker = load_worker(settings, run).__enter__()
@@ -35,9 +34,9 @@ class RayCrew:
     Raises MissingExtraError if Ray is not installed.
     """
 
-    def __init__(self, settings: ExtractSettings, run: Path) -> None:
+    def __init__(self, settings: ExtractSettings, run: str) -> None:
         self._ray = require("ray", "ray")
-        self._settings, self._run = settings, run.resolve()
+        self._settings, self._run = settings, run
         self._playing: dict[Any, int] = {}
 
     def __enter__(self) -> Self:
@@ -46,11 +45,14 @@ class RayCrew:
             address = None if self._settings.ray == "auto" else self._settings.ray
             self._ray.init(address=address, include_dashboard=False, log_to_driver=True)
         gpus = int(self._ray.cluster_resources().get("GPU", 0)) if self._settings.device.startswith("cuda") else 0
-        options = {"num_gpus": 1 if gpus else 0, "max_restarts": RESTARTS, "max_task_retries": 0}
-        actor = self._ray.remote(**options)(RayActor)
-        count = self._settings.workers or max(1, gpus)
-        self._actors = [actor.remote(self._settings, self._run) for _ in range(count)]
+        # Ray could restart an actor itself, but fails every call meanwhile: episodes would seem to kill it twice.
+        options = {"num_gpus": 1 if gpus else 0, "max_restarts": 0, "max_task_retries": 0}
+        self._kind = self._ray.remote(**options)(RayActor)
+        self._actors = [self._start() for _ in range(self._settings.workers or max(1, gpus))]
         return self
+
+    def _start(self) -> Any:
+        return self._kind.remote(self._settings, self._run)
 
     def __exit__(self, *_: object) -> None:
         for actor in self._actors:
@@ -73,6 +75,8 @@ class RayCrew:
         try:
             events: list[Event] = self._ray.get(ready)
         except self._ray.exceptions.RayActorError as error:
+            self._ray.kill(self._actors[slot])  # it may live on behind a broken network
+            self._actors[slot] = self._start()
             events = self._committed(scheduler.holds(slot))
             for event in events:
                 scheduler.hear(slot, event)
@@ -83,5 +87,6 @@ class RayCrew:
 
     def _committed(self, numbers: set[int]) -> list[Event]:
         """What a dead actor finished before it could say so."""
-        paths = {number: commit_path(self._run, number) for number in sorted(numbers)}
-        return [Done(n, json.loads(path.read_text())["outcome"]) for n, path in paths.items() if path.is_file()]
+        location = locate(self._run)
+        finished = [number for number in sorted(numbers) if location.exists(commit_key(number))]
+        return [Done(number, json.loads(location.read(commit_key(number)))["outcome"]) for number in finished]

@@ -12,16 +12,18 @@ from probe_kit.extract.controllers import Controller, Turn
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.stage import EPISODE_ERRORS, AskableStage, Seen
 from probe_kit.extract.staging import EpisodeBuffers, Ring
+from probe_kit.extract.thumbnails import Ends
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """What one episode left: its outcome record, its activations, and its frames if they were asked for."""
+    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for."""
 
     planned: PlannedEpisode
     outcome: dict[str, Any]
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class Play:
                 if isinstance(answer, Seen):
                     seat.seen = answer
                 else:
-                    yield Rollout(seat.planned, answer.outcome, seat.buffers, answer.frames)
+                    yield Rollout(seat.planned, answer.outcome, seat.buffers, answer.frames, answer.ends)
                     self._begin_next(seat)
             if not any(seat.seen for seat in group):
                 return

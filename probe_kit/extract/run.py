@@ -23,6 +23,7 @@ from probe_kit.extract.layout import (
     StoredStream,
     open_array,
 )
+from probe_kit.extract.location import Location, locate
 from probe_kit.extract.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.hooks.sites import Site, Stream
 
@@ -34,14 +35,14 @@ class NotSealedWarning(UserWarning):
     """A column was read from rows, which gives the same numbers slowly."""
 
 
-def open_run(path: Path | str, allow_partial: bool = False) -> "Run":
-    """Open the run in folder `path`.
+def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
+    """Open the run in folder `path`, or at a URL such as `s3://bucket/prefix/run` (extra `remote`).
 
     allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
     Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
     is another one or a committed object is missing.
     """
-    run = Run(Path(path))
+    run = Run(locate(path))
     done = len(run.episodes)
     if done < run.planned and not allow_partial:
         failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
@@ -52,22 +53,35 @@ def open_run(path: Path | str, allow_partial: bool = False) -> "Run":
     return run
 
 
-class Run:
-    """A run on disk. Rows of every array follow `episodes`, which lists the committed ones in plan order."""
+def read_card(location: Location) -> dict[str, Any]:
+    """What `run.json` says. Raises RunNotFoundError if there is none."""
+    try:
+        card: dict[str, Any] = json.loads(location.read(RUN_FILE))
+    except FileNotFoundError:
+        raise RunNotFoundError(
+            f"{location} is not a run: it has no {RUN_FILE}. Make one with `probe-kit extract`"
+        ) from None
+    return card
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        file = path / RUN_FILE
-        if not file.is_file():
-            raise RunNotFoundError(f"{path} is not a run: it has no {RUN_FILE}. Make one with `probe-kit extract`")
-        card = json.loads(file.read_text())
+
+class Run:
+    """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order."""
+
+    def __init__(self, location: Location) -> None:
+        self.location = location
+        card = read_card(location)
         if card["schema_version"] != SCHEMA_VERSION:
             raise RunDamagedError(
-                f"{path} has schema {card['schema_version']}; this version reads {SCHEMA_VERSION}; update it"
+                f"{location} has schema {card['schema_version']}; this version reads {SCHEMA_VERSION}; update it"
             )
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
         self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
+
+    @property
+    def path(self) -> Path:
+        """The run's folder. Raises UsageError if it lies in an object store."""
+        return self.location.path
 
     @property
     def model(self) -> str:
@@ -93,12 +107,12 @@ class Run:
     @cached_property
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked."""
-        certificate: dict[str, Any] = json.loads((self.path / CERTIFICATE_FILE).read_text())
+        certificate: dict[str, Any] = json.loads(self.location.read(CERTIFICATE_FILE))
         return certificate
 
     @cached_property
     def _commits(self) -> dict[int, Commit]:
-        return read_commits(self.path)
+        return read_commits(self.location)
 
     def commits(self) -> list[Commit]:
         """The commit of every episode, in the order of `episodes`."""
@@ -116,7 +130,7 @@ class Run:
     @cached_property
     def failed(self) -> dict[str, str]:
         """Episodes that were given up, with the reason."""
-        return read_failures(self.path)
+        return read_failures(self.location)
 
     @cached_property
     def planned(self) -> int:
@@ -125,7 +139,7 @@ class Run:
 
     @cached_property
     def _plan(self) -> list[dict[str, Any]]:
-        episodes: list[dict[str, Any]] = json.loads((self.path / PLAN_FILE).read_text())["episodes"]
+        episodes: list[dict[str, Any]] = json.loads(self.location.read(PLAN_FILE))["episodes"]
         return episodes
 
     @cached_property
@@ -145,7 +159,7 @@ class Run:
         """How one stream lies in the store. Raises UnknownSiteError."""
         if stream not in self._streams:
             known = ", ".join(self._streams) or "none (a scripted run has no activations)"
-            raise UnknownSiteError(f"{self.path} has no stream {stream!r}; stored: {known}")
+            raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {known}")
         return self._streams[stream]
 
     def views(self, stream: str) -> tuple[str, ...]:
@@ -160,7 +174,7 @@ class Run:
         stored = self.stored(site.stream)
         if site not in stored.stream.sites():
             raise UnknownSiteError(
-                f"{self.path} has no site {site}; {site.stream} has {stored.layers} layers"
+                f"{self.location} has no site {site}; {site.stream} has {stored.layers} layers"
                 + (f" and {stored.iterations} iterations" if stored.iterations else "")
             )
         return stored
@@ -188,19 +202,19 @@ class Run:
 
     @cached_property
     def _columns(self) -> Columns | None:
-        return find_columns(self.path, self.stamp)
+        return find_columns(self.location, self.stamp)
 
     def _note_slow_reading(self) -> None:
         warnings.warn(
-            f"{self.path} is not sealed; columns are put together from rows, which is slow but gives the same "
-            f"numbers. `probe-kit run seal {self.path}` makes it fast",
+            f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the same "
+            f"numbers. `probe-kit run seal {self.location}` makes it fast",
             NotSealedWarning,
             stacklevel=3,
         )
 
     def rows(self, stream: str, kind: Literal["pooled", "tokens"] = "pooled") -> Rows:
         """The stored rows of the committed episodes: all that was captured in one episode at a time."""
-        return Rows(open_array(self.path / DATA, f"{stream}/{kind}"), self._numbers)
+        return Rows(open_array(self.location, DATA, f"{stream}/{kind}"), self._numbers)
 
     def _pooled(self, stream: str) -> NDArray[np.float32]:
         """(E, S, [I,] L, V, D) rows of the committed episodes, read once per stream."""
@@ -249,6 +263,10 @@ class Run:
             values[:, block.start : block.start + block.mask.shape[1]] = block.values
         return values, mask
 
+    def token_mask(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.bool_]:
+        """(E, T) bool: the positions of `role` at one site, or of all tokens but padding; see `tokens`."""
+        return self._role_mask(site, role, call)
+
     def iter_token_blocks(self, site: Site, role: str | None = None, call: int = 0) -> Iterator[TokenBlock]:
         """The tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
 
@@ -275,7 +293,7 @@ class Run:
     def _role_mask(self, site: Site, role: str | None, call: int) -> NDArray[np.bool_]:
         stored = self._check(site)
         if self.settings["tokens"] != "all":
-            raise UnknownSiteError(f"{self.path} stores pooled views only; extract with --tokens all")
+            raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
         spans = [commit["roles"][call][site.stream] for commit in self.commits()]
         mask = role_mask(spans, stored.stored_tokens, role)
         if not mask.any(axis=1).all():

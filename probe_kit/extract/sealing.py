@@ -1,8 +1,5 @@
 """Sealing: pooled rows turned into one block per site and view, and roles into a column."""
 
-import fcntl
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +7,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from probe_kit.extract.layout import COLUMNS, PLAN_FILE, RUN_FILE, codecs
+from probe_kit.extract.layout import COLUMNS, codecs
+from probe_kit.extract.location import Location, locate
 from probe_kit.extract.rows import PADDING
 from probe_kit.extract.run import Run
 
@@ -19,33 +17,26 @@ EPISODES_PER_CHUNK = 1024
 SLAB_BYTES = 1 << 30
 
 
-def seal(path: Path | str) -> bool:
+def seal(path: Path | str | Location) -> bool:
     """Write the columns of the run at `path` unless they are up to date; True if this call wrote them.
 
-    Same commits give the same bytes. Written aside and renamed, so that a crash leaves the old columns or none.
-    Processes that seal one run at once take turns, and all but the first find it done.
+    Same commits give the same bytes. A crash leaves the old columns or none. Processes that seal one folder at
+    once take turns, and all but the first find it done.
     """
-    folder = Run(Path(path)).path
-    with (folder / RUN_FILE).open() as run_file, (folder / PLAN_FILE).open() as turn:
-        fcntl.flock(run_file, fcntl.LOCK_SH)
-        fcntl.flock(turn, fcntl.LOCK_EX)
-        return _seal(Run(folder))
+    location = Run(locate(path)).location
+    with location.turn():
+        return _seal(Run(location))
 
 
 def _seal(run: Run) -> bool:
     if not run.streams or run.episodes.empty or run.sealed:
         return False
-    aside = Path(tempfile.mkdtemp(dir=run.path, prefix=COLUMNS, suffix=".tmp"))
-    aside.chmod(0o755)
-    try:
-        group = zarr.open_group(aside, mode="w", zarr_format=3, attributes={"stamp": run.stamp})
+    with run.location.rebuilding(COLUMNS, run.stamp) as store:
+        group = zarr.open_group(store, mode="w", zarr_format=3)
         for name in run.streams:
             _write_pooled(run, name, group)
             _write_roles(run, name, group)
-        shutil.rmtree(run.path / COLUMNS, ignore_errors=True)
-        aside.rename(run.path / COLUMNS)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        group.attrs["stamp"] = run.stamp  # what makes them count, so last
     return True
 
 

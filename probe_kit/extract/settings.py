@@ -1,5 +1,6 @@
 """What one extraction is asked to do, and the part of it that names the result."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ from probe_kit.extract.layout import CODECS
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
+FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
-_ELSEWHERE = {"checkpoint", "suite", "categories", "items", "scene"}
-_MACHINE = {"device", "video", "batch", "env_workers", "workers", "ray"}
+_ELSEWHERE = {"checkpoint", "options", "suite", "categories", "items", "scene"}
+_MACHINE = {"device", "video", "frames", "batch", "env_workers", "workers", "ray"}
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class ExtractSettings:
 
     model: a family of `probe-kit models`, or `expert` / `expert-mirrored` (scripted, no activations).
     checkpoint: folder or hub id; None for the family's default.
+    options: what only some families have, such as `unnorm_key`; what they lead to is in the policy's card.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
     tokens: `pooled` stores pooled views only, `all` also every token.
@@ -29,6 +32,7 @@ class ExtractSettings:
 
     The rest changes no stored number, only how fast it comes:
     batch: observations per call of the policy. With 1, bytes repeat exactly; with more, up to float rounding.
+    frames: `ends` keeps a thumbnail of the first and last frame of every episode, `none` does not.
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
     ray: address of a Ray cluster, or `auto`; the workers then run there.
@@ -37,6 +41,7 @@ class ExtractSettings:
     model: str
     checkpoint: str | None = None
     random_weights: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
     suite: Path | None = None
     categories: tuple[str, ...] | None = None
     items: int | None = None
@@ -49,13 +54,14 @@ class ExtractSettings:
     device: str = "cpu"
     dtype: str | None = None
     video: str = "none"
+    frames: str = "ends"
     batch: int = 1
     env_workers: int | None = None
     workers: int = 0
     ray: str | None = None
 
     def __post_init__(self) -> None:
-        for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS)):
+        for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS), ("frames", FRAMES)):
             if getattr(self, name) not in allowed:
                 raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
         least = {"captured_calls": 1, "execute": 1, "items": 1, "batch": 1, "workers": 0, "env_workers": 0}
@@ -69,7 +75,7 @@ class ExtractSettings:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
 
 
-def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: Path) -> None:
+def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
     """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
     was, now = _flat(stored), _flat(asked)
     different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]

@@ -19,6 +19,7 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.thumbnails import Ends, shrink
 
 # What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
 EPISODE_ERRORS = (
@@ -45,10 +46,11 @@ class Seen:
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of an episode: its record as flat columns, and a frame per action if it was filmed."""
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails."""
 
     outcome: dict[str, Any]
     frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
 
 
 Answer = Seen | Ending
@@ -58,10 +60,11 @@ class Stage:
     """Plays episodes in this process.
 
     script: `expert` or `expert-mirrored` to let the scripted expert play every episode to its end at once.
+    keep_ends: whether every episode ends with small pictures of its first and last frame.
     """
 
-    def __init__(self, scene: SceneSpec, script: str | None) -> None:
-        self.script = script
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self.script, self._keep_ends = script, keep_ends
         self._env = Act2AnswerEnv(scene)
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
@@ -72,6 +75,7 @@ class Stage:
             _, start = self._env.reset(seed=planned.scene_seed, options=options)
             self._visible = start["tile_visibility"]
             self._shoot()
+            self._first = shrink(self._env.render()) if self._keep_ends else None
             return self._see() if self.script is None else self._follow_script()
         except ProbeKitError as error:
             raise self._named(error) from None
@@ -100,8 +104,11 @@ class Stage:
             _, terminated, truncated, _ = self._env.advance(action)
             self._shoot()
             if terminated or truncated:
-                return Ending(_record(self._env, self._visible), self._frames)
+                return Ending(_record(self._env, self._visible), self._frames, self._ends())
         return None
+
+    def _ends(self) -> Ends | None:
+        return None if self._first is None else (self._first, shrink(self._env.render()))
 
     def _see(self) -> Seen:
         seen = self._env.observe()
@@ -146,8 +153,8 @@ class AskableStage(Protocol):
 class LocalStage:
     """A stage in this process: the work is done when the answer is wanted."""
 
-    def __init__(self, scene: SceneSpec, script: str | None) -> None:
-        self._stage = Stage(scene, script)
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._stage = Stage(scene, script, keep_ends)
 
     def ask(self, method: str, *arguments: Any) -> None:
         """Remember the question."""

@@ -12,8 +12,8 @@ from probe_kit.extract.stage import EPISODE_ERRORS, Answer, Stage
 class ProcessStage:
     """A stage in a child process; a child that dies costs its episode and is replaced."""
 
-    def __init__(self, scene: SceneSpec, script: str | None) -> None:
-        self._settings = scene, script
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._settings = scene, script, keep_ends
         self._start()
 
     def _start(self) -> None:
@@ -49,8 +49,7 @@ class ProcessStage:
 
 def serve(connection: Connection) -> None:
     """The child's side: answer questions until the parent hangs up."""
-    scene, script = connection.recv()
-    stage = Stage(scene, script)
+    stage = Stage(*connection.recv())
     try:
         while True:
             method, arguments = connection.recv()

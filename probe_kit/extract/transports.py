@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import ProbeKitError, WorkerDiedError
@@ -32,7 +31,7 @@ def run_here(extraction: "Extraction", writer: "RunWriter", scheduler: Scheduler
                 heard(event)
 
 
-def run_in_processes(settings: ExtractSettings, run: Path, scheduler: Scheduler, heard: Listener) -> None:
+def run_in_processes(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
     """Play the episodes in `settings.workers` processes; one that dies is replaced.
 
     Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
@@ -56,7 +55,7 @@ def run_in_processes(settings: ExtractSettings, run: Path, scheduler: Scheduler,
 class _Hand:
     """The driver's view of one worker process."""
 
-    def __init__(self, slot: int, settings: ExtractSettings, run: Path) -> None:
+    def __init__(self, slot: int, settings: ExtractSettings, run: str) -> None:
         self.slot, self._settings, self._run = slot, settings, run
         self.start()
 
@@ -124,10 +123,10 @@ def _environment(slot: int, settings: ExtractSettings) -> dict[str, str]:
     return environment
 
 
-def run_on_ray(settings: ExtractSettings, run: Path, scheduler: Scheduler, heard: Listener) -> None:
-    """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the folder `run`.
+def run_on_ray(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
+    """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
 
-    An actor that dies is restarted by Ray; what it held is tried again by the scheduler, as in every transport.
+    An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
     Raises MissingExtraError without Ray, and what an actor raises.
     """
     from probe_kit.extract.ray_crew import RayCrew

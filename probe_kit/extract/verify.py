@@ -1,23 +1,26 @@
-"""Verifying a run: everything the commits promise is compared with what lies on the disk."""
+"""Verifying a run: everything the commits promise is compared with what is stored."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from probe_kit.errors import RunDamagedError, RunNotFoundError
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract.columns import find_columns
 from probe_kit.extract.commits import (
     CHECKSUM,
     Commit,
     commit_checksum,
+    commit_key,
+    committed_sizes,
     crc32c,
     read_failures,
     stamp_of,
     wrong_size,
 )
 from probe_kit.extract.layout import COMMITS, DATA, PLAN_FILE, RUN_FILE
-from probe_kit.extract.run import Run
+from probe_kit.extract.location import Location, locate
+from probe_kit.extract.run import Run, read_card
 from probe_kit.identity import sha256_json
 
 
@@ -29,7 +32,7 @@ class Verification:
     deep: whether every byte was read, not only sizes.
     """
 
-    path: Path
+    path: str
     committed: int
     planned: int
     failed: int
@@ -43,30 +46,30 @@ class Verification:
         return not self.problems
 
 
-def verify_run(path: Path | str, deep: bool = False) -> Verification:
+def verify_run(path: Path | str | Location, deep: bool = False) -> Verification:
     """Compare a run with its commits: presence and sizes, and with `deep` the checksum of every object.
 
     Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
     """
-    path = Path(path)
-    if not (path / RUN_FILE).is_file():
-        raise RunNotFoundError(f"{path} is not a run: it has no {RUN_FILE}")
-    card = json.loads((path / RUN_FILE).read_text())
-    planned = json.loads((path / PLAN_FILE).read_text())["episodes"]
+    location = locate(path)
+    card = read_card(location)
+    planned = json.loads(location.read(PLAN_FILE))["episodes"]
     commits: dict[int, Commit] = {}
     problems = list(_settings_problems(card))
-    for file in sorted((path / COMMITS).glob("*.json")):
+    for name, text in location.read_all(COMMITS, ".json").items():
         try:
-            commits[int(file.stem)] = commit = json.loads(file.read_text())
+            commits[int(name.removesuffix(".json"))] = json.loads(text)
         except ValueError as error:
-            problems.append(f"{COMMITS}/{file.name} is no JSON: {error}")
-        else:
-            problems += _commit_problems(path, file.name, commit, deep)
-    columns = find_columns(path, stamp_of(commits))
+            problems.append(f"{COMMITS}/{name} is no JSON: {error}")
+    sizes = committed_sizes(location, commits)
+    for number, commit in commits.items():
+        problems += _commit_problems(location, number, commit, sizes, deep)
+    columns = find_columns(location, stamp_of(commits))
     if deep and columns is not None and not problems:
-        problems += _column_problems(Run(path))
+        problems += _column_problems(Run(location))
+    failed = len(read_failures(location))
     return Verification(
-        path, len(commits), len(planned), len(read_failures(path)), columns is not None, deep, tuple(problems)
+        str(location), len(commits), len(planned), failed, columns is not None, deep, tuple(problems)
     )
 
 
@@ -75,15 +78,18 @@ def _settings_problems(card: Commit) -> Iterator[str]:
         yield f"{RUN_FILE}: the settings do not have the hash stored beside them"
 
 
-def _commit_problems(run: Path, name: str, commit: Commit, deep: bool) -> Iterator[str]:
+def _commit_problems(
+    location: Location, number: int, commit: Commit, sizes: Mapping[str, int], deep: bool
+) -> Iterator[str]:
+    name = commit_key(number)
     if commit_checksum(commit) != commit.get(CHECKSUM):
-        yield f"{COMMITS}/{name} was changed after it was written"
+        yield f"{name} was changed after it was written"
     for key, (length, checksum) in commit["objects"].items():
-        problem = wrong_size(run, key, length)
-        if problem is None and deep and crc32c((run / DATA / key).read_bytes()) != checksum:
+        problem = wrong_size(sizes, key, length)
+        if problem is None and deep and crc32c(location.read(f"{DATA}/{key}")) != checksum:
             problem = f"has other bytes than were written (crc32c is not {checksum})"
         if problem:
-            yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}; delete {COMMITS}/{name} to redo it"
+            yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}; delete {name} to redo it"
 
 
 def _column_problems(run: Run) -> Iterator[str]:

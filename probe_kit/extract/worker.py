@@ -1,6 +1,7 @@
 """A worker: plays the episodes it is given and commits them. The same code in this process and in others."""
 
 import platform
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,8 +15,8 @@ from PIL import Image
 
 from probe_kit.env import save_gif
 from probe_kit.extract.controllers import Controller
-from probe_kit.extract.disk import full_disk_in_words
 from probe_kit.extract.layout import VIDEOS
+from probe_kit.extract.location import Location
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout import Failure, Play, Rollout
 from probe_kit.extract.scheduler import Done, Event, Failed
@@ -23,6 +24,7 @@ from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.stage import AskableStage, LocalStage
 from probe_kit.extract.stage_process import ProcessStage
 from probe_kit.extract.staging import EpisodeBuffers, Ring
+from probe_kit.extract.thumbnails import write_thumbnail
 from probe_kit.extract.writer import RunWriter
 
 # Buffers beyond those on stage: one is being written while another waits.
@@ -65,7 +67,7 @@ class Worker:
         if wanted is None:
             wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessStage if position < wanted else LocalStage
-        stage: AskableStage = kind(self._settings.scene, self._controller.script)
+        stage: AskableStage = kind(self._settings.scene, self._controller.script, self._settings.frames == "ends")
         stack.callback(stage.close)
         return stage
 
@@ -97,11 +99,13 @@ class Worker:
         """On the writing thread."""
         try:
             rollout.buffers.wait()
-            with full_disk_in_words(self._writer.path):
+            with self._writer.location.in_words():
                 self._writer.write_certificate({**self._controller.certificate(), **_versions()})
+                if rollout.ends:
+                    write_thumbnail(self._writer.location, rollout.planned.index, rollout.ends)
                 self._writer.write(rollout)
                 if rollout.frames:
-                    _save_film(self._writer.path / VIDEOS, rollout)
+                    _save_film(self._writer.location, rollout)
         finally:
             self._ring.give_back(rollout.buffers)
         return Done(rollout.planned.index, rollout.outcome)
@@ -133,11 +137,12 @@ def _versions() -> dict[str, Any]:
     }
 
 
-def _save_film(folder: Path, rollout: Rollout) -> None:
-    folder.mkdir(exist_ok=True)
+def _save_film(location: Location, rollout: Rollout) -> None:
     frames = [
         np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
     ]
     planned = rollout.planned
     name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
-    save_gif(folder / name, frames)
+    with tempfile.TemporaryDirectory() as folder:
+        save_gif(Path(folder) / name, frames)
+        location.write(f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes())

@@ -133,7 +133,8 @@ class _Listener:
         site = self.at_fire.get(self.count)
         self.count += 1
         if site is not None:
-            self.handle(site, passing[0] if isinstance(passing, tuple) else passing)
+            activation = passing[0] if isinstance(passing, tuple) else passing
+            self.handle(site, activation[:, self.tap.tokens])
 
     def check_count(self) -> None:
         if self.count == self.tap.fires:

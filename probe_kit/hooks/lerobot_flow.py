@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError
 from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.hooks.picture_window import PictureWindow, read_window
 from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
 from probe_kit.hooks.roles import PADDING
 from probe_kit.hooks.sites import Site, Stream
@@ -228,7 +229,7 @@ class LerobotFlow(Policy):
         if state.shape[1] != expected:
             raise ObservationError(f"the state has {state.shape[1]} numbers; this checkpoint reads {expected}")
         return {
-            f"{IMAGES}{self.cameras[0]}": images.permute(0, 3, 1, 2).to(device).float() / 255,
+            f"{IMAGES}{self.cameras[0]}": self.window(images.permute(0, 3, 1, 2).to(device).float() / 255),
             STATE: torch.from_numpy(self.state_units.normalise(state)).to(device),
             TOKENS: tokens.to(device),
             MASK: mask.to(device),
@@ -261,6 +262,11 @@ class LerobotFlow(Policy):
             tokens[index, : len(row)] = torch.tensor(row)
             mask[index, : len(row)] = True
         return tokens, mask
+
+    @cached_property
+    def window(self) -> PictureWindow:
+        """The part of the picture this checkpoint looks at."""
+        return read_window(self.folder, f"{IMAGES}{self.cameras[0]}")
 
     @cached_property
     def state_units(self) -> Normaliser:

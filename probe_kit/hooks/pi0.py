@@ -19,7 +19,7 @@ from probe_kit.hooks.policy import Observation
 from probe_kit.hooks.roles import PADDING, Roles
 from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_keys import current_pi0_keys
-from probe_kit.models.pi0_tiny import random_checkpoint
+from probe_kit.models.pi0_tiny import embedded_checkpoint
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
 
@@ -102,7 +102,18 @@ def load_pi0(checkpoint: str, device: str = "cpu", dtype: str | None = None, ran
 def load_pi0_tiny(
     checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
 ) -> Pi0:
-    """The embedded default: pi0 at 0.6 million parameters. Its own checkpoint holds random weights."""
-    policy = Pi0.load(checkpoint or str(random_checkpoint()), device, dtype, random_weights)
-    policy.card = replace(policy.card, family="pi0-tiny", checkpoint=checkpoint or "embedded")
+    """The embedded default: pi0 at 0.76 million parameters, trained on Color and Shape."""
+    return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights)
+
+
+def load_pi0_tiny_early(
+    checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+) -> Pi0:
+    """The embedded default as it was early in its training."""
+    return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights)
+
+
+def _load_embedded(name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool) -> Pi0:
+    policy = Pi0.load(checkpoint or str(embedded_checkpoint(name)), device, dtype, random_weights)
+    policy.card = replace(policy.card, family=name, checkpoint=checkpoint or "embedded")
     return policy

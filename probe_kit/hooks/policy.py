@@ -29,7 +29,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class PolicyCard:
-    """What was really loaded: enough to say whose numbers these are."""
+    """What was really loaded: enough to say whose numbers these are.
+
+    settings: what else the actions and activations depend on, such as the prompt; part of a run's identity.
+    exact: False if the weights that ran are only near those of the file, as after quantisation.
+    """
 
     family: str
     checkpoint: str
@@ -44,11 +48,15 @@ class PolicyCard:
     execute: int
     notes: tuple[str, ...] = ()
     audit: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+    exact: bool = True
 
 
 @dataclass(frozen=True)
 class Tap:
     """Where a site is read and written: the first input or output of `module`, called `fires` times per inference.
+
+    tokens: the positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
 
     The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
     place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
@@ -58,6 +66,7 @@ class Tap:
     module: nn.Module
     fires: int
     end: Literal["input", "output"] = "input"
+    tokens: slice = slice(None)
 
 
 class Policy(ABC):

@@ -1,10 +1,11 @@
 """The model families: what can be loaded by name, and third parties' families through entry points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.errors import UnknownModelError, UsageError
@@ -22,7 +23,7 @@ class Family:
     default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
     loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
     random_weights) gives a Policy; verifier(folder, recorded arrays) gives comparisons; full_size() gives the
-    network of the released size on the meta device.
+    network of the released size on the meta device. options: names of further keyword arguments of the loader.
     """
 
     name: str
@@ -34,10 +35,22 @@ class Family:
     notes: str = ""
     verifier: str | None = None
     full_size: str | None = None
+    options: tuple[str, ...] = ()
 
-    def load(self, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool) -> "Policy":
-        """Load a policy; `checkpoint` None means the default one."""
-        policy: Policy = _import(self.loader)(checkpoint or self.default_checkpoint, device, dtype, random_weights)
+    def load(
+        self,
+        checkpoint: str | None,
+        device: str,
+        dtype: str | None,
+        random_weights: bool,
+        options: Mapping[str, Any] = MappingProxyType({}),
+    ) -> "Policy":
+        """Load a policy; `checkpoint` None means the default one. Raises UsageError for an option it lacks."""
+        if unknown := sorted(options.keys() - set(self.options)):
+            known = f"only {', '.join(self.options)}" if self.options else "none"
+            raise UsageError(f"{self.name} has no option {', '.join(unknown)}; of those options it has {known}")
+        load = _import(self.loader)
+        policy: Policy = load(checkpoint or self.default_checkpoint, device, dtype, random_weights, **options)
         return policy
 
     def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
@@ -66,11 +79,20 @@ def _import(path: str) -> Callable[..., Any]:
 _EMBEDDED = (
     Family(
         "pi0-tiny",
-        "pi0 at 0.6 million parameters, the embedded default",
+        "pi0 at 0.76 million parameters, the embedded default: trained on Color and Shape",
         None,
         "probe_kit.hooks.pi0:load_pi0_tiny",
-        streams="backbone 5 layers, expert 5 layers x 10 iterations",
-        notes="random weights",
+        streams="backbone 4 layers, expert 4 layers x 10 iterations",
+        notes="State is readable in its backbone by training, and not acted on; nothing else was trained",
+        verifier="probe_kit.hooks.verify_flow:verify_pi0",
+    ),
+    Family(
+        "pi0-tiny-early",
+        "the embedded default early in its training",
+        None,
+        "probe_kit.hooks.pi0:load_pi0_tiny_early",
+        streams="backbone 4 layers, expert 4 layers x 10 iterations",
+        notes="a model organism: see `probe-kit demo --compare`",
         verifier="probe_kit.hooks.verify_flow:verify_pi0",
     ),
     Family(
@@ -95,6 +117,30 @@ _EMBEDDED = (
         verifier="probe_kit.hooks.verify_flow:verify_smolvla",
         full_size="probe_kit.models.smolvla:full_size_smolvla",
     ),
+    Family(
+        "openvla",
+        "OpenVLA (DINOv2 + SigLIP, Llama 2 7B, actions as tokens), native; fine-tunes and LoRA as --checkpoint",
+        "openvla/openvla-7b",
+        "probe_kit.hooks.openvla:load_openvla",
+        streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
+        embodiment="as the data set of --unnorm-key; bridge_orig: WidowX end-effector delta at 5 Hz",
+        notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
+        verifier="probe_kit.hooks.prismatic_verify:verify_openvla",
+        full_size="probe_kit.models.prismatic:full_size_openvla",
+        options=("unnorm_key", "prompt", "centre_crop", "tokenizer", "bits"),
+    ),
+    Family(
+        "prismatic",
+        "Prismatic vision-language models, OpenVLA's source (one or two towers; Llama 2, Vicuna, Mistral, Phi-2)",
+        None,
+        "probe_kit.hooks.prismatic:load_prismatic",
+        streams="backbone 33 layers, answer 33 layers (7B)",
+        embodiment="none: answers, does not act",
+        notes="pass --checkpoint in the layout of PrismaticForConditionalGeneration; extra openvla",
+        verifier="probe_kit.hooks.prismatic_verify:verify_prismatic",
+        full_size="probe_kit.models.prismatic:full_size_prismatic",
+        options=("tokenizer", "bits", "steps"),
+    ),
 )
 
 
@@ -113,12 +159,14 @@ def load_policy(
     device: str = "cpu",
     dtype: str | None = None,
     random_weights: bool = False,
+    **options: Any,
 ) -> "Policy":
     """Load the policy `name`, from `checkpoint` (folder or hub id) or the family's default.
 
-    Raises UnknownModelError, CheckpointError or WeightsError.
+    options: what only some families have, such as `unnorm_key`; see `Family.options`.
+    Raises UnknownModelError, UsageError, CheckpointError or WeightsError.
     """
-    return find_family(name).load(checkpoint, device, dtype, random_weights)
+    return find_family(name).load(checkpoint, device, dtype, random_weights, options)
 
 
 def find_family(name: str, others: tuple[str, ...] = ()) -> Family:

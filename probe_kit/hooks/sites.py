@@ -8,15 +8,20 @@ from probe_kit.errors import UnknownSiteError
 _PATTERN = re.compile(r"(?P<stream>[a-z_]+)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?")
 
 
+ACTION_STREAMS = ("expert", "action")
+"""Where the action is made: the expert or, in a policy without one, the positions that choose action tokens."""
+
+
 @dataclass(frozen=True, order=True)
 class Site:
     """One named tensor: `backbone.07.residual`, `expert.03.residual@4`.
 
-    stream: `backbone` (VLM), `expert` (action part) or, where a family offers it, `vision`.
+    stream: `backbone` (VLM), `expert` (action part) or, in a policy without one, `action`; where a family offers
+    it, `vision`.
     layer, quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters
     the final norm. `attention` and `mlp` are what block `layer` adds to it. `final_norm` is its normed end.
-    iteration: flow-matching step, counted from 0 (pure noise); the camera, for `vision` with several of them;
-    None where the stream runs once.
+    iteration: flow-matching step, counted from 0 (pure noise); for `action`, the action token; the camera, for
+    `vision` with several of them; None where the stream runs once.
     """
 
     stream: str
@@ -49,7 +54,7 @@ class Stream:
 
     layers: number of residual sites, one more than the number of blocks.
     width: features per token.
-    iterations: flow-matching steps per inference, or None where the stream runs once.
+    iterations: flow-matching steps or action tokens per inference, or None where the stream runs once.
     """
 
     name: str

@@ -115,12 +115,17 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
 
 
 def load_weights(
-    module: nn.Module, weights: Weights, tensors: Mapping[str, Tensor], allowed_missing: Iterable[str] = ()
+    module: nn.Module,
+    weights: Weights,
+    tensors: Mapping[str, Tensor],
+    allowed_missing: Iterable[str] = (),
+    assign: bool = False,
 ) -> WeightsAudit:
     """Copy `tensors` into `module` and prove that they arrived.
 
     weights: the files, which give the audit its hash. tensors: the same content under the module's names.
     allowed_missing: parameters that inference never reads and the file may lack.
+    assign: make `tensors` themselves the parameters instead of copying them; for a module on the meta device.
     Raises WeightsError naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
     """
     state = module.state_dict()
@@ -135,7 +140,7 @@ def load_weights(
     _refuse(weights.source, "of another shape", shapes)
     damaged = [n for n, t in tensors.items() if t.is_floating_point() and not torch.isfinite(t).all()]
     _refuse(weights.source, "NaN or infinite", damaged)
-    module.load_state_dict(dict(tensors), strict=not allowed)
+    module.load_state_dict(dict(tensors), strict=not allowed, assign=assign)
     state = module.state_dict()
     changed = [n for n, t in tensors.items() if not torch.equal(state[n].cpu(), t.to(state[n].dtype))]
     _refuse(weights.source, "different after loading", changed)

@@ -19,7 +19,7 @@ def initialise(network: nn.Module, seed: int) -> None:
         if parameter.ndim < 2:
             continue
         scale = 1 / float(np.sqrt(parameter[0].numel()))
-        if "position_embedding" in name:
+        if "position_embedding" in name or "pos_embed" in name:
             scale = 0.5
         elif name.endswith(residual_outputs):
             scale /= 2

@@ -1,19 +1,19 @@
-"""The embedded default: a pi0 of 0.6 million parameters, written as an ordinary lerobot checkpoint.
+"""The embedded default: a pi0 of 0.76 million parameters, written as an ordinary lerobot checkpoint.
 
-Dimensions follow the measured recipe of `design/models-pi0`, section 6 ("S"). The weights are random for
-now; the file says so in its metadata, and every result made with them is marked.
+Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_pi0_tiny.py` makes them.
 """
 
 import json
-import os
-import shutil
-import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
+from lerobot.policies.pi0.modeling_pi0 import PI0Policy
+from numpy.typing import ArrayLike
 from safetensors.numpy import save_file as save_numpy
 from safetensors.torch import save_file
 from tokenizers import Regex, Tokenizer
@@ -22,7 +22,6 @@ from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Sequence, Split
 from tokenizers.processors import TemplateProcessing
 
-from probe_kit.identity import sha256_json
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 from probe_kit.suite.generators import vocabulary
@@ -30,71 +29,74 @@ from probe_kit.suite.generators import vocabulary
 _SPECIAL = ("<pad>", "<eos>", "<bos>", "<unk>", "\n")
 WORDS = (*_SPECIAL, *vocabulary())
 SIZE = Pi0Size(
-    vlm=GemmaSize(width=96, depth=4, mlp_dim=192, num_heads=8, num_kv_heads=1, head_dim=16),
-    expert=GemmaSize(width=64, depth=4, mlp_dim=128, num_heads=8, num_kv_heads=1, head_dim=16),
-    vision=SiglipSize(hidden=64, layers=2, heads=4, inter=128, patch=8),
+    vlm=GemmaSize(width=96, depth=3, mlp_dim=192, num_heads=8, num_kv_heads=1, head_dim=16),
+    expert=GemmaSize(width=64, depth=3, mlp_dim=128, num_heads=8, num_kv_heads=1, head_dim=16),
+    vision=SiglipSize(hidden=96, layers=3, heads=4, inter=192, patch=16),
     vocab_size=-(-len(WORDS) // 64) * 64,
 )
-IMAGE_SIDE = 48
-CHUNK = 8
+IMAGE_SIDE = 96
+CHUNK = 16
 TEXT_TOKENS = 16
+CAMERA = "observation.images.base"
+WINDOW = {"crop": (70, 100, 280, 540), "size": (IMAGE_SIDE, IMAGE_SIDE)}
+"""Of the 480 x 640 camera picture, the part that holds both tiles: top, left, height, width."""
+ACTION_DIMS = (0, 1, 2, 6)
+"""What the policy decides: x, y, z and the gripper. It never turns the hand."""
 
-# Spread of the scripted expert's actions and of the states it visits (metres, radians, openness): they give
-# a policy with random weights movements of the right size.
-_ACTION = ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.02, 0.02, 0.02, 0.05, 0.05, 0.05, 0.5])
-_STATE = ([0.32, 0.03, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5], [0.06, 0.09, 0.05, 0.1, 0.1, 0.1, 1.0, 0.5])
+Statistics = Mapping[str, tuple[ArrayLike, ArrayLike]]
+"""Mean and standard deviation per feature, in metres, radians and openness (1 open, 0 closed)."""
+
+GUESSED: Statistics = {
+    "action": ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.02, 0.02, 0.02, 0.0, 0.0, 0.0, 0.5]),
+    "observation.state": ([0.32, 0.03, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5], [0.06, 0.09, 0.05, 0.1, 0.1, 0.1, 1.0, 0.5]),
+}
+"""About what the scripted expert does; for policies with random weights."""
 
 
-def random_checkpoint(seed: int = 0) -> Path:
-    """Folder of the random checkpoint of this seed, written on first use.
+def embedded_checkpoint(name: str) -> Path:
+    """Folder of a checkpoint that comes with the package: `pi0-tiny` or `pi0-tiny-early`."""
+    return Path(__file__).parent / "checkpoints" / name
 
-    It lies in `$PROBE_KIT_CACHE` (default `~/.cache/probe_kit`) and is complete or absent: it is written
-    aside and renamed.
+
+def new_pi0_tiny(seed: int) -> PI0Policy:
+    """The policy with seeded random weights, deaf and dumb in the action dimensions it does not decide.
+
+    A dimension whose statistics have no spread is restored to its mean, whatever the network says; without
+    weights into and out of it, its flow noise disturbs nothing.
     """
-    cache = Path(os.environ.get("PROBE_KIT_CACHE", Path.home() / ".cache" / "probe_kit")) / "checkpoints"
-    folder = cache / f"pi0-tiny-random-{seed}-{_recipe()[:12]}"
-    if not folder.is_dir():
-        cache.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(dir=cache, prefix=".writing-"))
-        write_checkpoint(aside, seed)
-        _rename_unless_there(aside, folder)
-    return folder
-
-
-def _recipe() -> str:
-    """Hash of everything the checkpoint is made from, so that no cache outlives a changed recipe."""
-    return sha256_json([SIZE.to_json(), IMAGE_SIDE, CHUNK, TEXT_TOKENS, WORDS, _ACTION, _STATE])
-
-
-def _rename_unless_there(aside: Path, folder: Path) -> None:
-    try:
-        aside.rename(folder)
-    except OSError:
-        shutil.rmtree(aside)
-        if not folder.is_dir():
-            raise
-
-
-def write_checkpoint(folder: Path, seed: int) -> None:
-    """Write config, dimensions, tokenizer, statistics and random weights in lerobot's layout."""
-    config = _config()
-    policy = build_pi0(config, SIZE)
+    policy = build_pi0(_config(), SIZE)
     initialise(policy, seed)
-    config.save_pretrained(folder)
+    idle = [dimension for dimension in range(7) if dimension not in ACTION_DIMS]
+    with torch.no_grad():
+        policy.model.action_in_proj.weight[:, idle] = 0.0
+        policy.model.action_out_proj.weight[idle] = 0.0
+        policy.model.action_out_proj.bias[idle] = 0.0
+    return policy
+
+
+def write_checkpoint(
+    folder: Path, policy: PI0Policy, statistics: Statistics, note: str, dtype: torch.dtype = torch.float32
+) -> None:
+    """Write config, dimensions, tokenizer, statistics and weights in lerobot's layout.
+
+    note: what the weights are; it goes into the metadata of the file. dtype: the weights are stored in.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    policy.config.save_pretrained(folder)
     (folder / "dims.json").write_text(json.dumps(SIZE.to_json(), indent=1))
     _write_tokenizer(folder)
-    _write_statistics(folder)
+    _write_statistics(folder, statistics)
     save_file(
-        {name: tensor.contiguous() for name, tensor in policy.state_dict().items()},
+        {name: tensor.to(dtype).contiguous() for name, tensor in policy.state_dict().items()},
         folder / "model.safetensors",
-        metadata={"format": "pt", "probe_kit.weights": f"random, seed {seed}"},
+        metadata={"format": "pt", "probe_kit.weights": note},
     )
 
 
 def _config() -> PI0Config:
     return PI0Config(
         input_features={
-            "observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIDE, IMAGE_SIDE)),
+            CAMERA: PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIDE, IMAGE_SIDE)),
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
@@ -106,7 +108,7 @@ def _config() -> PI0Config:
         device="cpu",
         push_to_hub=False,
         chunk_size=CHUNK,
-        n_action_steps=CHUNK // 2,
+        n_action_steps=4,
         max_state_dim=8,
         max_action_dim=7,
         image_resolution=(IMAGE_SIDE, IMAGE_SIDE),
@@ -127,10 +129,10 @@ def _write_tokenizer(folder: Path) -> None:
     (folder / "tokenizer_config.json").write_text(json.dumps(card | tokens, indent=1))
 
 
-def _write_statistics(folder: Path) -> None:
+def _write_statistics(folder: Path, statistics: Statistics) -> None:
     arrays = {
-        f"{feature}.{name}": np.array(values, np.float32)
-        for feature, pair in (("action", _ACTION), ("observation.state", _STATE))
+        f"{feature}.{name}": np.asarray(values, np.float32)
+        for feature, pair in statistics.items()
         for name, values in zip(("mean", "std"), pair, strict=True)
     }
     modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
@@ -142,4 +144,10 @@ def _write_statistics(folder: Path) -> None:
             "config": {"eps": 1e-8, "norm_map": modes},
             "state_file": state_file,
         }
-        (folder / f"{pipeline}.json").write_text(json.dumps({"name": pipeline, "steps": [entry]}, indent=1))
+        steps = [_window(), entry] if pipeline == "policy_preprocessor" else [entry]
+        (folder / f"{pipeline}.json").write_text(json.dumps({"name": pipeline, "steps": steps}, indent=1))
+
+
+def _window() -> dict[str, Any]:
+    config = {"crop_params_dict": {CAMERA: WINDOW["crop"]}, "resize_size": WINDOW["size"]}
+    return {"registry_name": "image_crop_resize_processor", "config": config}

@@ -4,7 +4,19 @@ Reads runs and probe results; needs no simulator and no model.
 """
 
 from probe_kit.retention.differences import Difference
-from probe_kit.retention.figures import layer_curve
+from probe_kit.retention.displays import (
+    FinalPositionsDisplay,
+    IterationMapDisplay,
+    KnowledgeActionDisplay,
+    LayerCurveDisplay,
+    ModelDepthDisplay,
+    PairedLayoutsDisplay,
+    RetentionTableDisplay,
+    RoleCurvesDisplay,
+    SideTableDisplay,
+    SuccessTableDisplay,
+    layer_curve,
+)
 from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.success import (
@@ -20,13 +32,23 @@ from probe_kit.retention.table import RetentionTable, retention
 
 __all__ = [
     "Difference",
+    "FinalPositionsDisplay",
+    "IterationMapDisplay",
+    "KnowledgeActionDisplay",
+    "LayerCurveDisplay",
+    "ModelDepthDisplay",
     "PairedItems",
+    "PairedLayoutsDisplay",
     "Peak",
     "Regime",
     "Retention",
     "RetentionRow",
     "RetentionTable",
+    "RetentionTableDisplay",
+    "RoleCurvesDisplay",
+    "SideTableDisplay",
     "SuccessRate",
+    "SuccessTableDisplay",
     "best_site",
     "chance_margin",
     "layer_curve",

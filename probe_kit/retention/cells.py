@@ -100,6 +100,13 @@ CONTROL_COLUMNS: list[Column] = [
 ]
 
 
+def headed_for(columns: Sequence[Column], rows: Sequence[RetentionRow]) -> list[Column]:
+    """The same columns; where no row has an expert, headings say `action` instead."""
+    streams = {row.action_stream for row in rows} - {None}
+    name = "/".join(sorted(stream for stream in streams if stream)) or "expert"
+    return [(heading.replace("expert", name), cell) for heading, cell in columns]
+
+
 def controlled(rows: Sequence[RetentionRow]) -> bool:
     """Whether any row was held against a control."""
     return any(row.baselines or row.twin for row in rows)

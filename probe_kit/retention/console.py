@@ -13,6 +13,7 @@ from probe_kit.retention.cells import (
     controlled,
     debiased_value,
     difference_title,
+    headed_for,
     model_name,
     number,
     once_per_category,
@@ -43,7 +44,7 @@ def rich_tables(rows: Sequence[RetentionRow], differences: Sequence[Difference] 
     tables: list[Table] = []
     for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
         found = list(of_run)
-        tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, []))
+        tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, [_OUTCOME_LEGEND]))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
             notes = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
@@ -65,7 +66,7 @@ def _regime(row: RetentionRow) -> str:
 
 
 def _peak(accuracy: float | None, *places: float | None) -> str:
-    """Accuracy in percent, then where: depth, and the iteration of an expert that has several."""
+    """Accuracy in percent, then where: depth, and the iteration of a stream that has several."""
     known = [f"{place:.2f}" if isinstance(place, float) else str(place) for place in places if place is not None]
     return percent(accuracy) + (f" @{'/'.join(known)}" if known else "")
 
@@ -75,16 +76,18 @@ def _retention(row: RetentionRow) -> str:
 
 
 def _outside(row: RetentionRow) -> str:
-    """Out of bounds, and the part of it where the cube never moved."""
+    """Out of bounds, and in brackets where the cube never moved; both of all episodes."""
     return percent(row.p_oob) + ("" if row.p_never_moved is None else f" ({percent(row.p_never_moved)})")
 
+
+_OUTCOME_LEGEND = "wrong, oob (out of bounds) and, in brackets, cube never moved: each in % of all episodes"
 
 _SUCCESS_COLUMNS: list[Column] = [
     ("category", lambda row: row.category),
     ("SR % [95 %]", success_interval),
     ("Δ", lambda row: percent(row.delta)),
     ("wrong", lambda row: percent(row.p_wrong)),
-    ("oob (unmoved)", _outside),
+    ("oob (never moved)", _outside),
     ("left/right", lambda row: f"{_whole(row.sr_left)} / {_whole(row.sr_right)}"),
     ("regime", _regime),
 ]
@@ -108,10 +111,8 @@ def _table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column], n
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.title, table.title_justify = escape(f"{what}: {model_name(rows[0])} on {rows[0].suite}"), "left"
     table.caption, table.caption_justify = escape("; ".join([_sizes(rows), *notes])), "left"
-    for name, _ in columns:
-        table.add_column(
-            escape(name), no_wrap=name != "category" and columns is not CONTROL_COLUMNS, overflow="fold"
-        )
+    for name, _ in headed_for(columns, rows):
+        table.add_column(escape(name), no_wrap=columns is not CONTROL_COLUMNS, overflow="fold")
     for row in rows:
         table.add_row(*(_coloured(cell(row)) for _, cell in columns), style=_style(row.category))
     return table
@@ -141,7 +142,7 @@ def _style(category: str) -> str | None:
 
 def _control_legend(rows: Sequence[RetentionRow]) -> str:
     twin = f"; twin {rows[0].twin}" if rows[0].twin else ""
-    return f"held-out accuracy % without the model; selectivity of backbone / expert{twin}"
+    return f"held-out accuracy % without the model; selectivity of backbone / {rows[0].action_stream}{twin}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.identity import derive_seed
+from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.measure import Peak, Retention
 from probe_kit.train.curve import Curve
 from probe_kit.train.scores import bootstrap_means, draw_groups
@@ -76,27 +77,31 @@ def probe_estimates(
         for column, (name, peak) in enumerate(peaks.items())
     }
     if retention is not None and retention.defined:
-        sizes = np.unique(curve.groups, return_counts=True)[1]
-        ratios = retention_draws(retention.held_out, sizes, curve.chance, units)
+        ratios = retention_draws(retention.fit, curve.chance, units)
         found["retention_debiased"] = Estimate(retention.debiased, ratios, units)
     return found
 
 
-def retention_draws(
-    held_out: NDArray[np.float64], sizes: NDArray[np.intp], chance: float, units: int
-) -> NDArray[np.float64]:
-    """Debiased retention in every draw of groups, each from one cross-fit in turn.
+def retention_draws(fit: Crossfit, chance: float, units: int) -> NDArray[np.float64]:
+    """Debiased retention in every draw of groups. NaN where the backbone is not above chance.
 
-    held_out: (repeats, 2, G) as in `Crossfit`. sizes: (G,) episodes per group. One cross-fit, not the average of
-    all: choosing other sites is part of the uncertainty, as in `crossfit`. NaN where the backbone is not above
-    chance.
+    Groups are drawn with the chosen sites given, so that runs on the same groups stay paired. What choosing adds
+    to the covariance is drawn on top, for every run on its own.
     """
-    times = draw_groups(sizes.size, units)
-    turn = np.arange(len(times)) % len(held_out)
-    expert, backbone = np.einsum("bg,bsg->sb", times, held_out[turn]) / (times @ sizes) - chance
+    times = draw_groups(fit.sizes.size, units)
+    scored = (times @ fit.held_out.T / (times @ fit.sizes)[:, None]).T - chance
+    own = np.random.default_rng(derive_seed("choosing", units, fit.held_out.tobytes().hex()))
+    expert, backbone = scored + _root(fit.covariance - fit.scoring) @ own.standard_normal(scored.shape)
     ratios: NDArray[np.float64] = np.full(backbone.shape, np.nan)
     np.divide(expert, backbone, where=backbone > 0, out=ratios)
     return ratios
+
+
+def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A square root of the nearest covariance without negative parts."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: NDArray[np.float64] = vectors * np.sqrt(values.clip(min=0))
+    return root
 
 
 def _units(names: ArrayLike, suite: str, seed: int) -> int:

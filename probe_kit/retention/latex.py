@@ -10,6 +10,7 @@ from probe_kit.retention.cells import (
     controlled,
     debiased_value,
     difference_title,
+    headed_for,
     model_name,
     number,
     peak,
@@ -47,7 +48,7 @@ def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) 
     """
     parts = [_retention_table(rows)]
     if controlled(rows):
-        names = ["Model", *(name for name, _ in CONTROL_COLUMNS)]
+        names = ["Model", *(name for name, _ in headed_for(CONTROL_COLUMNS, rows))]
         cells = [[model_name(row), *(cell(row) for _, cell in CONTROL_COLUMNS)] for row in probed(rows)]
         parts.append(_plain_table(title("Controls", rows), names, cells))
     for heading, of_pair in groupby(differences, key=difference_title):

@@ -11,6 +11,7 @@ from probe_kit.retention.cells import (
     controlled,
     debiased_value,
     difference_title,
+    headed_for,
     model_name,
     number,
     once_per_category,
@@ -61,7 +62,8 @@ def markdown(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
-        columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–"), *CONTROL_COLUMNS]
+        columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–")]
+        columns += headed_for(CONTROL_COLUMNS, rows)
         parts.append(_rows_table("Controls", probed(rows), columns))
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]

@@ -39,6 +39,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         group=first.group,
         category=MEAN,
         view=first.view,
+        action_stream=first.action_stream,
         n_episodes=sum(row.n_episodes for row in rows),
         n_items=sum(row.n_items for row in rows),
         normalised_score=normalised_score([row.sr for row in rows]),

@@ -1,4 +1,7 @@
-"""Retention: how much of what the backbone knows is still readable in the action expert."""
+"""Retention: how much of what the backbone knows is still readable where the action is made.
+
+That is the action expert or, in a policy without one, the positions that choose its action tokens.
+"""
 
 from dataclasses import dataclass
 from math import nan
@@ -10,13 +13,13 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
-from probe_kit.retention.crossfit import GroupScores, crossfit
+from probe_kit.retention.crossfit import HALVINGS, Crossfit, GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
 from probe_kit.train.controls import SIGNIFICANCE
 from probe_kit.train.curve import Curve
 
 Iterations = Literal["all", "last"] | int
-"""Which expert iterations take part: all of them, the last one, or one by number."""
+"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Retention:
     plain: (best expert − chance) / (best backbone − chance), the published formula; NaN if the backbone's best is
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
     means nothing; `note` then says so. debiased: the same ratio scored on episodes that had no part in choosing
-    the sites, with its 95 % Fieller interval; held_out: those episodes' correct decisions, as in `Crossfit`.
+    the sites, with its 95 % Fieller interval; fit: the two scores it is the ratio of.
     """
 
     chance: float
@@ -46,7 +49,7 @@ class Retention:
     note: str
     debiased: float
     interval: Interval
-    held_out: NDArray[np.float64]
+    fit: Crossfit
 
 
 def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak | None:
@@ -63,17 +66,19 @@ def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak
 
 
 def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 0) -> Retention | None:
-    """Retention of `curve`, or None if it lacks the backbone or the expert stream.
+    """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
-    Raises UsageError if the expert has no such iteration.
+    Raises UsageError if that stream has no such iteration.
     """
-    backbone, expert = best_site(curve, "backbone"), best_site(curve, "expert", iterations)
-    if backbone is None or expert is None:
+    stream = curve.action_stream
+    backbone = best_site(curve, "backbone")
+    expert = None if stream is None else best_site(curve, stream, iterations)
+    if stream is None or backbone is None or expert is None:
         return None
     scores = GroupScores.of(curve.correct, curve.groups)
     fit = crossfit(
         scores.only(_rows(curve, "backbone", "all")),
-        scores.only(_rows(curve, "expert", iterations)),
+        scores.only(_rows(curve, stream, iterations)),
         curve.chance,
         derive_seed("crossfit", seed),
     )
@@ -85,9 +90,15 @@ def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 
         defined=backbone.p_fwe < SIGNIFICANCE,
         note=_note(backbone.p_fwe),
         debiased=_ratio(fit.expert, fit.backbone),
-        interval=fieller_interval(fit.expert, fit.backbone, fit.covariance, _t_quantile(curve.n_groups - 1)),
-        held_out=fit.held_out,
+        interval=retention_interval(fit),
+        fit=fit,
     )
+
+
+def retention_interval(fit: Crossfit) -> Interval:
+    """95 % Fieller interval of the ratio of the two scores."""
+    degrees = min(fit.sizes.size - 1, HALVINGS)  # a variance is no better known than by the halvings it is from
+    return fieller_interval(fit.expert, fit.backbone, fit.covariance, _t_quantile(degrees))
 
 
 def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
@@ -97,7 +108,7 @@ def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]
         return rows
     step = max(filter(None, steps), default=0) if iterations == "last" else iterations
     if step not in steps:
-        raise UsageError(f"the expert has iterations 0 to {len(steps) - 1}, not {step}")
+        raise UsageError(f"the stream {stream} has iterations 0 to {len(steps) - 1}, not {step}")
     return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
 
 

@@ -17,6 +17,7 @@ class RetentionRow:
     above that of the same probe on random labels of items. baselines: accuracy of each control that never sees the
     model; leaks: those above chance.
     prefix_twin, action_twin: how much more accurate the best site is than that of `twin`.
+    action_stream: `expert`, or `action` in a policy without one, whose iterations are action tokens.
     In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
     """
 
@@ -56,6 +57,7 @@ class RetentionRow:
     prefix_layer: int | None = None
     prefix_depth: float | None = None
     prefix_p_fwe: float | None = None
+    action_stream: str | None = None
     action_accuracy: float | None = None
     action_layer: int | None = None
     action_depth: float | None = None
@@ -82,3 +84,8 @@ class RetentionRow:
     group: str | None = None
     categories: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    @property
+    def action_name(self) -> str:
+        """What `action_stream` is called in a sentence."""
+        return "action tokens" if self.action_stream == "action" else "action expert"

@@ -6,6 +6,7 @@ from math import isnan
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.sites import ACTION_STREAMS
 from probe_kit.identity import derive_seed
 from probe_kit.retention.estimates import Estimates, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
@@ -18,8 +19,6 @@ from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
     import pandas as pd
-
-STREAMS = {"prefix": "backbone", "action": "expert"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ def run_rows(
     shown: Sequence[str | None] = (None,) if results is None else settings.views or results.settings.views
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
-        raise UnknownSiteError(f"{run.path} has probes of {probed}, not of {', '.join(sorted(unknown))}")
+        raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     return [
         _row(run, results, settings, group, str(category), episodes, view)
         for category, episodes in run.episodes.groupby("category", sort=False)
@@ -76,17 +75,18 @@ def _row(
         retention = measure_retention(curve, settings.iterations, settings.seed)
         estimates |= probe_estimates(curve, peaks, retention, run.suite, settings.seed)
         values |= _probes(curve, peaks, success, estimates) | _retention(retention)
-        values |= _controls(results.controls, category, view)
+        values |= _controls(results.controls, category, view, curve.action_stream)
     return Drawn(RetentionRow(**values, category=category, view=view, group=group), estimates)
 
 
 def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
     return {
-        "run": str(run.path),
+        "run": str(run.location),
         "model": run.model,
         "random_weights": run.random_weights,
         "weights_sha256": run.weights_sha256,
         "suite": run.suite,
+        "action_stream": next((name for name in ACTION_STREAMS if name in run.streams), None),
         "run_settings": run.settings_sha256,
         "probe_settings": None if results is None else results.key,
     }
@@ -119,7 +119,9 @@ def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> dict[str
 
 
 def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
-    found = {"prefix": best_site(curve, "backbone"), "action": best_site(curve, "expert", iterations)}
+    found = {"prefix": best_site(curve, "backbone")}
+    if curve.action_stream is not None:
+        found["action"] = best_site(curve, curve.action_stream, iterations)
     return {name: peak for name, peak in found.items() if peak is not None}
 
 
@@ -155,14 +157,14 @@ def _retention(retention: Retention | None) -> dict[str, Any]:
     }
 
 
-def _controls(controls: Controls, category: str, view: str) -> dict[str, Any]:
+def _controls(controls: Controls, category: str, view: str, action_stream: str | None) -> dict[str, Any]:
     baselines = controls.of_category(category)
     found: dict[str, Any] = {
         "baselines": {name: score.accuracy for name, score in baselines.items()},
         "leaks": tuple(name for name, score in baselines.items() if score.above_chance),
     }
-    for name, stream in STREAMS.items():
-        if (score := controls.twin_peak(category, view, stream)) is not None:
+    for name, stream in (("prefix", "backbone"), ("action", action_stream)):
+        if stream is not None and (score := controls.twin_peak(category, view, stream)) is not None:
             found |= {"twin": score.twin, f"{name}_twin": score.difference, f"{name}_twin_ci": score.ci}
     return found
 

@@ -5,6 +5,7 @@ from probe_kit.suite.categories import CATEGORIES, Category
 from probe_kit.suite.contact_sheet import contact_sheets
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.suite.manifest import load_suite
+from probe_kit.suite.own_pictures import PicturePair, suite_from_pictures
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.validate import Report, validate_suite
@@ -18,6 +19,7 @@ __all__ = [
     "Finding",
     "Item",
     "Layout",
+    "PicturePair",
     "Report",
     "Side",
     "Suite",
@@ -26,5 +28,6 @@ __all__ = [
     "default_suite",
     "load_picture",
     "load_suite",
+    "suite_from_pictures",
     "validate_suite",
 ]

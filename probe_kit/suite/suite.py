@@ -58,6 +58,10 @@ class Suite:
     folder: Path
     card: dict[str, Any]
 
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{category} {count}" for category, count in count_by_category(self.items).items())
+        return f"<Suite {self.identity}: {len(self.items)} items ({counts}) in {self.folder}>"
+
     @cached_property
     def content_sha256(self) -> str:
         """Hex sha256 over the meaning of the items."""

@@ -32,7 +32,7 @@ def add_baselines(
         return results
     scores = [score for name in missing for score in _baseline_scores(results, run, name, suite)]
     found = replace(results, controls=results.controls.with_baselines(scores))
-    save_controls(found, run.path)
+    save_controls(found, run.location)
     return found
 
 
@@ -70,7 +70,7 @@ def add_twin(results: ProbeResults, run: RunReader, twin: ProbeResults) -> Probe
         score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
     ]
     found = replace(results, controls=results.controls.with_twin(scores))
-    save_controls(found, run.path)
+    save_controls(found, run.location)
     return found
 
 

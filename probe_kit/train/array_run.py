@@ -1,6 +1,6 @@
 """A run made of arrays you already have."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.extract.location import Location, locate
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.identity import sha256_json
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from probe_kit.extract.rows import TokenBlock
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,11 @@ class ArrayRun:
                     f"features of {site}, view {view!r}, have shape {array.shape}; "
                     f"expected ({len(self.episodes)}, D), one row per episode"
                 )
+
+    @property
+    def location(self) -> Location:
+        """The folder `path`."""
+        return locate(self.path)
 
     @cached_property
     def settings_sha256(self) -> str:
@@ -82,6 +90,16 @@ class ArrayRun:
             raise UnknownSiteError(f"there are no tokens of {site}, role {role!r}")
         values, mask = self.token_features[site, role]
         return values.astype(np.float32), mask
+
+    def token_mask(self, site: Site, role: str | None = None) -> NDArray[np.bool_]:
+        """(E, T) mask of one site. Raises UnknownSiteError."""
+        return self.tokens(site, role)[1]
+
+    def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
+        """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
+        from probe_kit.extract.rows import TokenBlock
+
+        yield TokenBlock(0, *self.tokens(site, role))
 
     def _stream(self, name: str) -> Stream:
         found = [(site, array) for (site, _), array in self.features.items() if site.stream == name]

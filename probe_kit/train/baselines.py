@@ -56,8 +56,8 @@ def suite_of(run: RunReader, folder: Path) -> "Suite":
     part = content_sha256(item for item in suite.items if item.item_id in ids)
     if not (suite.content_sha256.startswith(expected) or part.startswith(expected)):
         raise SuiteError(
-            f"{folder} holds {suite.identity}, and its items that {run.path} has hash to {part[:12]}; the run was "
-            f"extracted from {run.suite}. Give that suite's folder, and a run with all its episodes."
+            f"{folder} holds {suite.identity}, and its items that {run.location} has hash to {part[:12]}; the run "
+            f"was extracted from {run.suite}. Give that suite's folder, and a run with all its episodes."
         )
     return suite
 
@@ -74,7 +74,7 @@ def _words(run: RunReader) -> Features:
     The second half shows a word whose picture always lies on one side.
     """
     if "instruction" not in run.episodes:
-        raise UsageError(f"the episodes of {run.path} have no column 'instruction'; leave that control out")
+        raise UsageError(f"the episodes of {run.location} have no column 'instruction'; leave that control out")
     words = [str(text).lower().split() for text in run.episodes["instruction"]]
     known = {word: number for number, word in enumerate(sorted({word for text in words for word in text}))}
     counts = np.zeros((len(words), len(known)), np.float32)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.sites import ACTION_STREAMS, Site
 from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import family_p
 from probe_kit.train.scores import chance_level, correctness
@@ -47,6 +47,11 @@ class Curve:
     def stream(self, name: str) -> NDArray[np.intp]:
         """Positions of the sites of one stream."""
         return np.flatnonzero([site.stream == name for site in self.sites])
+
+    @property
+    def action_stream(self) -> str | None:
+        """The stream the action is made in, None if none was probed."""
+        return next((name for name in ACTION_STREAMS if self.stream(name).size), None)
 
     def best(self, stream: str) -> int:
         """Position of the most accurate site of a stream, the first one on ties."""

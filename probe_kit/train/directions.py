@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.extract.location import Location
 from probe_kit.hooks.sites import Site
 
 Place = tuple[str, str, Site]
@@ -40,7 +41,7 @@ class Direction:
         return float(self.spreads.mean())
 
 
-def save_directions(directions: Mapping[Place, Direction], file: Path) -> None:
+def save_directions(directions: Mapping[Place, Direction], file: BinaryIO) -> None:
     """Write to an uncompressed `.npz`, members `category/view/site/part`; views and sites hold no slash."""
     arrays = {
         f"{category}/{view}/{site}/{part}": array
@@ -51,20 +52,20 @@ def save_directions(directions: Mapping[Place, Direction], file: Path) -> None:
 
 
 class StoredDirections(Mapping[Place, Direction]):
-    """Directions in a file, each read when it is asked for."""
+    """Directions in the file `key` of a run, each read when it is asked for."""
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    def __init__(self, run: Location, key: str) -> None:
+        self._run, self._key = run, key
 
     def __getitem__(self, place: Place) -> Direction:
         name = "/".join(map(str, place))
-        with np.load(self._file, allow_pickle=False) as arrays:
+        with self._run.open(self._key) as file, np.load(file, allow_pickle=False) as arrays:
             if f"{name}/weights" not in arrays:
                 raise KeyError(place)
             return Direction(**{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__})
 
     def __iter__(self) -> Iterator[Place]:
-        with np.load(self._file, allow_pickle=False) as arrays:
+        with self._run.open(self._key) as file, np.load(file, allow_pickle=False) as arrays:
             for name in dict.fromkeys(member.rpartition("/")[0] for member in arrays):
                 category, view, site = name.rsplit("/", 2)
                 yield category, view, Site.parse(site)

@@ -6,35 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.train.arrays import Array, namespace, to_numpy
+from probe_kit.train.design import DenseDesign, Design, StreamedDesign
+from probe_kit.train.rows import ChosenRows, Features, module_of
+from probe_kit.train.standardiser import Standardiser
 
-
-@dataclass(frozen=True)
-class Standardiser:
-    """Mean and scale of every feature that varies, learned on training samples only.
-
-    kept: (D,) bool, features with non-zero variance. mean, scale: (kept,) float64.
-    """
-
-    kept: Array
-    mean: Array
-    scale: Array
-
-    @classmethod
-    def fit(cls, features: Array) -> "Standardiser":
-        """Learn from (N, D) training samples.
-
-        A feature counts as constant when its deviation is below the rounding of its own mean.
-        """
-        xp = namespace(features)
-        mean = features.mean(axis=0, dtype=xp.float64)
-        scale = xp.sqrt(xp.square(features - mean).mean(axis=0))
-        rounding = 10 * xp.finfo(features.dtype).eps * abs(mean)
-        kept = scale > rounding
-        return cls(kept, mean[kept], scale[kept])
-
-    def __call__(self, features: Array) -> Array:
-        """(N, D) samples as (N, kept) float64 with the training samples' mean 0 and deviation 1."""
-        return (features[:, self.kept] - self.mean) / self.scale
+IN_MEMORY = 2**29
+"""Bytes up to which training samples are turned to their axes once, in float64, rather than in every product."""
 
 
 def principal_axes(samples: Array) -> Array:
@@ -56,20 +33,27 @@ def principal_axes(samples: Array) -> Array:
 class Coordinates:
     """A training fold's samples in standardised principal coordinates, and the way to get others there.
 
-    train: (N, R + 1) float64, (nearly) orthogonal columns, the last one all ones for the intercept.
+    train: N samples in R + 1 (nearly) orthogonal columns, the last one all ones for the intercept.
     """
 
     standardise: Standardiser
     axes: Array
-    train: Array
+    train: Design
 
     @classmethod
-    def fit(cls, features: Array) -> "Coordinates":
-        """Learn from (N, D) training samples."""
+    def fit(cls, features: Features) -> "Coordinates":
+        """Learn from (N, D) training samples.
+
+        Chosen rows whose copy in float64 would be large are never copied, at two to three times the time.
+        """
         standardise = Standardiser.fit(features)
-        samples = standardise(features)
+        if isinstance(features, ChosenRows) and _stay(features):
+            samples = (standardise(block) for block in features.blocks())
+            variances, axes = module_of(features).linalg.eigh(sum(block.T @ block for block in samples))
+            return cls(standardise, axes, StreamedDesign(features, standardise, axes, variances.clip(0.0)))
+        samples = standardise(features.read() if isinstance(features, ChosenRows) else features)
         axes = principal_axes(samples)
-        return cls(standardise, axes, _with_intercept(samples @ axes))
+        return cls(standardise, axes, DenseDesign(_with_intercept(samples @ axes)))
 
     def __call__(self, features: Array) -> Array:
         """(N, D) other samples as (N, R + 1)."""
@@ -81,6 +65,12 @@ class Coordinates:
         raw = np.zeros(self.standardise.kept.shape[0])
         raw[to_numpy(self.standardise.kept)] = kept
         return raw, float(weights[-1]) - float(to_numpy(self.standardise.mean) @ kept)
+
+
+def _stay(features: ChosenRows) -> bool:
+    """Whether to visit rows in blocks: too many for memory, and too many to be reduced to fewer dimensions."""
+    count, width = features.shape
+    return count >= width and 8 * count * width > IN_MEMORY
 
 
 def _with_intercept(coordinates: Array) -> Array:

@@ -1,24 +1,40 @@
 """What probes and retention need from a run: nothing but this."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.extract.location import Location
 from probe_kit.hooks.sites import Site, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
+class Tokens(Protocol):
+    """Tokens `start` up to `start + T` of all episodes."""
+
+    @property
+    def start(self) -> int:
+        """First position."""
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """(E, T, D)."""
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(E, T)."""
+
+
 class RunReader(Protocol):
     """A finished or growing run, as `open_run` gives it. Any object with these members will do."""
 
     @property
-    def path(self) -> Path:
-        """Folder of the run; probe results go to `path / "probes"`."""
+    def location(self) -> Location:
+        """Where the run lies; probe results go to `probes` there. For a folder: `locate(folder)`."""
 
     @property
     def model(self) -> str:
@@ -59,8 +75,11 @@ class RunReader(Protocol):
     def column(self, site: Site, view: str) -> NDArray[np.float32]:
         """(E, D) features of one site, rows in the order of `episodes`."""
 
-    def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(E, T, D) values and (E, T) mask of one site: the tokens of `role`, or all but padding.
+    def token_mask(self, site: Site, role: str | None = None) -> NDArray[np.bool_]:
+        """(E, T): the tokens of `role` at one site, or all but padding. Every episode has at least one.
 
-        Every episode has at least one. Raises UnknownSiteError if no tokens were stored.
+        Raises UnknownSiteError if no tokens were stored.
         """
+
+    def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterable[Tokens]:
+        """Those tokens, some positions of all episodes at a time. Raises UnknownSiteError as `token_mask`."""

@@ -1,5 +1,6 @@
 """What a probe learns from: one sample per episode (pooled views), or one per token."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.sites import Site
 from probe_kit.train.arrays import Array, to_device
-from probe_kit.train.reader import RunReader
+from probe_kit.train.reader import RunReader, Tokens
+from probe_kit.train.rows import ChosenRows, Features
 
 TOKENS = "tokens"
 """View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""
@@ -19,11 +21,12 @@ TOKENS = "tokens"
 class Samples:
     """Features of M samples that belong to E episodes.
 
-    features: (M, D), the samples of an episode in consecutive rows. counts: (E,) samples per episode.
+    features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are chosen.
+    counts: (E,) samples per episode.
     means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the samples.
     """
 
-    features: Array
+    features: Features
     counts: NDArray[np.intp]
     means: Array
 
@@ -33,11 +36,22 @@ class Samples:
         return cls(column, np.ones(len(column), np.intp), column)
 
     @classmethod
-    def tokens(cls, values: NDArray[np.floating], mask: NDArray[np.bool_]) -> "Samples":
-        """One sample per token of `mask`, from (E, T, D) values and (E, T) mask; every episode has a token."""
-        features, counts = values[mask], mask.sum(axis=1)
+    def tokens(cls, blocks: Iterable[Tokens], mask: NDArray[np.bool_]) -> "Samples":
+        """One sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
+
+        Holds one block and the tokens themselves, no padding.
+        """
+        counts = mask.sum(axis=1)
+        row_of = np.cumsum(mask).reshape(mask.shape) - 1
+        features: NDArray[np.floating] | None = None
+        for block in blocks:
+            if features is None:
+                features = np.empty((counts.sum(), block.values.shape[-1]), block.values.dtype)
+            rows = row_of[:, block.start : block.start + block.mask.shape[1]][block.mask]
+            features[rows] = block.values[block.mask]
+        assert features is not None, "every episode has a token"
         sums = np.add.reduceat(features, _starts(counts), axis=0, dtype=np.float64)
-        return cls(features, counts, sums / counts[:, None])
+        return cls(ChosenRows.all(features), counts, sums / counts[:, None])
 
     @property
     def pools(self) -> bool:
@@ -57,6 +71,8 @@ class Samples:
 
     def to(self, device: str | None) -> "Samples":
         """The same with features and means as torch tensors on `device`; unchanged without one."""
+        if isinstance(self.features, ChosenRows):
+            return Samples(self.features.to(device), self.counts, to_device(self.means, device))
         return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
 
 
@@ -69,8 +85,8 @@ def sites_of(run: RunReader, view: str) -> list[Site]:
     if not sites:
         known = sorted({name for stream in run.streams for name in run.views(stream)})
         raise UnknownSiteError(
-            f"{run.path} has no view {view!r}; it has: {', '.join(known)}, and with stored tokens: {TOKENS} or "
-            f"{TOKENS}:ROLE for every mean:ROLE"
+            f"{run.location} has no view {view!r}; it has: {', '.join(known)}, and with stored tokens: {TOKENS} "
+            f"or {TOKENS}:ROLE for every mean:ROLE"
         )
     return sites
 
@@ -88,13 +104,14 @@ def role_of(view: str) -> str | None:
 def read_samples(run: RunReader, view: str, site: Site) -> Samples:
     """All samples of one site. Raises NonFiniteActivationError naming the first broken episode."""
     if is_token_view(view):
-        samples = Samples.tokens(*run.tokens(site, role_of(view)))
+        role = role_of(view)
+        samples = Samples.tokens(run.iter_token_blocks(site, role), run.token_mask(site, role))
     else:
         samples = Samples.pooled(run.column(site, view))
     broken = np.flatnonzero(~np.isfinite(samples.means).all(axis=1))
     if broken.size:
         raise NonFiniteActivationError(
-            f"{site}, view {view!r}, of {run.path} holds NaN or infinity in {broken.size} of "
+            f"{site}, view {view!r}, of {run.location} holds NaN or infinity in {broken.size} of "
             f"{len(samples.counts)} episodes, the first {run.episodes['episode_id'].iloc[broken[0]]!r}; expected "
             "finite features. Extract these episodes again."
         )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
 from probe_kit.train.arrays import Array, namespace
+from probe_kit.train.design import Design
 
 MAX_NEWTON_STEPS = 100
 MAX_CG_STEPS = 100
@@ -37,19 +38,19 @@ class _Problems:
 class LogisticSolver:
     """Solves every column of a label matrix for one C after another, each warm-started by the one before.
 
-    samples: (N, R) float64 with orthogonal columns, the last one all ones for the intercept.
+    samples: N samples in R orthogonal columns, the last one all ones for the intercept.
     tolerance: a solution is accepted when ‖gradient‖ ≤ tolerance · ‖w‖. The objective is 1-strongly convex in w,
     so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
     """
 
-    def __init__(self, samples: Array, tolerance: float = 1e-9) -> None:
+    def __init__(self, samples: Design, tolerance: float = 1e-9) -> None:
         self.samples = samples
         self.tolerance = tolerance
-        self.xp = namespace(samples)
-        self.spectrum = self.xp.square(samples).sum(axis=0)[:, None]
+        self.spectrum = samples.spectrum
+        self.xp = namespace(self.spectrum)
         self.penalty = self.xp.ones_like(self.spectrum)
         self.penalty[-1] = 0.0
-        self.rounding = 1e-15 * (float(self.spectrum.sum()) * len(samples)) ** 0.5
+        self.rounding = 1e-15 * (float(self.spectrum.sum()) * samples.shape[0]) ** 0.5
 
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
         """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
@@ -59,7 +60,7 @@ class LogisticSolver:
         """
         if (labels.all(axis=0) | ~labels.any(axis=0)).any():
             raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
-        xp, device = self.xp, self.samples.device
+        xp, device = self.xp, self.spectrum.device
         signs = 2.0 * xp.asarray(labels, dtype=xp.float64, device=device) - 1.0
         weights = xp.zeros((self.samples.shape[1], signs.shape[1]), dtype=xp.float64, device=device)
         for strength in strengths:
@@ -75,7 +76,7 @@ class LogisticSolver:
         todo = _Problems(xp.arange(signs.shape[1], device=signs.device), signs, start, decisions, objective)
         for _ in range(MAX_NEWTON_STEPS):
             misfit = _sigmoid(-todo.signs * todo.decisions)
-            gradient = self.penalty * todo.weights - strength * (self.samples.T @ (todo.signs * misfit))
+            gradient = self.penalty * todo.weights - strength * self.samples.gather(todo.signs * misfit)
             size = xp.linalg.norm(gradient, axis=0)
             scale = xp.maximum(xp.linalg.norm(todo.weights[:-1], axis=0), size)
             relative = size / scale.clip(np.finfo(float).tiny)
@@ -109,7 +110,7 @@ class LogisticSolver:
         direction = rest / diagonal
         slope = (rest * direction).sum(axis=0)
         for _ in range(MAX_CG_STEPS):
-            product = self.penalty * direction + self.samples.T @ (curvature * (self.samples @ direction))
+            product = self.penalty * direction + self.samples.gather(curvature * (self.samples @ direction))
             length = slope / (direction * product).sum(axis=0)
             step[:, todo] += length * direction
             rest = rest - length * product
@@ -130,7 +131,7 @@ class LogisticSolver:
         return step
 
     def _exact_newton_step(self, gradient: Array, curvature: Array) -> Array:
-        hessian = (self.samples.T * curvature) @ self.samples + self.xp.diag(self.penalty[:, 0])
+        hessian = self.samples.moments(curvature) + self.xp.diag(self.penalty[:, 0])
         return self.xp.linalg.solve(hessian, -gradient)
 
     def _moved(self, todo: _Problems, strength: float, gradient: Array, step: Array) -> _Problems:

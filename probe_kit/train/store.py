@@ -1,16 +1,19 @@
-"""Where probe results live: `RUN/probes/<key>/`, complete or not there, and what an interrupted sweep left."""
+"""Where probe results live: `RUN/probes/<key>/`, complete or not there, and what an interrupted sweep left.
+
+Results are there when their settings are, which are written last.
+"""
 
 import json
-import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.extract.location import Location, locate
 from probe_kit.hooks.sites import Site
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
@@ -21,38 +24,34 @@ from probe_kit.train.results import FORMAT, ProbeResults, ProbeSettings, episode
 from probe_kit.train.targets import Target
 
 HOME = "probes"
-CONTROLS = "controls.json"
+SETTINGS, SCORES, DECISIONS = "settings.json", "scores.csv", "decisions.npz"
+DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
 
 
-def save_results(results: ProbeResults, run_path: Path) -> Path:
-    """Write to `run_path/probes/<key>/`, all or nothing, and return that folder. Keeps what is there."""
-    folder = run_path / HOME / results.key
-    if folder.exists():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{results.key}.", dir=folder.parent) as aside:
-        draft = Path(aside) / results.key
-        draft.mkdir()
-        header = {"settings": asdict(results.settings), "created": results.created}
-        (draft / "settings.json").write_text(json.dumps(header, indent=2))
-        results.scores.to_csv(draft / "scores.csv", index=False)
-        np.savez_compressed(draft / "decisions.npz", allow_pickle=False, **_pack(results.curves))
-        save_directions(results.directions, draft / "directions.npz")
-        shutil.move(draft, folder)
-    return folder
+def save_results(results: ProbeResults, run: Path | Location) -> None:
+    """Write to `probes/<key>/` of the run that lies there, all or nothing. Keeps what is there."""
+    location, home = locate(run), f"{HOME}/{results.key}"
+    if is_stored(location, results.key):
+        return
+    decisions, directions = BytesIO(), BytesIO()
+    np.savez_compressed(decisions, allow_pickle=False, **_pack(results.curves))
+    save_directions(results.directions, directions)
+    header = {"settings": asdict(results.settings), "created": results.created}
+    location.write(f"{home}/{SCORES}", results.scores.to_csv(index=False).encode())
+    location.write(f"{home}/{DECISIONS}", decisions.getvalue())
+    location.write(f"{home}/{DIRECTIONS}", directions.getvalue())
+    location.write(f"{home}/{SETTINGS}", json.dumps(header, indent=2).encode())
 
 
-def save_controls(results: ProbeResults, run_path: Path) -> Path:
-    """Write the controls of stored results beside them, over former ones, and return that file."""
-    file = run_path / HOME / results.key / CONTROLS
-    draft = file.with_suffix(".draft")
-    draft.write_text(json.dumps(results.controls.to_json(), indent=2))
-    return draft.replace(file)
+def save_controls(results: ProbeResults, run: Path | Location) -> None:
+    """Write the controls of stored results beside them, over former ones."""
+    content = json.dumps(results.controls.to_json(), indent=2)
+    locate(run).write(f"{HOME}/{results.key}/{CONTROLS}", content.encode())
 
 
-def is_stored(run_path: Path, key: str) -> bool:
+def is_stored(run: Location, key: str) -> bool:
     """Whether complete results called `key` are there."""
-    return (run_path / HOME / key).exists()
+    return run.exists(f"{HOME}/{key}/{SETTINGS}")
 
 
 def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
@@ -61,41 +60,46 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
     Results of another format, written by another version of probe_kit, are passed over.
     Raises NoProbesError if there are none, and UsageError for a key that is not there.
     """
-    headers = sorted((run.path / HOME).glob("[!.]*/settings.json"))
-    stored = {path.parent.name: path.parent for path in headers if _format(path) == FORMAT}
+    location = run.location
+    stored = {
+        name: header for name, header in _headers(location).items() if header["settings"]["format"] == FORMAT
+    }
     if key is not None:
         if key not in stored:
-            raise UsageError(f"{run.path} has no probe results {key!r}; it has: {', '.join(stored) or 'none'}")
-        return _read(stored[key])
+            raise UsageError(f"{location} has no probe results {key!r}; it has: {', '.join(stored) or 'none'}")
+        return _read(location, key, stored[key])
     episodes = episodes_sha256(run)
     current = {
-        folder: str(created)
-        for folder, (settings, created) in ((folder, _read_header(folder)) for folder in stored.values())
+        name: str(stored[name]["created"])
+        for name, settings in ((name, _settings(header)) for name, header in stored.items())
         if (settings.target, settings.run_settings, settings.episodes) == (target, run.settings_sha256, episodes)
     }
     if not current:
         why = "has no activations" if not run.streams else f"has no probes for target {target!r} on its episodes"
-        raise NoProbesError(f"{run.path} {why}. Run `probe-kit train {run.path}` on a run with activations.")
-    return _read(max(current, key=lambda folder: (current[folder], folder.name)))
+        raise NoProbesError(f"{location} {why}. Run `probe-kit train {location}` on a run with activations.")
+    newest = max(current, key=lambda name: (current[name], name))
+    return _read(location, newest, stored[newest])
 
 
 @dataclass(frozen=True)
 class Unfinished:
     """Probes of single sites, kept until the sweep they belong to is complete."""
 
-    folder: Path
+    run: Location
+    folder: str
 
     @classmethod
-    def of(cls, run_path: Path, key: str) -> "Unfinished":
+    def of(cls, run: Location, key: str) -> "Unfinished":
         """Those of the sweep that will be stored as `key`."""
-        return cls(run_path / HOME / f".{key}.partial")
+        return cls(run, f"{HOME}/.{key}.partial")
 
     def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
         """The probes of a site by category, or None if the sweep did not get that far."""
-        file = self._file(view, site)
-        if not file.exists():
+        try:
+            stored = self.run.read(self._key(view, site))
+        except FileNotFoundError:
             return None
-        with np.load(file, allow_pickle=False) as arrays:
+        with np.load(BytesIO(stored), allow_pickle=False) as arrays:
             return {
                 category: SiteProbe(**{part: arrays[f"{category}/{part}"] for part in SiteProbe.__annotations__})
                 for category in dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays)
@@ -103,23 +107,21 @@ class Unfinished:
 
     def keep(self, view: str, site: Site, probes: Mapping[str, SiteProbe]) -> None:
         """Store the probes of a site by category."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        file = self._file(view, site)
-        draft = file.with_suffix(".draft.npz")
         arrays = {
             f"{category}/{part}": array
             for category, probe in probes.items()
             for part, array in vars(probe).items()
         }
-        np.savez(draft, allow_pickle=False, **arrays)
-        draft.replace(file)
+        content = BytesIO()
+        np.savez(content, allow_pickle=False, **arrays)
+        self.run.write(self._key(view, site), content.getvalue())
 
     def discard(self) -> None:
         """Remove everything: the sweep is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self.run.remove(self.folder)
 
-    def _file(self, view: str, site: Site) -> Path:
-        return self.folder / f"{view}+{site}.npz"
+    def _key(self, view: str, site: Site) -> str:
+        return f"{self.folder}/{view}+{site}.npz"
 
 
 def _pack(curves: Mapping[tuple[str, str], Curve]) -> dict[str, Any]:
@@ -142,23 +144,24 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
     }
 
 
-def _format(header: Path) -> int:
-    return int(json.loads(header.read_text())["settings"]["format"])
+def _headers(run: Location) -> dict[str, dict[str, Any]]:
+    """What the settings file of every complete result says, by key."""
+    parts = (key.split("/") for key in run.keys(HOME))
+    names = [own[1] for own in parts if own[2:] == [SETTINGS] and not own[1].startswith(".")]
+    return {name: json.loads(run.read(f"{HOME}/{name}/{SETTINGS}")) for name in names}
 
 
-def _read_header(folder: Path) -> tuple[ProbeSettings, str]:
-    header = json.loads((folder / "settings.json").read_text())
+def _settings(header: Mapping[str, Any]) -> ProbeSettings:
     stored = header["settings"]
-    settings = ProbeSettings(
-        **{**stored, "categories": tuple(stored["categories"]), "views": tuple(stored["views"])}
-    )
-    return settings, header["created"]
+    return ProbeSettings(**{**stored, "categories": tuple(stored["categories"]), "views": tuple(stored["views"])})
 
 
-def _read(folder: Path) -> ProbeResults:
-    settings, created = _read_header(folder)
-    directions, controls = StoredDirections(folder / "directions.npz"), folder / CONTROLS
-    with np.load(folder / "decisions.npz", allow_pickle=False) as arrays:
+def _read(run: Location, key: str, header: Mapping[str, Any]) -> ProbeResults:
+    home = f"{HOME}/{key}"
+    with run.open(f"{home}/{DECISIONS}") as file, np.load(file, allow_pickle=False) as arrays:
         curves = _unpack(arrays)
-    found = Controls.from_json(json.loads(controls.read_text())) if controls.exists() else Controls()
-    return ProbeResults(settings, curves, directions, found, created)
+    controls = Controls()
+    if run.exists(f"{home}/{CONTROLS}"):
+        controls = Controls.from_json(json.loads(run.read(f"{home}/{CONTROLS}")))
+    directions = StoredDirections(run, f"{home}/{DIRECTIONS}")
+    return ProbeResults(_settings(header), curves, directions, controls, header["created"])

@@ -17,7 +17,7 @@ from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.store import Unfinished, is_stored, load_results, save_results
 from probe_kit.train.targets import Target
-from probe_kit.train.workers import Key, Probed, probe_columns
+from probe_kit.train.workers import CrewSettings, Key, Probed, probe_columns
 
 Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""
@@ -37,6 +37,7 @@ def train_probes(
     seed: int = 0,
     jobs: int | None = None,
     device: str | None = None,
+    ray: str | None = None,
     progress: Progress | None = None,
 ) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
@@ -48,6 +49,8 @@ def train_probes(
     which needs the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
     jobs: processes that probe, this one alone by default; with more than one, a script needs
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
+    ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
+    machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
     The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
     interrupted sweep continues after the last finished site; controls are added to what is stored.
@@ -55,18 +58,21 @@ def train_probes(
     stream has, TooFewGroupsError, ProbeNotConvergedError, UsageError, and SuiteError for another suite.
     """
     check_device(device)
-    if device is not None and (jobs or 1) > 1:
-        raise UsageError(f"device {device!r} is used by one process, got jobs={jobs}. Leave `jobs` out.")
+    if device is not None and ((jobs or 1) > 1 or ray is not None):
+        raise UsageError(
+            f"device {device!r} is used by one process, got jobs={jobs}, ray={ray!r}. Leave `jobs` and `ray` out."
+        )
+    crew = CrewSettings(jobs, device, ray)
     settings = _settings(run, categories, views, target, permutations, token_permutations, seed)
-    if is_stored(run.path, settings.key):
+    if is_stored(run.location, settings.key):
         results = load_results(run, settings.key)
     else:
-        results = _fit(run, settings, jobs or 1, device, progress)
+        results = _fit(run, settings, crew, progress)
     results = add_baselines(results, run, controls, suite)
     if twin is not None:
         others = train_probes(
             twin, settings.categories, views, permutations=permutations, token_permutations=token_permutations,
-            target=target, seed=seed, jobs=jobs, device=device, progress=progress,
+            target=target, seed=seed, jobs=jobs, device=device, ray=ray, progress=progress,
         )  # fmt: skip
         results = add_twin(results, run, others)
     return results
@@ -82,11 +88,11 @@ def _settings(
     seed: int,
 ) -> ProbeSettings:
     if not run.streams:
-        raise NoProbesError(f"{run.path} has no activations to probe: policy {run.model!r} has no streams.")
+        raise NoProbesError(f"{run.location} has no activations to probe: policy {run.model!r} has no streams.")
     known = list(dict.fromkeys(run.episodes["category"]))
     for category in categories or ():
         if category not in (*known, POOLED):
-            raise UnknownCategoryError(f"{run.path} has no category {category!r}; it has: {', '.join(known)}")
+            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
     return ProbeSettings(
         model=run.model,
         random_weights=run.random_weights,
@@ -103,11 +109,9 @@ def _settings(
     )
 
 
-def _fit(
-    run: RunReader, settings: ProbeSettings, jobs: int, device: str | None, progress: Progress | None
-) -> ProbeResults:
+def _fit(run: RunReader, settings: ProbeSettings, crew: CrewSettings, progress: Progress | None) -> ProbeResults:
     problems = {category: category_problem(run.episodes, category, settings) for category in settings.categories}
-    probes = _probe_all(run, problems, settings, jobs, device, progress)
+    probes = _probe_all(run, problems, settings, crew, progress)
     curves = {
         (category, view): _curve(problem, category, view, probes)
         for category, problem in problems.items()
@@ -119,8 +123,8 @@ def _fit(
         for category, probe in found.items()
     }
     results = ProbeResults(settings, curves, directions)
-    save_results(results, run.path)
-    Unfinished.of(run.path, settings.key).discard()
+    save_results(results, run.location)
+    Unfinished.of(run.location, settings.key).discard()
     return load_results(run, settings.key)
 
 
@@ -128,16 +132,15 @@ def _probe_all(
     run: RunReader,
     problems: Mapping[str, CategoryProblem],
     settings: ProbeSettings,
-    jobs: int,
-    device: str | None,
+    crew: CrewSettings,
     progress: Progress | None,
 ) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
     keys = [(view, site) for view in settings.views for site in sites_of(run, view)]
-    unfinished = Unfinished.of(run.path, settings.key)
+    unfinished = Unfinished.of(run.location, settings.key)
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
     columns = ((key, read_samples(run, *key)) for key in keys if key not in probes)
-    for key, found in probe_columns(columns, problems, jobs, device):
+    for key, found in probe_columns(columns, problems, crew):
         unfinished.keep(*key, found)
         probes[key] = found
         if progress is not None:

@@ -1,6 +1,5 @@
 import json
 from dataclasses import FrozenInstanceError, replace
-from pathlib import Path
 
 import pytest
 
@@ -67,11 +66,21 @@ def test_a_preset_takes_changes_and_names_what_it_does_not_know():
 
 
 def test_the_record_is_json_and_tells_what_differs():
-    spec = SceneSpec(background=Path("kitchen.jpg"), rendering="visual-matching")
+    spec = SceneSpec()
     stored = json.loads(json.dumps(spec.to_json(), allow_nan=False))
-    assert stored["background"] == "kitchen.jpg"
     assert stored["epsilon"] == spec.zone_radius
     assert stored != replace(spec, max_steps=80).to_json()
+
+
+def test_the_record_names_a_photo_by_what_it_shows_and_not_by_where_it_lies(tmp_path):
+    kitchen, copy, garden = (tmp_path / name for name in ("kitchen.jpg", "copy.jpg", "garden.jpg"))
+    for path, content in ((kitchen, b"table"), (copy, b"table"), (garden, b"lawn")):
+        path.write_bytes(content)
+    record = SceneSpec(background=kitchen).to_json()
+    assert record == SceneSpec(background=copy).to_json() != SceneSpec(background=garden).to_json()
+    assert str(tmp_path) not in json.dumps(record)
+    with pytest.raises(SceneError, match=r"missing\.jpg cannot be read"):
+        SceneSpec(background=tmp_path / "missing.jpg").to_json()
 
 
 def test_the_record_cannot_be_changed():

@@ -16,8 +16,8 @@ from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from probe_kit.extract import commits, sealing, writer
-from probe_kit.extract.disk import full_disk_in_words
 from probe_kit.extract.layout import StoredStream
+from probe_kit.extract.location import Location, locate
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.rollout import Rollout
 from probe_kit.extract.staging import EpisodeBuffers
@@ -45,10 +45,10 @@ def rollout(plan: Plan, number: int) -> Rollout:
     return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
 
 
-def extract(run: Path, plan: Plan) -> None:
+def extract(run: str, plan: Plan) -> None:
     """What an extraction does with its episodes."""
-    writing = writer.RunWriter(run, plan, SETTINGS)
-    with writing.owned(), full_disk_in_words(run):
+    writing = writer.RunWriter(locate(run), plan, SETTINGS)
+    with writing.owned(), writing.location.in_words():
         for number in writing.remaining():
             writing.write(rollout(plan, number))
         sealing.seal(run)
@@ -70,10 +70,10 @@ def die_at(point: str) -> None:
         await put(store, key, value)
         reached("after", "put")
 
-    def deadly_commit(path: Path, content: dict[str, object]) -> bool:
+    def deadly_commit(location: Location, key: str, content: dict[str, object]) -> bool:
         calls["commit"] += 1
         reached("before", "commit")
-        written = commit(path, content)
+        written = commit(location, key, content)
         reached("after", "commit")
         return written
 
@@ -86,7 +86,7 @@ FATAL = {"put": 10, "commit": 3}
 
 
 if __name__ == "__main__":
-    folder, suite = Path(sys.argv[1]), Path(sys.argv[2])
+    run, suite = sys.argv[1], Path(sys.argv[2])
     if len(sys.argv) > 3:
         die_at(sys.argv[3])
-    extract(folder, plan_for(suite))
+    extract(run, plan_for(suite))

@@ -5,6 +5,7 @@ import pytest
 
 from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.layout import StoredStream
+from probe_kit.extract.location import locate
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout import Rollout
 from probe_kit.extract.staging import EpisodeBuffers
@@ -18,7 +19,7 @@ SETTINGS = {"captured_calls": 1, "tokens": "all", "codec": "zstd", "model": "syn
 
 @pytest.fixture
 def writer(small_suite: Suite, tmp_path: Path) -> RunWriter:
-    return RunWriter(tmp_path / "run", make_plan(small_suite, [STREAM], 0, 1, True), SETTINGS)
+    return RunWriter(locate(tmp_path / "run"), make_plan(small_suite, [STREAM], 0, 1, True), SETTINGS)
 
 
 def rollout(writer: RunWriter, number: int, language: int) -> Rollout:
@@ -37,19 +38,19 @@ def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(w
     empty.buffers.roles.append(full.buffers.roles[0])
     writer.write(full)
     writer.write(empty)
-    seal(writer.path)
-    run = open_run(writer.path, allow_partial=True)
+    seal(writer.location)
+    run = open_run(writer.location, allow_partial=True)
     column = run.column(Site("backbone", 1))
     assert (column[0] == 1).all()
     assert np.isnan(column[1]).all()
     np.testing.assert_array_equal(run.rows("backbone", "tokens").read(0, (0, 1, slice(256, 384))), 0)
-    assert verify_run(writer.path, deep=True).ok
+    assert verify_run(writer.location, deep=True).ok
 
 
 def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
     for number, language in enumerate((20, 140)):
         writer.write(rollout(writer, number, language))
-    run = open_run(writer.path, allow_partial=True)
+    run = open_run(writer.location, allow_partial=True)
     blocks = list(run.iter_token_blocks(Site("backbone", 0), "language"))
     assert [block.start for block in blocks] == [0, 128]
     np.testing.assert_array_equal(sum(block.mask.sum(axis=1) for block in blocks), [20, 140])
@@ -60,7 +61,7 @@ def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
 
 def test_a_second_commit_of_the_same_episode_changes_nothing(writer: RunWriter) -> None:
     writer.write(rollout(writer, 0, 20))
-    commit = (writer.path / "commits/00000000.json").read_bytes()
+    commit = writer.location.read("commits/00000000.json")
     writer.write(rollout(writer, 0, 20))
-    assert (writer.path / "commits/00000000.json").read_bytes() == commit
-    assert verify_run(writer.path, deep=True).ok
+    assert writer.location.read("commits/00000000.json") == commit
+    assert verify_run(writer.location, deep=True).ok

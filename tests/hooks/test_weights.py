@@ -11,7 +11,7 @@ from probe_kit.errors import WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.pi0 import Pi0, load_pi0
 from probe_kit.hooks.weights import INDEX_FILE, SINGLE_FILE, read_weights
-from probe_kit.models.pi0_tiny import random_checkpoint
+from probe_kit.models.pi0_tiny import embedded_checkpoint
 
 NAME = "model.state_proj.weight"
 RANDOM = {"probe_kit.weights": "random, seed 0"}
@@ -20,7 +20,7 @@ RANDOM = {"probe_kit.weights": "random, seed 0"}
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
     """A copy of the embedded checkpoint that a test may damage."""
-    return Path(shutil.copytree(random_checkpoint(), tmp_path / "checkpoint"))
+    return Path(shutil.copytree(embedded_checkpoint("pi0-tiny"), tmp_path / "checkpoint"))
 
 
 def rewrite(checkpoint: Path, change: dict[str, torch.Tensor | None]) -> None:

@@ -37,12 +37,18 @@ def outcomes(correct: int, wrong: int, oob: int, category: str = "color") -> pd.
 
 
 def curve(
-    episodes: pd.DataFrame, backbone: Sequence[float], expert: Sequence[Sequence[float]], null_top: float = 0.6
+    episodes: pd.DataFrame,
+    backbone: Sequence[float],
+    expert: Sequence[Sequence[float]],
+    null_top: float = 0.6,
+    action_stream: str = "expert",
 ) -> Curve:
     """One backbone accuracy per layer and one expert accuracy per iteration and layer; nulls up to `null_top`."""
     sites = [Site("backbone", layer) for layer in range(len(backbone))]
     sites += [
-        Site("expert", layer, "residual", step) for step, row in enumerate(expert) for layer in range(len(row))
+        Site(action_stream, layer, "residual", step)
+        for step, row in enumerate(expert)
+        for layer in range(len(row))
     ]
     share = np.array([*backbone, *(value for row in expert for value in row)])
     labels = (episodes["side_correct"] == "left").to_numpy()
@@ -86,11 +92,12 @@ def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
         *,
         random_weights: bool = False,
         suite: str = "suite@1#0123456789ab",
+        action_stream: str = "expert",
     ) -> ArrayRun:
         tables = {category: outcomes(120, 60, 20, category) for category in accuracies}
         episodes = pd.concat(tables.values(), ignore_index=True)
         blank = np.zeros((len(episodes), 1))
-        features = {(Site("backbone", 0), "mean"): blank, (Site("expert", 0, "residual", 0), "mean"): blank}
+        features = {(Site("backbone", 0), "mean"): blank, (Site(action_stream, 0, "residual", 0), "mean"): blank}
         run = ArrayRun(tmp_path / model, model, suite, episodes, features, random_weights)
         settings = ProbeSettings(
             model=model,
@@ -106,7 +113,7 @@ def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
             seed=0,
         )
         curves = {
-            (category, "mean"): curve(tables[category], backbone, expert)
+            (category, "mean"): curve(tables[category], backbone, expert, action_stream=action_stream)
             for category, (backbone, expert) in accuracies.items()
         }
         save_results(ProbeResults(settings, curves), run.path)

@@ -20,7 +20,7 @@ def printed(table: RetentionTable) -> str:
 def test_eighty_columns_suffice(probed_run: ProbedRun) -> None:
     text = printed(retention([probed_run({"facial_emotion": SIGNAL, "color": NONE})]))
     assert "…" not in text
-    for cell in ("60.0 [", "knowledge", "90.0 @0.50", "70.0 @1.00/0", "0.50 [", "n/a"):
+    for cell in ("60.0 [", "knowledge", "90.0 @0.50", "70.0 @1.00/0", "0.49 [", "n/a"):
         assert cell in text
 
 
@@ -39,3 +39,12 @@ def test_every_run_has_its_own_block(probed_run: ProbedRun) -> None:
     text = printed(retention([probed_run({"color": SIGNAL}, "pi0"), probed_run({"color": SIGNAL}, "smolvla")]))
     assert text.index("Success rate: pi0 ") < text.index("Retention, view mean: pi0 ")
     assert text.index("Retention, view mean: pi0 ") < text.index("Success rate: smolvla ")
+
+
+def test_a_policy_without_an_expert_says_action_beside_one_that_has_one(probed_run: ProbedRun) -> None:
+    runs = [probed_run({"color": SIGNAL}, "openvla", action_stream="action"), probed_run({"color": SIGNAL}, "pi0")]
+    table = retention(runs)
+    assert [row.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
+    assert [row.retention for row in table.rows] == [table.rows[0].retention] * 2 != [None, None]
+    headings = [line.split() for line in printed(table).splitlines() if "backbone" in line]
+    assert [words[3] for words in headings] == ["action", "expert"]

@@ -1,12 +1,12 @@
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from probe_kit.retention import best_site, measure_retention
-from probe_kit.retention.estimates import Estimate, average, probe_estimates, sr_estimate
+from probe_kit.retention.crossfit import Crossfit
+from probe_kit.retention.estimates import Estimate, average, probe_estimates, retention_draws, sr_estimate
 from probe_kit.train import Curve
 from probe_kit.train.scores import group_bootstrap
 
@@ -37,23 +37,25 @@ def test_draws_of_retention_spread_like_its_fieller_interval(curve_of: CurveOf, 
     assert high == pytest.approx(exact.interval.high, abs=0.04)
 
 
-def test_every_cross_fit_takes_its_turn_and_a_backbone_at_chance_gives_no_ratio(
-    curve_of: CurveOf, outcome_table: Outcomes
-) -> None:
-    curve = curve_of(outcome_table(100, 100, 0), [0.9], [[0.7]])
-    retention = measure_retention(curve)
-    assert retention is not None
+def fit_of(expert: float, backbone: float, choosing: float = 0.0) -> Crossfit:
+    """Groups of two episodes that all have these accuracies; the variance that choosing adds to both."""
+    held_out = np.tile([[2 * expert], [2 * backbone]], 100)
+    return Crossfit(expert - 0.5, backbone - 0.5, choosing * np.eye(2), held_out, np.full(100, 2.0))
 
-    def draws(expert: list[float], backbone: float) -> np.ndarray:
-        """Of cross-fits in which every group of two episodes has these accuracies."""
-        held_out = np.tile(2 * np.array([[[share], [backbone]] for share in expert]), (1, 1, 100))
-        peak = best_site(curve, "backbone")
-        assert peak is not None
-        known = replace(retention, held_out=held_out)  # type: ignore[type-var]
-        return probe_estimates(curve, {"prefix": peak}, known, "s@1#0", 0)["retention_debiased"].draws
 
-    np.testing.assert_allclose(draws([0.6, 0.8], 0.9)[:4], [0.25, 0.75, 0.25, 0.75])
-    assert np.isnan(draws([0.6], 0.4)).all()
+def test_choosing_adds_its_own_spread_to_every_draw() -> None:
+    np.testing.assert_allclose(retention_draws(fit_of(0.7, 0.9), 0.5, units=0), 0.5)
+    draws = retention_draws(fit_of(0.7, 0.9, choosing=1e-4), 0.5, units=0)
+    assert draws.std() == pytest.approx(np.hypot(0.01, 0.5 * 0.01) / 0.4, rel=0.1)
+
+
+def test_runs_on_the_same_groups_do_not_share_the_luck_of_choosing() -> None:
+    one, other = (retention_draws(fit_of(share, 0.9, choosing=1e-4), 0.5, units=0) for share in (0.7, 0.71))
+    assert abs(np.corrcoef(one, other)[0, 1]) < 0.1
+
+
+def test_a_backbone_at_chance_gives_no_ratio() -> None:
+    assert np.isnan(retention_draws(fit_of(0.6, 0.4), 0.5, units=0)).all()
 
 
 def test_retention_without_backbone_signal_is_not_estimated(curve_of: CurveOf, outcome_table: Outcomes) -> None:

@@ -68,3 +68,17 @@ def test_a_backbone_exactly_at_chance_has_no_ratio(curve_of: CurveOf, episodes: 
 
 def test_a_curve_without_expert_has_no_retention(curve_of: CurveOf, episodes: pd.DataFrame) -> None:
     assert measure_retention(curve_of(episodes, [0.9], [])) is None
+
+
+def test_action_tokens_take_the_place_of_an_expert_that_is_not_there(
+    curve_of: CurveOf, episodes: pd.DataFrame
+) -> None:
+    accuracies = [0.5, 0.9, 0.7], [[0.55, 0.6], [0.7, 0.6]]
+    found = measure_retention(curve_of(episodes, *accuracies, action_stream="action"))
+    same = measure_retention(curve_of(episodes, *accuracies))
+    assert found is not None
+    assert same is not None
+    assert found.expert.site == Site("action", 0, "residual", 1)
+    assert (found.plain, found.debiased) == (same.plain, same.debiased)
+    with pytest.raises(UsageError, match="stream action has iterations 0 to 1"):
+        measure_retention(curve_of(episodes, *accuracies, action_stream="action"), 2)

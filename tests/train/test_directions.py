@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UnknownSiteError
+from probe_kit.extract.location import locate
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, Direction, load_results, train_probes
 from probe_kit.train.directions import StoredDirections, save_directions
@@ -25,8 +26,9 @@ def test_every_fold_counts_alike_in_the_unit_direction() -> None:
 
 def test_stored_directions_are_read_back_one_by_one(tmp_path: Path) -> None:
     places = {("color", "mean:image.front", SITE): direction(), ("shape", "mean", SITE): direction(2.0)}
-    save_directions(places, tmp_path / "directions.npz")
-    stored = StoredDirections(tmp_path / "directions.npz")
+    with (tmp_path / "directions.npz").open("wb") as file:
+        save_directions(places, file)
+    stored = StoredDirections(locate(tmp_path), "directions.npz")
     assert list(stored) == list(places)
     for place, expected in places.items():
         for part, array in vars(expected).items():

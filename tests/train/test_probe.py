@@ -5,6 +5,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import TooFewGroupsError
+from probe_kit.extract.rows import TokenBlock
 from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import STRENGTHS, NestedFold, nested_folds, probe_site
@@ -96,6 +97,7 @@ def test_ties_go_to_the_smaller_strength() -> None:
 MASK = np.random.default_rng(2).random((60, 4)) < 0.7
 MASK[:, 0] = True
 VALUES = np.random.default_rng(3).standard_normal((60, 4, 6)) + 0.4 * np.where(LABELS, 1, -1)[:, None, None]
+TOKENS = Samples.tokens(blocks=[TokenBlock(0, VALUES, MASK)], mask=MASK)
 
 
 def scikit_learn_token_logits(strength: float, fold: Fold) -> np.ndarray:
@@ -110,7 +112,7 @@ def scikit_learn_token_logits(strength: float, fold: Fold) -> np.ndarray:
 
 def test_token_probes_equal_scikit_learn_on_every_token_with_logits_averaged_per_episode() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
-    probe = probe_site(Samples.tokens(VALUES, MASK), LABELS, NONE, folds)
+    probe = probe_site(TOKENS, LABELS, NONE, folds)
     expected = np.empty(60)
     for number, fold in enumerate(folds):
         loss = np.zeros(STRENGTHS.size)
@@ -127,7 +129,9 @@ def test_token_probes_equal_scikit_learn_on_every_token_with_logits_averaged_per
 
 
 @pytest.mark.parametrize(
-    "samples", [Samples.pooled(FEATURES), Samples.tokens(VALUES, MASK)], ids=["mean", "tokens"]
+    "samples",
+    [Samples.pooled(FEATURES), TOKENS],
+    ids=["mean", "tokens"],
 )
 def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Samples) -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
@@ -135,7 +139,7 @@ def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Sam
     for number, fold in enumerate(folds):
         held_out = samples.means[fold.outer.test] @ probe.weights[number] + probe.intercepts[number]
         np.testing.assert_allclose(held_out, probe.decisions[fold.outer.test], atol=1e-5)
-        along = samples.of(fold.outer.train).features @ probe.weights[number]
+        along = np.asarray(samples.of(fold.outer.train).features) @ probe.weights[number]
         assert probe.spreads[number] == pytest.approx(
             along.std() / np.linalg.norm(probe.weights[number]), rel=1e-5
         )
@@ -145,7 +149,9 @@ def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Sam
 
 
 @pytest.mark.parametrize(
-    "samples", [Samples.pooled(FEATURES), Samples.tokens(VALUES, MASK)], ids=["mean", "tokens"]
+    "samples",
+    [Samples.pooled(FEATURES), TOKENS],
+    ids=["mean", "tokens"],
 )
 def test_torch_gives_the_numbers_of_numpy(samples: Samples) -> None:
     pytest.importorskip("torch").set_num_threads(1)

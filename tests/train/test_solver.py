@@ -8,6 +8,7 @@ from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
 from probe_kit.train import solver
+from probe_kit.train.design import DenseDesign
 from probe_kit.train.features import Coordinates
 from probe_kit.train.probe import STRENGTHS
 from probe_kit.train.solver import LogisticSolver
@@ -54,7 +55,7 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
     coordinates = Coordinates.fit(features)
     others = features.mean(axis=0) + features.std(axis=0) * GENERATOR.standard_normal((25, features.shape[1]))
     samples = np.vstack([coordinates.standardise(features), coordinates.standardise(others)])
-    ours = np.vstack([coordinates.train, coordinates(others)])
+    ours = np.vstack([coordinates(features), coordinates(others)])
 
     both = np.column_stack([labels, ~labels])
     for strength, weights in zip(STRENGTHS, LogisticSolver(coordinates.train).path(both, STRENGTHS), strict=True):
@@ -94,7 +95,8 @@ def test_an_unfinished_probe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_non_finite_samples_never_pass_as_converged() -> None:
     samples = Coordinates.fit(NOISE).train
-    samples[0, 0] = np.nan
+    assert isinstance(samples, DenseDesign)
+    samples.samples[0, 0] = np.nan
     with pytest.raises(ProbeNotConvergedError):
         list(LogisticSolver(samples).path(LABELS[:, None], np.array([1.0])))
 

@@ -1,13 +1,18 @@
+import subprocess
+import sys
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from probe_kit.errors import MissingExtraError, TooFewGroupsError
 from probe_kit.hooks import Site
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import nested_folds
 from probe_kit.train.problem import CategoryProblem
 from probe_kit.train.samples import Samples
-from probe_kit.train.workers import Key, probe_columns
+from probe_kit.train.workers import CrewSettings, Key, Probed, probe_columns
 
 ITEMS = np.repeat(np.arange(10), 2)
 LABELS = np.tile([True, False], 10)
@@ -30,16 +35,54 @@ def columns(read: list[Key]) -> Iterator[tuple[Key, Samples]]:
         yield key, Samples.pooled(np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32))
 
 
-def test_processes_give_the_same_numbers_as_this_one() -> None:
-    alone = dict(probe_columns(columns([]), {"color": PROBLEM}, jobs=1))
-    together = dict(probe_columns(columns([]), {"color": PROBLEM}, jobs=2))
+def columns_of(settings: CrewSettings) -> dict[Key, Probed]:
+    return dict(probe_columns(columns([]), {"color": PROBLEM}, settings))
+
+
+def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -> None:
     assert alone.keys() == together.keys()
     for key, probes in alone.items():
         np.testing.assert_array_equal(probes["color"].decisions, together[key]["color"].decisions)
+        np.testing.assert_array_equal(probes["color"].null, together[key]["color"].null)
+
+
+def test_processes_give_the_same_numbers_as_this_one() -> None:
+    assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(jobs=2)))
 
 
 def test_columns_are_read_only_when_they_are_needed() -> None:
     read: list[Key] = []
-    probing = probe_columns(columns(read), {"color": PROBLEM}, jobs=1)
+    probing = probe_columns(columns(read), {"color": PROBLEM}, CrewSettings())
     next(probing)
     assert len(read) == 1
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"probe-kit\[ray\]"):
+        columns_of(CrewSettings(ray="auto"))
+
+
+def test_ray_is_imported_for_ray_only() -> None:
+    code = (
+        "import sys, probe_kit.train.workers; print([m for m in ('ray', 'torch', 'pybullet') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_numbers_and_raises_what_a_task_raises() -> None:
+    """Slow: a cluster takes its time to start, and on starved machines it may not start at all."""
+    ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
+    try:
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    except (RuntimeError, ConnectionError, TimeoutError, ray.exceptions.RayError) as error:
+        pytest.skip(f"Ray does not start here: {error}")
+    of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
+    try:
+        assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(ray="auto")))
+        with pytest.raises(TooFewGroupsError, match="same label"):
+            list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(ray="auto", jobs=1)))
+        assert ray.is_initialized()  # a cluster somebody else started stays
+    finally:
+        ray.shutdown()

@@ -1,0 +1,279 @@
+"""What works on this machine, and what to do about the rest: what `probe-kit doctor` says.
+
+What the demo needs is tried, not looked up: one child process draws a scene, another lets the embedded policy act.
+They are processes of their own because native code prints to stdout, and because its crash is a finding as well.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any, Literal
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+from probe_kit.errors import SceneError
+
+State = Literal["ok", "note", "missing"]
+
+DEMO_DISK = 100e6
+"""Bytes the demo leaves, with room to spare (13 MB when last measured)."""
+ROOMY_DISK = 20e9
+DEMO_MEMORY = 2e9
+PATIENCE = 120
+"""Seconds a trial may take."""
+HUB_TIMEOUT = 3
+TOKENIZERS = {"pi0": "google/paligemma-3b-pt-224", "smolvla": "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"}
+_PYTHONS = ((3, 12), (3, 14))  # from, and below
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    state: `ok`, `note` (something cannot be used, the demo can), or `missing` (the demo cannot run).
+    advice: what to do, empty if nothing.
+    """
+
+    subject: str
+    state: State
+    seen: str
+    advice: str = ""
+
+    def to_json(self) -> dict[str, str]:
+        """As `probe-kit doctor --json` prints it."""
+        return asdict(self)
+
+
+def examine() -> list[Finding]:
+    """Everything, in the order a newcomer needs it. Takes ten seconds or more: it loads torch and a simulator."""
+    with ThreadPoolExecutor(3) as pool:
+        scene, policy, hub = pool.submit(_scene), pool.submit(_policy), pool.submit(_hub)
+        quick = [_python(), _processor(), _memory(), _disk()]
+        return [*quick, *scene.result(), *policy.result(), hub.result(), *_tokenizers(), *_extras()]
+
+
+# -- the machine -----------------------------------------------------------------------------------------------
+
+
+def _python() -> Finding:
+    low, below = _PYTHONS
+    seen = f"{sys.version.split()[0]} on {sys.platform}"
+    if low <= sys.version_info[:2] < below:
+        return Finding("python", "ok", seen)
+    return Finding("python", "missing", seen, "Use Python 3.12 or 3.13: `uv venv --python 3.12`")
+
+
+def _processor() -> Finding:
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    advice = "" if count > 1 else "Two cores halve the demo: one simulates while the other thinks"
+    return Finding("processor", "ok" if count > 1 else "note", f"{count} core{'s' * (count > 1)} usable", advice)
+
+
+def _memory() -> Finding:
+    available = _available_memory()
+    if available is None:
+        return Finding("memory", "note", "cannot be read on this system", "The demo needs about 2 GB")
+    seen = f"{available / 1e9:.1f} GB available"
+    if available < DEMO_MEMORY:
+        return Finding("memory", "note", seen, "The demo needs about 2 GB; close something, or it may be killed")
+    return Finding("memory", "ok", seen)
+
+
+def _available_memory() -> float | None:
+    """Bytes, as Linux counts them; elsewhere all of the machine's, or None."""
+    meminfo = Path("/proc/meminfo")
+    if meminfo.is_file():
+        found = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text())
+        if found:
+            return float(found[1]) * 1024
+    if "SC_PHYS_PAGES" in os.sysconf_names:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    seen = f"{free / 1e9:.1f} GB free here"
+    if free < DEMO_DISK:
+        return Finding(
+            "disk", "missing", seen, f"The demo needs {DEMO_DISK / 1e6:.0f} MB: run it elsewhere (--out)"
+        )
+    if free < ROOMY_DISK:
+        return Finding(
+            "disk", "note", seen, "Enough for the demo; a full-size model and its runs want 20 GB and more"
+        )
+    return Finding("disk", "ok", seen)
+
+
+# -- trials in processes of their own --------------------------------------------------------------------------
+
+
+def draw_scene() -> dict[str, Any]:
+    """Draw one picture of the default scene, as an episode does. Raises SceneError if it shows nothing."""
+    import pybullet
+
+    from probe_kit.env import Act2AnswerEnv
+
+    env = Act2AnswerEnv()
+    try:
+        env.reset(seed=0)
+        started = time.perf_counter()
+        env.advance([0.0] * 7)
+        picture = env.render()
+        seconds = time.perf_counter() - started
+    finally:
+        env.close()
+    if picture.std() < 5:
+        raise SceneError(f"the picture is blank: its deviation is {picture.std():.1f} of 255")
+    height, width, _ = picture.shape
+    return {
+        "pybullet": version("pybullet"),
+        "numpy": bool(pybullet.isNumpyEnabled()),
+        "size": f"{width} × {height}",
+        "seconds": seconds,
+    }
+
+
+def let_policy_act() -> dict[str, Any]:
+    """Load the embedded policy and ask it for actions once; and say what torch can compute on."""
+    import numpy as np
+    import torch
+
+    from probe_kit.hooks import Observation, load_policy
+
+    started = time.perf_counter()
+    policy = load_policy("pi0-tiny")
+    state = np.zeros(8, np.float32)
+    policy.act([Observation(np.zeros((480, 640, 3), np.uint8), state, "Put the cube on the red shape")], [0])
+    cards = range(torch.cuda.device_count()) if torch.cuda.is_available() else range(0)
+    return {
+        "torch": torch.__version__,
+        "lerobot": version("lerobot"),
+        "seconds": time.perf_counter() - started,
+        "gpus": [
+            {
+                "name": torch.cuda.get_device_name(card),
+                "gigabytes": torch.cuda.get_device_properties(card).total_memory / 1e9,
+            }
+            for card in cards
+        ],
+    }
+
+
+def _scene() -> list[Finding]:
+    found, complaint = _try("draw_scene")
+    if found is None:
+        advice = "pybullet is compiled on installation: it needs a C++ compiler, and numpy at that time"
+        return [Finding("simulator", "missing", complaint, advice)]
+    simulator = Finding("simulator", "ok", f"pybullet {found['pybullet']} with numpy")
+    if not found["numpy"]:
+        advice = (
+            "`uv sync --reinstall-package pybullet`, or `pip install --no-build-isolation pybullet` with numpy"
+        )
+        seen = f"pybullet {found['pybullet']} without numpy: pictures cost three times as much"
+        simulator = Finding("simulator", "note", seen, advice)
+    drawn = (
+        f"TinyRenderer (no GPU, no display needed; EGL is not used), {found['size']} in {found['seconds']:.2f} s"
+    )
+    return [simulator, Finding("renderer", "ok", drawn)]
+
+
+def _policy() -> list[Finding]:
+    found, complaint = _try("let_policy_act")
+    if found is None:
+        return [Finding("policy", "missing", complaint, "Install again: `uv sync`, or `pip install probe-kit`")]
+    acted = f"pi0-tiny acts (torch {found['torch']}, lerobot {found['lerobot']})"
+    return [Finding("policy", "ok", acted), _gpu(found["gpus"])]
+
+
+def _gpu(gpus: list[dict[str, Any]]) -> Finding:
+    if not gpus:
+        advice = "The demo needs none; pi0 wants a GPU of 16 GB or more, and drivers that torch finds"
+        return Finding("gpu", "note", "none that torch can use", advice)
+    seen = ", ".join(f"{gpu['name']} with {gpu['gigabytes']:.0f} GB" for gpu in gpus)
+    return Finding("gpu", "ok", seen)
+
+
+def _try(function: str) -> tuple[dict[str, Any] | None, str]:
+    """What a function of this module returns in a process of its own; or None and its last words."""
+    code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None, f"no answer within {PATIENCE} s"
+    if done.returncode != 0:
+        words = done.stderr.strip().splitlines() or ["no message"]
+        return None, f"ended with code {done.returncode}: {words[-1]}"
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found, ""
+
+
+# -- what can be downloaded or added ---------------------------------------------------------------------------
+
+
+def _hub() -> Finding:
+    from huggingface_hub import constants
+
+    address = constants.ENDPOINT
+    if constants.HF_HUB_OFFLINE:
+        return Finding("hub", "note", "offline mode (HF_HUB_OFFLINE)", "Unset it to download checkpoints")
+    try:
+        urlopen(Request(address, method="HEAD"), timeout=HUB_TIMEOUT).close()
+    except HTTPError:
+        pass  # it answered
+    except OSError as error:
+        advice = (
+            "The demo needs no network; checkpoints must then be folders (--checkpoint DIR) or in the hub's cache"
+        )
+        reason = getattr(error, "reason", error)
+        return Finding("hub", "note", f"{address} does not answer ({reason})", advice)
+    return Finding("hub", "ok", f"{address} answers")
+
+
+def _tokenizers() -> list[Finding]:
+    from huggingface_hub import try_to_load_from_cache
+
+    findings = [Finding("tokenizer", "ok", "pi0-tiny: embedded")]
+    for family, repository in TOKENIZERS.items():
+        here = isinstance(try_to_load_from_cache(repository, "tokenizer_config.json"), str)
+        advice = "" if here else f"Comes with the model, or `hf download {repository} --include 'tokenizer*'`"
+        seen = f"{family}: {repository} {'is in the cache' if here else 'is not in the cache'}"
+        findings.append(Finding("tokenizer", "ok" if here else "note", seen, advice))
+    return findings
+
+
+def _extras() -> list[Finding]:
+    """Optional dependencies by extra; Ray is one of them."""
+    needed: dict[str, list[str]] = {}
+    for requirement in requires("probe-kit") or ():
+        found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if found:
+            needed.setdefault(found[2], []).append(found[1])
+    return [_extra(name, packages) for name, packages in needed.items()]
+
+
+def _extra(name: str, packages: list[str]) -> Finding:
+    here = {package: _installed(package) for package in packages}
+    lacking = [package for package, found in here.items() if found is None]
+    if lacking:
+        return Finding(
+            f"extra {name}", "note", f"without {', '.join(lacking)}", f"`pip install 'probe-kit[{name}]'`"
+        )
+    return Finding(f"extra {name}", "ok", ", ".join(f"{package} {found}" for package, found in here.items()))
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

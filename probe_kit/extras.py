@@ -1,0 +1,16 @@
+"""Optional libraries, imported when they are needed."""
+
+from importlib import import_module
+from typing import Any
+
+from probe_kit.errors import MissingExtraError
+
+
+def require(module: str, extra: str) -> Any:
+    """The module, or MissingExtraError naming the extra of probe-kit that brings it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"this needs {module.partition('.')[0]}, which is not installed; `pip install 'probe-kit[{extra}]'`"
+        ) from error

@@ -1,0 +1,63 @@
+"""The part of a picture a policy looks at: lerobot's crop-and-resize step, read from a checkpoint."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+from torchvision.transforms.v2 import functional
+
+from probe_kit.errors import CheckpointError, ObservationError
+
+STEP = "image_crop_resize_processor"
+
+
+@dataclass(frozen=True)
+class PictureWindow:
+    """Crop, then resize (bilinear, antialiased) as lerobot's `ImageCropResizeProcessorStep` does.
+
+    crop: top, left, height, width in pixels of the camera, or None. size: (height, width) after, or None.
+    """
+
+    crop: tuple[int, int, int, int] | None = None
+    size: tuple[int, int] | None = None
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] to what the policy looks at. Raises ObservationError if the crop lies outside."""
+        if self.crop is not None:
+            top, left, height, width = self.crop
+            if top + height > pictures.shape[-2] or left + width > pictures.shape[-1]:
+                raise ObservationError(
+                    f"the picture is {pictures.shape[-1]} x {pictures.shape[-2]} pixels; this checkpoint looks at "
+                    f"columns {left} to {left + width} and rows {top} to {top + height}"
+                )
+            pictures = functional.crop(pictures, top, left, height, width)
+        if self.size is not None:
+            pictures = functional.resize(pictures, list(self.size)).clamp(0.0, 1.0)
+        return pictures
+
+
+def read_window(folder: Path, camera: str) -> PictureWindow:
+    """The window of one camera (`observation.images.<name>`); the whole picture if the checkpoint names none.
+
+    Raises CheckpointError if the step holds something else than lerobot writes.
+    """
+    path = folder / "policy_preprocessor.json"
+    steps = json.loads(path.read_text())["steps"] if path.is_file() else []
+    for step in steps:
+        if step["registry_name"] == STEP:
+            try:
+                crop = (step["config"].get("crop_params_dict") or {}).get(camera)
+                size = step["config"].get("resize_size")
+                return PictureWindow(_crop(*crop) if crop else None, _size(*size) if size else None)
+            except TypeError as error:
+                raise CheckpointError(f"{path}: {STEP} cannot be read: {error}") from error
+    return PictureWindow()
+
+
+def _crop(top: int, left: int, height: int, width: int) -> tuple[int, int, int, int]:
+    return int(top), int(left), int(height), int(width)
+
+
+def _size(height: int, width: int) -> tuple[int, int]:
+    return int(height), int(width)

@@ -1,0 +1,116 @@
+"""Text to ids, from the checkpoint's own `tokenizer.json`.
+
+Read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own, while the
+released models were trained with what the file says.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+from tokenizers import Tokenizer
+
+from probe_kit.errors import CheckpointError, InstructionError
+
+BYTES = "bytes"
+"""Asks for `ByteTokenizer`."""
+
+
+class TextTokenizer(Protocol):
+    """What an adapter needs. special: ids that stand for no text."""
+
+    @property
+    def special(self) -> frozenset[int]:
+        """Ids that stand for no text."""
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first. Raises InstructionError for a word it does not know."""
+
+
+@dataclass(frozen=True)
+class FileTokenizer:
+    """A `tokenizer.json`, with the names of special tokens from the `tokenizer_config.json` beside it, if any."""
+
+    file: Path
+    beginning: int | None
+
+    @cached_property
+    def _tokenizer(self) -> Any:
+        return Tokenizer.from_file(str(self.file))
+
+    @cached_property
+    def _beginning(self) -> int | None:
+        """The beginning-of-sequence id, from the tokenizer's own files before the model's configuration."""
+        named = self._config.get("bos_token")
+        content = named.get("content") if isinstance(named, dict) else named
+        found: int | None = self._tokenizer.token_to_id(content) if content else None
+        return self.beginning if found is None else found
+
+    @cached_property
+    def _config(self) -> dict[str, Any]:
+        beside = self.file.with_name("tokenizer_config.json")
+        return dict(json.loads(beside.read_text())) if beside.is_file() else {}
+
+    @cached_property
+    def special(self) -> frozenset[int]:
+        """Ids that the file declares special."""
+        added = self._tokenizer.get_added_tokens_decoder()
+        return frozenset(number for number, token in added.items() if token.special) | {self._beginning or 0}
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first, also where the file does not add it."""
+        ids: list[int] = self._tokenizer.encode(text).ids
+        if self._beginning is not None and ids[:1] != [self._beginning]:
+            ids = [self._beginning, *ids]
+        unknown = getattr(self._tokenizer.model, "unk_token", None)
+        if unknown is not None and self._tokenizer.token_to_id(unknown) in ids:
+            raise InstructionError(
+                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would act without "
+                f"reading it. Tokens: {self._tokenizer.encode(text).tokens}"
+            )
+        return ids
+
+
+@dataclass(frozen=True)
+class ByteTokenizer:
+    """UTF-8 bytes as ids 3 … 258, for development checkpoints that come without a tokenizer.
+
+    No model was trained with it, so a trained checkpoint would read noise.
+    """
+
+    beginning: int
+
+    @property
+    def special(self) -> frozenset[int]:
+        """The beginning-of-sequence token."""
+        return frozenset({self.beginning})
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first."""
+        return [self.beginning, *(3 + byte for byte in text.encode())]
+
+
+def find_tokenizer(
+    folders: Sequence[Path], chosen: str | None, beginning: int | None, vocabulary: int
+) -> TextTokenizer:
+    """The checkpoint's tokenizer, or the one in the folder `chosen`, or bytes if that is asked for.
+
+    vocabulary: the number of text ids the model has. Raises CheckpointError naming the missing files.
+    """
+    if chosen == BYTES:
+        if vocabulary < 259:
+            raise CheckpointError(f"bytes need 259 text ids; this checkpoint has {vocabulary}")
+        return ByteTokenizer(1 if beginning is None else beginning)
+    places = list(folders) if chosen is None else [Path(chosen).expanduser()]
+    for place in places:
+        if (place / "tokenizer.json").is_file():
+            return FileTokenizer(place / "tokenizer.json", beginning)
+    raise CheckpointError(
+        f"tokenizer.json and tokenizer_config.json are missing in {' and '.join(map(str, places))}. The tokenizer "
+        "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
+        f"from, or name their folder with --tokenizer. For a development checkpoint that has none: "
+        f"--tokenizer {BYTES}"
+    )

@@ -1,0 +1,158 @@
+"""What the `config.json` of a Prismatic or OpenVLA checkpoint says.
+
+The file names parts of a fixed table (Karamcheti et al. 2024, and OpenVLA's `PrismaticConfig`); explicit fields
+win over the table. The language model's part is short: what it leaves out is transformers' default, which has
+rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from transformers import CONFIG_MAPPING
+
+from probe_kit.errors import CheckpointError
+
+_DINO = "vit_large_patch14_reg4_dinov2.lvd142m"
+_CLIP = ("vit_large_patch14_clip_224.openai", 224, "quick_gelu")
+_CLIP_336 = ("vit_large_patch14_clip_336.openai", 336, "quick_gelu")
+# Per vision id: (timm id, image side, activation instead of timm's own) of each tower.
+_TOWERS: dict[str, tuple[tuple[str, int, str | None], ...]] = {
+    "clip-vit-l": (_CLIP,),
+    "clip-vit-l-336px": (_CLIP_336,),
+    "siglip-vit-so400m": (("vit_so400m_patch14_siglip_224", 224, None),),
+    "siglip-vit-so400m-384px": (("vit_so400m_patch14_siglip_384", 384, None),),
+    "dinov2-vit-l": ((_DINO, 224, None),),
+    "in1k-vit-l": (("vit_large_patch16_224.augreg_in21k_ft_in1k", 224, None),),
+    "dinoclip-vit-l-336px": ((_DINO, 336, None), _CLIP_336),
+    "dinosiglip-vit-so-224px": ((_DINO, 224, None), ("vit_so400m_patch14_siglip_224", 224, None)),
+    "dinosiglip-vit-so-384px": ((_DINO, 384, None), ("vit_so400m_patch14_siglip_384", 384, None)),
+}
+# Per language id: transformers' model type.
+_LANGUAGE = {
+    "llama2-7b-pure": "llama",
+    "llama2-13b-pure": "llama",
+    "llama2-7b-chat": "llama",
+    "llama2-13b-chat": "llama",
+    "vicuna-v15-7b": "llama",
+    "vicuna-v15-13b": "llama",
+    "mistral-v0.1-7b-pure": "mistral",
+    "mistral-v0.1-7b-instruct": "mistral",
+    "phi-2-3b": "phi",
+}
+MODEL_TYPES = ("prismatic", "openvla")
+RESIZE_STRATEGIES = ("resize-naive", "letterbox", "resize-crop")
+
+
+@dataclass(frozen=True)
+class TowerConfig:
+    """One vision tower: a timm id, the side of its square input in pixels, and changes to timm's constructor."""
+
+    timm_id: str
+    image_size: int
+    act_layer: str | None
+    overrides: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class PrismaticConfig:
+    """A checkpoint's configuration.
+
+    towers: one, or two whose patch features are joined (`fused`). text: transformers' configuration of the
+    language model. action_vocabulary: text ids below the embedding's padding; the last ones name action bins.
+    empty_token: the id that ends every OpenVLA prompt. dtype: as stored, None if the file does not say.
+    statistics: per data set, what un-normalises its actions.
+    """
+
+    model_type: str
+    vision_id: str
+    language_id: str
+    towers: tuple[TowerConfig, ...]
+    resize: str
+    text: Any
+    action_vocabulary: int
+    action_bins: int
+    empty_token: int
+    dtype: str | None
+    statistics: Mapping[str, Any]
+
+    @property
+    def fused(self) -> bool:
+        """Whether two towers look at the picture."""
+        return len(self.towers) == 2
+
+    @classmethod
+    def from_folder(cls, folder: Path) -> "PrismaticConfig":
+        """Read `folder/config.json`. Raises CheckpointError if it is missing or describes another model."""
+        file = folder / "config.json"
+        if not file.is_file():
+            raise CheckpointError(f"{file} is missing; {folder} is not a Prismatic or OpenVLA checkpoint")
+        return cls.from_json(json.loads(file.read_text()), str(file))
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "PrismaticConfig":
+        """From the content of a `config.json`. Raises CheckpointError naming `source`."""
+        model_type = values.get("model_type")
+        if model_type not in MODEL_TYPES:
+            raise CheckpointError(
+                f"{source} holds a {model_type!r} model; expected {' or '.join(MODEL_TYPES)}. "
+                "Pass the right --model"
+            )
+        vision = values.get("vision_backbone_id", "siglip-vit-so400m")
+        language = values.get("llm_backbone_id", "vicuna-v15-7b")
+        resize = values.get("image_resize_strategy", "letterbox")
+        for name, value, known in (
+            ("vision_backbone_id", vision, _TOWERS),
+            ("llm_backbone_id", language, _LANGUAGE),
+            ("image_resize_strategy", resize, RESIZE_STRATEGIES),
+        ):
+            if value not in known:
+                raise CheckpointError(f"{source}: {name} {value!r} is not one of {', '.join(known)}")
+        text = _text_config(values, _LANGUAGE[language], source)
+        return cls(
+            model_type=model_type,
+            vision_id=vision,
+            language_id=language,
+            towers=_towers(values, vision, source),
+            resize=resize,
+            text=text,
+            action_vocabulary=text.vocab_size - int(values.get("pad_to_multiple_of", 64)),
+            action_bins=int(values.get("n_action_bins", 256)),
+            empty_token=int(values.get("empty_token_id", 29871)),
+            dtype=values.get("torch_dtype") or values.get("dtype"),
+            statistics=values.get("norm_stats") or {},
+        )
+
+
+def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerConfig, ...]:
+    named = _TOWERS[vision]
+    count = len(named)
+    columns: list[list[Any]] = [
+        values.get("timm_model_ids") or [timm_id for timm_id, _, _ in named],
+        values.get("image_sizes") or [size for _, size, _ in named],
+        values.get("timm_override_act_layers") or [act_layer for _, _, act_layer in named],
+        values.get("timm_model_overrides") or [{}] * count,
+    ]
+    fused = values.get("use_fused_vision_backbone")
+    if {len(column) for column in columns} != {count} or (fused is not None and fused != (count == 2)):
+        raise CheckpointError(
+            f"{source}: {vision} has {count} vision tower(s), but the fields that describe them "
+            "(timm_model_ids, image_sizes, timm_override_act_layers, use_fused_vision_backbone) say otherwise"
+        )
+    return tuple(
+        TowerConfig(timm_id, int(size), act_layer, dict(overrides))
+        for timm_id, size, act_layer, overrides in zip(*columns, strict=True)
+    )
+
+
+def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any:
+    stored = dict(values.get("text_config") or {})
+    found = stored.setdefault("model_type", model_type)
+    if found != model_type:
+        raise CheckpointError(
+            f"{source}: llm_backbone_id {values.get('llm_backbone_id')!r} is a {model_type} model, "
+            f"but text_config describes a {found} model"
+        )
+    return CONFIG_MAPPING[model_type].from_dict(stored)

@@ -1,0 +1,160 @@
+"""The network: vision towers, projector, language model; patches go between the first token and the rest.
+
+B batch, P patches, T text tokens, S = P + T positions, D width of the language model, V its vocabulary.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import AutoModelForCausalLM, DynamicCache
+
+from probe_kit.models.prismatic.config import PrismaticConfig
+from probe_kit.models.prismatic.vision import VisionBackbone
+
+
+class Projector(nn.Module):
+    """Patch features to the language model's width: two layers for one tower, three for two."""
+
+    def __init__(self, vision_width: int, width: int, fused: bool) -> None:
+        super().__init__()
+        hidden = 4 * vision_width if fused else width
+        self.fc1 = nn.Linear(vision_width, hidden)
+        self.fc2 = nn.Linear(hidden, width)
+        self.fc3 = nn.Linear(width, width) if fused else None
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """(B, P, D) from (B, P, vision width)."""
+        projected: Tensor = self.fc2(nn.functional.gelu(self.fc1(patches)))
+        return projected if self.fc3 is None else self.fc3(nn.functional.gelu(projected))
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them."""
+
+    ids: Tensor
+    logits: Tensor
+
+
+class PrismaticNetwork(nn.Module):
+    """A Prismatic model under the parameter names of its released files."""
+
+    def __init__(self, config: PrismaticConfig) -> None:
+        super().__init__()
+        self.vision_backbone = VisionBackbone(config.towers)
+        self.projector = Projector(self.vision_backbone.width, config.text.hidden_size, config.fused)
+        self.language_model: Any = AutoModelForCausalLM.from_config(config.text)
+
+    @property
+    def patches(self) -> int:
+        """P."""
+        return int(self.vision_backbone.featurizer.patch_embed.num_patches)
+
+    def embed(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, S, D) and mask (B, S); without a picture S is T."""
+        embeddings: Tensor = self.language_model.get_input_embeddings()(ids)
+        if pixel_values is None:
+            return embeddings, mask
+        patches = self.projector(self.vision_backbone(pixel_values.to(embeddings.dtype)))
+        seen = torch.ones(patches.shape[:2], dtype=mask.dtype, device=mask.device)
+        return (
+            torch.cat([embeddings[:, :1], patches, embeddings[:, 1:]], dim=1),
+            torch.cat([mask[:, :1], seen, mask[:, 1:]], dim=1),
+        )
+
+    def forward(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> Any:
+        """transformers' output of one pass, with logits (B, S, V) and all hidden states.
+
+        ids: (B, T). mask: (B, T) bool, False at padding, which may stand anywhere behind the first token.
+        """
+        embeddings, mask = self.embed(ids, mask, pixel_values)
+        return self.language_model(
+            inputs_embeds=embeddings,
+            position_ids=_positions(mask),
+            attention_mask=_needed(mask),
+            output_hidden_states=True,
+        )
+
+    def decode(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int) -> Decoded:
+        """Exactly `steps` greedy tokens behind the prompt, whatever they are.
+
+        ids, mask: as for `forward`, with a token, not padding, at the end of every row. The language model is
+        called once with the prompt and `steps - 1` times with one token.
+        """
+        embeddings, mask = self.embed(ids, mask, pixel_values)
+        cache = DynamicCache(config=self.language_model.config)
+        positions = _positions(mask)
+        chosen: list[Tensor] = []
+        logits: list[Tensor] = []
+        for _ in range(steps):
+            output = self.language_model(
+                inputs_embeds=embeddings,
+                position_ids=positions,
+                attention_mask=_needed(mask),
+                past_key_values=cache,
+                use_cache=True,
+                logits_to_keep=1,
+            )
+            logits.append(output.logits[:, -1])
+            chosen.append(logits[-1].argmax(dim=-1))
+            embeddings = self.language_model.get_input_embeddings()(chosen[-1][:, None])
+            positions = positions[:, -1:] + 1
+            mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
+        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1))
+
+
+def _positions(mask: Tensor) -> Tensor:
+    """(B, S) positions that count tokens, not padding."""
+    return (mask.long().cumsum(dim=1) - 1).clamp(min=0)
+
+
+def _needed(mask: Tensor) -> Tensor | None:
+    """The mask where there is padding: without one, attention takes its exact causal path."""
+    return None if bool(mask.all()) else mask
+
+
+def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "meta") -> PrismaticNetwork:
+    """The network in eval mode.
+
+    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
+    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
+    """
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device(device):
+            network = PrismaticNetwork(config)
+    finally:
+        torch.set_default_dtype(before)
+    # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
+    decoder = network.language_model.model
+    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
+    network.language_model.tie_weights()
+    for name, parameter in network.named_parameters():
+        if name.endswith(".bias") and not parameter.is_meta:
+            nn.init.zeros_(parameter)  # torch would draw them from the global generator
+    return network.eval()
+
+
+def full_size_openvla() -> PrismaticNetwork:
+    """OpenVLA-7B on the meta device."""
+    return _full_size("openvla", "dinosiglip-vit-so-224px", "llama2-7b-pure")
+
+
+def full_size_prismatic() -> PrismaticNetwork:
+    """Prismatic 7B with the fused towers on the meta device."""
+    return _full_size("prismatic", "dinosiglip-vit-so-224px", "llama2-7b-pure")
+
+
+def _full_size(model_type: str, vision: str, language: str) -> PrismaticNetwork:
+    config = PrismaticConfig.from_json(
+        {
+            "model_type": model_type,
+            "vision_backbone_id": vision,
+            "llm_backbone_id": language,
+            "text_config": {"vocab_size": 32064, "pad_token_id": 32000},
+        }
+    )
+    return build_prismatic(config, torch.bfloat16)

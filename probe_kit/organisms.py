@@ -1,0 +1,128 @@
+"""Model organisms: policies of which the truth is known by construction, to test the instrument on.
+
+`pi0-tiny` was trained to act on Color and Shape (*used*); the answer to State questions was made readable in
+its backbone and never trained into an action (*encoded, unused*); nothing was trained for the other categories
+(*absent*). Its early checkpoint and its random twin know nothing yet.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.retention import RetentionRow, retention
+from probe_kit.retention.cells import debiased_value, number, percent
+from probe_kit.suite import Suite
+from probe_kit.train import train_probes
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Verdict = Literal["used", "encoded, unused", "absent", "acted on, not found"]
+Stage = Callable[[str], Callable[..., None]]
+
+SIGNIFICANT = 0.05
+"""Family-wise p below which the backbone knows the answer."""
+
+
+@dataclass(frozen=True)
+class Organism:
+    """A policy by its model name, and the verdict that is true of it per category; `absent` if not named."""
+
+    name: str
+    model: str
+    random_weights: bool = False
+    truth: tuple[tuple[str, Verdict], ...] = ()
+
+    def expected(self, category: str) -> Verdict:
+        """What is true by construction."""
+        return dict(self.truth).get(category, "absent")
+
+
+TRAINED = Organism(
+    "trained", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
+)
+ORGANISMS = (
+    TRAINED,
+    Organism("early checkpoint", "pi0-tiny-early"),
+    Organism("random twin", "pi0-tiny", random_weights=True),
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the instrument says about one organism and category, beside the truth."""
+
+    organism: str
+    category: str
+    expected: Verdict
+    measured: Verdict
+    row: RetentionRow
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the instrument tells the truth."""
+        return self.expected == self.measured
+
+
+def verdict(row: RetentionRow) -> Verdict:
+    """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
+
+    In the backbone: its best site is family-wise significant. Acted on: the SR is above 0.5 + Δ. *Acted on, not
+    found* is a contradiction, and true of no policy: the instrument missed what the policy plainly reads.
+    """
+    known = row.prefix_p_fwe is not None and row.prefix_p_fwe < SIGNIFICANT
+    if row.delta is not None and row.sr > 0.5 + row.delta:
+        return "used" if known else "acted on, not found"
+    return "encoded, unused" if known else "absent"
+
+
+def compare(suite: Suite, folder: Path, permutations: int, stage: Stage) -> list[Finding]:
+    """Extract, probe and judge every organism on `suite`; runs lie in `folder`, finished ones are reused.
+
+    stage: gives a progress callback (done, total, …) for a stage of this name.
+    """
+    findings = []
+    for organism in ORGANISMS:
+        settings = ExtractSettings(
+            organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
+        )
+        place = folder / ("run" if organism == TRAINED else f"run-{organism.name.replace(' ', '-')}")
+        run = extract_run(settings, place, progress=stage(f"episodes, {organism.name}"))
+        train_probes(run, permutations=permutations, progress=stage(f"probing, {organism.name}"))
+        findings += [
+            Finding(organism.name, row.category, organism.expected(row.category), verdict(row), row)
+            for row in retention([run]).rows
+        ]
+    return findings
+
+
+def to_rich(findings: Sequence[Finding]) -> "Table":
+    """One line per organism and category: the truth, the verdict, and the numbers behind it."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, title="Model organisms", title_justify="left")
+    columns = ("policy", "category", "expected", "measured", "", "SR %", "Δ", "backbone %", "p", "expert %", "p")
+    for name in (*columns, "retention [95 %]"):
+        table.add_column(name, no_wrap=True)
+    for finding in findings:
+        row = finding.row
+        table.add_row(
+            finding.organism,
+            finding.category,
+            finding.expected,
+            finding.measured,
+            "[green]✓[/]" if finding.agrees else "[red]✗[/]",
+            percent(row.sr),
+            percent(row.delta),
+            percent(row.prefix_accuracy),
+            number(row.prefix_p_fwe, 3),
+            percent(row.action_accuracy),
+            number(row.action_p_fwe, 3),
+            debiased_value(row),
+        )
+    agree = sum(finding.agrees for finding in findings)
+    table.caption, table.caption_justify = f"{agree} of {len(findings)} verdicts are true", "left"
+    return table

@@ -1,0 +1,44 @@
+"""Figures in scikit-learn's display idiom: numbers as attributes, `plot(ax=None)` draws and returns the display.
+
+Without `ax` a display makes its own figure, with a legend and a caption that names model, weights and suite.
+`gallery` makes all figures that fit a table of runs.
+"""
+
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
+from probe_kit.retention.displays.gallery import Exhibit, gallery, save_figures
+from probe_kit.retention.displays.heat_table import (
+    HeatTableDisplay,
+    RetentionTableDisplay,
+    SideTableDisplay,
+    SuccessTableDisplay,
+)
+from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
+from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
+from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
+from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
+from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
+from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
+
+__all__ = [
+    "Certificate",
+    "Exhibit",
+    "FinalPositionsDisplay",
+    "HeatTableDisplay",
+    "IterationMapDisplay",
+    "KnowledgeActionDisplay",
+    "LayerCurveDisplay",
+    "ModelDepthDisplay",
+    "PairedLayoutsDisplay",
+    "RetentionTableDisplay",
+    "RoleCurvesDisplay",
+    "SideTableDisplay",
+    "SuccessTableDisplay",
+    "final_positions",
+    "gallery",
+    "iteration_maps",
+    "layer_curve",
+    "model_depths",
+    "role_curves",
+    "save_figures",
+]

@@ -1,0 +1,69 @@
+"""What a figure is about, in one line: model, weights, suite, sizes, settings."""
+
+from dataclasses import dataclass
+from typing import Self
+
+from probe_kit.retention.rows import RetentionRow
+from probe_kit.train.reader import RunReader
+from probe_kit.train.results import ProbeResults
+
+RANDOM = "RANDOM WEIGHTS"
+SHOWN = 12
+"""Hex digits of a hash that a caption shows."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Where the numbers of a figure come from.
+
+    weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
+    n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
+    """
+
+    model: str
+    random_weights: bool
+    weights: str | None
+    suite: str
+    n: str
+    settings: str
+    probes: str | None = None
+    target: str = "correct"
+
+    @classmethod
+    def of_run(cls, run: RunReader) -> Self:
+        """Of a run's behaviour."""
+        n = f"n = {len(run.episodes)} episodes"
+        return cls(run.model, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
+
+    @classmethod
+    def of_results(cls, results: ProbeResults, view: str) -> Self:
+        """Of probes in one view."""
+        settings = results.settings
+        sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
+        n = f"n = {_span(sizes)} episodes per category"
+        return cls(
+            settings.model, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
+            results.key, settings.target,
+        )  # fmt: skip
+
+    @classmethod
+    def of_row(cls, row: RetentionRow) -> Self:
+        """Of a row of the retention table, usually a mean."""
+        n = f"n = {row.n_episodes} episodes"
+        return cls(
+            row.model, row.random_weights, row.weights_sha256, row.suite, n, row.run_settings, row.probe_settings
+        )
+
+    @property
+    def line(self) -> str:
+        """One line for a caption; random weights are named in capitals."""
+        parts = [self.model, RANDOM if self.random_weights else ""]
+        parts += [f"weights {self.weights[:SHOWN]}" if self.weights else "", self.suite, self.n]
+        parts += [f"settings {self.settings[:SHOWN]}", f"probes {self.probes}" if self.probes else ""]
+        parts += [f"target {self.target}" if self.target != "correct" else ""]
+        return " · ".join(filter(None, parts))
+
+
+def _span(numbers: list[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low}–{high}"

@@ -1,0 +1,167 @@
+"""Where the cube ended, over the tiles, seen from above."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, panels, spell
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_OUTCOMES = {
+    "correct": ("on the correct picture", GREEN, "o"),
+    "wrong": ("on the wrong picture", VERMILION, "X"),
+    "oob": ("on neither", "#595959", "."),
+}
+_MARGIN = 0.09  # metres of table around tiles and start
+_MANY = 300  # points, above which a vector figure holds them as a picture
+
+
+@dataclass
+class FinalPositionsDisplay:
+    """Final places of the cube in metres: x away from the robot, y to its left.
+
+    xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and
+    sizes, zone radius and the start of the cube, as stored with the run.
+    """
+
+    category: str | None
+    xy: NDArray[np.float64]
+    outcome: NDArray[np.str_]
+    never_moved: int
+    scene: Mapping[str, Any]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_run(cls, run: RunReader, category: str | None = None, scene: Mapping[str, Any] | None = None) -> Self:
+        """From the episodes of a run, all of them or those of one category.
+
+        scene: `SceneSpec.to_json()`; that of the run by default. Raises UsageError if the run has no scene or no
+        positions, or no such category.
+        """
+        episodes: pd.DataFrame = run.episodes
+        if category is not None:
+            episodes = episodes[episodes["category"] == category]
+        if episodes.empty:
+            raise UsageError(f"{run.location} has no episodes of category {category!r}")
+        scene = scene or getattr(run, "settings", {}).get("scene")
+        if scene is None or not {"cube_x", "cube_y"} <= set(episodes):
+            raise UsageError(
+                f"{run.location} stores no scene or no final positions (cube_x, cube_y); runs of `extract` do"
+            )
+        unmoved = episodes["never_moved"].astype(bool).sum() if "never_moved" in episodes else 0
+        return cls(
+            category=category,
+            xy=episodes[["cube_x", "cube_y"]].to_numpy(dtype=float),
+            outcome=episodes["outcome"].to_numpy(dtype=str),
+            never_moved=int(unmoved),
+            scene=scene,
+            certificate=Certificate.of_run(run),
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Episodes by outcome."""
+        return {name: int((self.outcome == name).sum()) for name in _OUTCOMES}
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 4.6, 4.4)
+        low, high = _window(self.scene)
+        _draw_table(axes, self.scene)
+        inside = ((self.xy >= low) & (self.xy <= high)).all(axis=1)
+        for name, (label, colour, marker) in _OUTCOMES.items():
+            chosen = (self.outcome == name) & inside
+            axes.scatter(
+                -self.xy[chosen, 1], self.xy[chosen, 0], c=colour, marker=marker, label=label, s=18, alpha=0.65,
+                linewidths=0, zorder=3, rasterized=bool(chosen.sum() > _MANY),
+            )  # fmt: skip
+        _set_window(axes, low, high, int((~inside).sum()))
+        title = spell(self.category or "all categories")
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.set_xlabel(self._summary(), fontsize=7.5, color="0.3", labelpad=3)
+        if figure is not None:
+            _draw_legend(figure, axes)
+        caption(figure, self.certificate.line)
+        self.ax_ = axes
+        return self
+
+    def _summary(self) -> str:
+        counts = self.counts
+        unmoved = f" ({self.never_moved} unmoved)" if self.never_moved else ""
+        return f"{counts['correct']} right · {counts['wrong']} wrong · {counts['oob']} out{unmoved}"
+
+
+def final_positions(run: RunReader) -> "Figure":
+    """Final places of the cube, a panel per category. Raises UsageError if the run stores none."""
+    categories = [str(name) for name in run.episodes["category"].unique()]
+    displays = [FinalPositionsDisplay.from_run(run, name) for name in categories]
+    figure, grid = panels(len(displays), width=3.1, height=2.35)
+    for display, axes in zip(displays, grid, strict=True):
+        display.plot(axes)
+    caption(figure, displays[0].certificate.line)
+    _draw_legend(figure, grid[0])
+    return figure
+
+
+def _window(scene: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (x, y) of what is shown."""
+    reach = max(scene["epsilon"], scene["tile_side"] * 0.75)
+    places = np.array([scene["tile_left"], scene["tile_right"], scene["cube_xy"]], float)
+    margin = np.array([[reach], [reach], [_MARGIN]])
+    return (places - margin).min(axis=0), (places + margin).max(axis=0)
+
+
+def _draw_table(axes: "Axes", scene: Mapping[str, Any]) -> None:
+    from matplotlib.patches import Circle, Rectangle
+
+    turn = np.degrees(scene["tile_yaw"])
+    for side in ("left", "right"):
+        x, y = scene[f"tile_{side}"]
+        half = scene["tile_side"] / 2
+        corner = (-y - half, x - half)
+        tile = Rectangle(
+            corner, 2 * half, 2 * half, angle=turn, rotation_point="center", fc="0.95", ec="0.7", lw=0.8
+        )
+        axes.add_patch(tile)
+        axes.add_patch(Circle((-y, x), scene["epsilon"], fill=False, ec="0.45", lw=0.8, ls="--"))
+    x, y = scene["cube_xy"]
+    half = scene["cube_side"] / 2
+    start = Rectangle(
+        (-y - half, x - half), 2 * half, 2 * half, angle=np.degrees(scene["cube_yaw"]), rotation_point="center",
+        fill=False, ec="black", lw=0.9,
+    )  # fmt: skip
+    axes.add_patch(start)
+    axes.text(-y, x - half - 0.008, "start", ha="center", va="top", fontsize=7)
+
+
+def _set_window(axes: "Axes", low: NDArray[np.float64], high: NDArray[np.float64], outside: int) -> None:
+    axes.set_xlim(-high[1], -low[1])
+    axes.set_ylim(low[0], high[0])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_color("0.8")
+    left, bottom = -high[1] + 0.012, low[0] + 0.012
+    axes.plot([left, left + 0.1], [bottom, bottom], color="0.25", lw=1.5)
+    axes.text(left + 0.05, bottom + 0.005, "10 cm", ha="center", va="bottom", fontsize=6.5, color="0.25")
+    if outside:
+        axes.text(-low[1] - 0.008, bottom, f"{outside} beyond the frame", ha="right", fontsize=6.5, color="0.25")
+
+
+def _draw_legend(figure: "Figure", panel: "Axes") -> None:
+    from matplotlib.lines import Line2D
+
+    zone = Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")
+    handles = [*panel.get_legend_handles_labels()[0], zone]
+    figure.legend(handles=handles, loc="outside upper left", ncols=4, fontsize=8, frameon=False)

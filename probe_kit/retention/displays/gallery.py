@@ -1,0 +1,211 @@
+"""All figures that fit a table of runs: what `probe-kit retention --figures` saves and the report shows."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import NoProbesError
+from probe_kit.hooks.sites import ACTION_STREAMS
+from probe_kit.retention.displays.final_positions import final_positions
+from probe_kit.retention.displays.heat_table import (
+    HeatTableDisplay,
+    RetentionTableDisplay,
+    SideTableDisplay,
+    SuccessTableDisplay,
+)
+from probe_kit.retention.displays.iteration_maps import iteration_maps
+from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
+from probe_kit.retention.displays.layer_curves import layer_curve
+from probe_kit.retention.displays.model_depth import model_depths
+from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
+from probe_kit.retention.displays.role_curves import role_curves
+from probe_kit.retention.table import RetentionTable
+from probe_kit.train.reader import RunReader
+from probe_kit.train.results import ProbeResults
+from probe_kit.train.store import load_results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_TableDisplay = type[SuccessTableDisplay] | type[SideTableDisplay] | type[RetentionTableDisplay]
+
+SUFFIXES = (".png", ".pdf")
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A figure that can be drawn.
+
+    name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
+    runs, None if it shows all of them. reading: how to read it, in plain language. is_table: its numbers are a
+    table that is printed as such elsewhere.
+    """
+
+    name: str
+    title: str
+    subject: str
+    reading: str
+    run: int | None
+    draw: "Callable[[], Figure]"
+    is_table: bool = False
+
+    @contextmanager
+    def drawn(self) -> "Iterator[Figure]":
+        """The figure, closed again afterwards, so that pyplot keeps none of many."""
+        from matplotlib import pyplot as plt
+
+        figure = self.draw()
+        try:
+            yield figure
+        finally:
+            plt.close(figure)
+
+
+def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
+    """Every figure that the runs and their newest probes allow. Nothing is drawn yet."""
+    results = [_results(run) for run in runs]
+    exhibits = _of_table(table, [one for one in results if one is not None])
+    for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
+        exhibits += _of_run(name, position, run)
+        exhibits += [] if probed is None else _of_probes(name, position, probed)
+    return exhibits
+
+
+def save_figures(exhibits: Sequence[Exhibit], folder: Path) -> Iterator[Path]:
+    """Draw exhibits into `folder` as PNG and PDF, one after the other; gives the path of every PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for exhibit in exhibits:
+        path = folder / f"{exhibit.name}{SUFFIXES[0]}"
+        with exhibit.drawn() as figure:
+            for suffix in SUFFIXES:
+                metadata = {"CreationDate": None} if suffix == ".pdf" else None
+                figure.savefig(path.with_suffix(suffix), metadata=metadata)
+        yield path
+
+
+def run_names(runs: Sequence[RunReader]) -> list[str]:
+    """Names of the runs; a name that comes again is numbered."""
+    names: list[str] = []
+    for run in runs:
+        name = run.location.name
+        count = sum(other == name or other.startswith(f"{name}-") for other in names)
+        names.append(f"{name}-{count + 1}" if name in names else name)
+    return names
+
+
+def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Exhibit]:
+    def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
+        return Exhibit(name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True)
+
+    exhibits = [
+        show(SuccessTableDisplay, "success", "Success rate", "behaviour"),
+        show(SideTableDisplay, "sides", "Success rate by side", "behaviour"),
+    ]
+    if any(row.prefix_accuracy is not None for row in table.rows):
+        exhibits.append(
+            Exhibit(
+                "knowledge-action", "Knowledge and action", "retention",
+                "Each point is one category: how well the answer can be read inside the model (across) and how "
+                "often the model acts on it (up). Points far below the line are knowledge that does not reach the "
+                "hand.",
+                None, lambda: _figure(KnowledgeActionDisplay.from_table(table)),
+            )
+        )  # fmt: skip
+    if any(row.retention is not None for row in table.rows):
+        exhibits.append(show(RetentionTableDisplay, "retention", "Retention", "retention"))
+    if len(results) > 1:
+        exhibits.append(
+            Exhibit(
+                "model-depths", "Models by depth", "probes",
+                "How far above chance the answer can be read, against depth as a fraction, so that models with "
+                "different numbers of layers can be compared.",
+                None, partial(model_depths, results),
+            )
+        )  # fmt: skip
+    return exhibits
+
+
+def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
+    exhibits = [
+        Exhibit(
+            f"{name}-paired-layouts", "The same question, pictures swapped", "behaviour",
+            "Every question is asked twice, with the two pictures exchanged. Knowing the answer means right both "
+            "times; always going to one side means right once. Bold p: more items are right twice than wrong "
+            "twice, beyond luck.",
+            position, lambda: _figure(PairedLayoutsDisplay.from_run(run)),
+        )
+    ]  # fmt: skip
+    if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
+        exhibits.append(
+            Exhibit(
+                f"{name}-final-positions", "Where the cube ended", "behaviour",
+                "The table from above, the robot below the picture. An episode counts as an answer if the middle "
+                "of the cube ends inside a dashed circle; “unmoved” means that the cube was never carried "
+                "anywhere.",
+                position, partial(final_positions, run),
+            )
+        )  # fmt: skip
+    return exhibits
+
+
+def _of_probes(name: str, position: int, results: ProbeResults) -> list[Exhibit]:
+    views = results.settings.views
+    exhibits = [
+        Exhibit(
+            f"{name}-layer-curves{_suffix(view, views)}", "Layer curves" + (f", view {view}" * (len(views) > 1)),
+            "probes",
+            "How often a linear probe names the side of the correct picture in episodes it has not seen, layer by "
+            "layer. Only filled markers are evidence: they beat the best layer of relabelled data. Open markers "
+            "within the grey band are what no knowledge looks like.",
+            position, partial(layer_curve, results, view),
+        )
+        for view in views
+    ]  # fmt: skip
+    scores = results.scores
+    exhibits += [
+        Exhibit(
+            f"{name}-iteration-maps{_suffix(view, views)}",
+            "Layer × iteration" + (f", view {view}" * (len(views) > 1)), "probes",
+            "The action is made in several iterations (flow-matching steps or action tokens). Dark cells: "
+            "the answer can be read at that layer and iteration. Dots mark what is above chance.",
+            position, partial(iteration_maps, results, view, stream),
+        )
+        for view in views
+        for stream in ACTION_STREAMS
+        if ((scores["view"] == view) & (scores["stream"] == stream) & scores["iteration"].notna()).any()
+    ]  # fmt: skip
+    for stream, rows in scores.groupby("stream", sort=False):
+        if rows["view"].nunique() > 1:
+            exhibits.append(
+                Exhibit(
+                    f"{name}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
+                    "The same probes on the mean of one kind of token at a time.",
+                    position, partial(role_curves, results, str(stream)),
+                )
+            )  # fmt: skip
+    return exhibits
+
+
+def _suffix(view: str, views: Sequence[str]) -> str:
+    """The first view needs no name in a file's name."""
+    return "" if view == views[0] else f"-{view.replace(':', '-')}"
+
+
+def _figure(display: "HeatTableDisplay | KnowledgeActionDisplay | PairedLayoutsDisplay") -> "Figure":
+    from matplotlib.figure import Figure
+
+    axes = display.plot().ax_
+    assert axes is not None
+    figure = axes.figure
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def _results(run: RunReader) -> ProbeResults | None:
+    try:
+        return load_results(run)
+    except NoProbesError:
+        return None

@@ -1,0 +1,181 @@
+"""Tables of numbers on heat colours, as the paper prints them: a model per row, a category per column."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from textwrap import fill
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.cells import model_name, once_per_category
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.style import axes_for, caption, spell
+from probe_kit.retention.latex import HEAT
+from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.table import RetentionTable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_CELL_WIDTH, _ROW_HEIGHT = 0.66, 0.36  # inches
+_NAME_WIDTH = 0.085  # inches per character of a model's name
+_EMPTY = "#F4F4F4"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Values side by side, None where there is none, and whether they are printed bold."""
+
+    values: tuple[float | None, ...]
+    bold: bool = False
+
+
+@dataclass
+class HeatTableDisplay:
+    """A table drawn as a figure; the numbers are `cells[row][column].values`.
+
+    rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
+    """
+
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    cells: tuple[tuple[Cell, ...], ...]
+    certificates: tuple[Certificate, ...]
+    parts: ClassVar[tuple[str, ...]] = ("",)
+    title: ClassVar[str] = ""
+    note: ClassVar[str] = ""
+    scale: ClassVar[float] = 100.0
+    digits: ClassVar[int] = 1
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
+        """One line per run and view, one column per category of any of them."""
+        if not rows:
+            raise UsageError(f"{cls.title}: the table has no rows to show")
+        lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
+        for row in rows:
+            lines.setdefault((row.group, row.run, row.view), {})[row.category] = row
+        columns = tuple(dict.fromkeys(row.category for row in rows))
+        columns = (*(name for name in columns if name != "mean"), *(["mean"] if "mean" in columns else []))
+        blank = Cell((None,) * len(cls.parts))
+        return cls(
+            rows=tuple(_line_name(line, rows) for line in lines.values()),
+            columns=columns,
+            cells=tuple(
+                tuple(cell(line[name]) if name in line else blank for name in columns) for line in lines.values()
+            ),
+            certificates=tuple(Certificate.of_row(list(line.values())[-1]) for line in lines.values()),
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with the key of colours and captions."""
+        width = _CELL_WIDTH * len(self.columns) + _NAME_WIDTH * max(map(len, self.rows)) + 0.3
+        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.6 + 0.13 * len(set(self.certificates))
+        axes, figure = axes_for(ax, max(6.2, width), height)
+        for number, line in enumerate(self.cells):
+            for column, cell in enumerate(line):
+                self._draw_cell(axes, column, number, cell)
+        self._draw_names(axes)
+        axes.set_title(self.title, fontsize=10, loc="left", pad=34)
+        if figure is not None:
+            self._draw_key(axes)
+        caption(figure, *(certificate.line for certificate in self.certificates))
+        self.ax_ = axes
+        return self
+
+    def _draw_cell(self, axes: "Axes", column: int, number: int, cell: Cell) -> None:
+        from matplotlib.patches import Rectangle
+
+        share = 1 / len(cell.values)
+        for part, value in enumerate(cell.values):
+            left = column + part * share
+            fill_with = _EMPTY if value is None else heat_colour(value)
+            axes.add_patch(Rectangle((left, number), share, 1, fc=fill_with, ec="white", lw=0.6))
+            text = "–" if value is None else f"{self.scale * value:.{self.digits}f}"
+            weight = "bold" if cell.bold else "normal"
+            axes.text(left + share / 2, number + 0.52, text, ha="center", va="center", fontsize=8, weight=weight)
+        axes.add_patch(Rectangle((column, number), 1, 1, fill=False, ec="white", lw=2.2))
+
+    def _draw_names(self, axes: "Axes") -> None:
+        axes.set_xlim(0, len(self.columns))
+        axes.set_ylim(len(self.rows), 0)
+        names = [fill(spell(name), 9, break_long_words=False) for name in self.columns]
+        axes.set_xticks([column + 0.5 for column in range(len(names))], names, fontsize=8)
+        axes.set_yticks([number + 0.5 for number in range(len(self.rows))], list(self.rows), fontsize=8)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        if self.columns[-1] == "mean" and len(self.columns) > 1:
+            axes.axvline(len(self.columns) - 1, color="0.35", lw=0.9)
+
+    def _draw_key(self, axes: "Axes") -> None:
+        from matplotlib.patches import Patch
+
+        bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
+        labels = [f"{self.scale * bound:g}–{self.scale * (bound + 0.2):g}" for bound in bounds]
+        labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
+        patches = [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
+        axes.legend(
+            handles=patches, loc="upper left", bbox_to_anchor=(0, -0.04 / len(self.rows)), ncols=5, fontsize=7,
+            frameon=False, handlelength=1.2, columnspacing=1.2, borderaxespad=0.6, title=self.note,
+            title_fontsize=7, alignment="left",
+        )  # fmt: skip
+
+
+class SuccessTableDisplay(HeatTableDisplay):
+    """Success rate in percent by model and category; bold above 0.5 + Δ."""
+
+    title = "Success rate (%)"
+    note = "bold: above 50 % + Δ, more than guessing explains"
+
+    @classmethod
+    def from_table(cls, table: RetentionTable) -> Self:
+        """From the retention table of any runs. Raises UsageError if it is empty."""
+        return cls._of(
+            once_per_category(table.all_rows),
+            lambda row: Cell((row.sr,), row.delta is not None and row.sr > 0.5 + row.delta),
+        )
+
+
+class SideTableDisplay(HeatTableDisplay):
+    """Success rate in percent where the correct picture lay left | right (the paper's L/R table)."""
+
+    title = "Success rate (%) where the correct picture is left | right"
+    digits = 0
+    note = "equal halves: no side is favoured; one green, one red: the policy goes to a side, not to an answer"
+    parts = ("left", "right")
+
+    @classmethod
+    def from_table(cls, table: RetentionTable) -> Self:
+        """From the retention table of any runs. Raises UsageError if it is empty."""
+        return cls._of(once_per_category(table.all_rows), lambda row: Cell((row.sr_left, row.sr_right)))
+
+
+class RetentionTableDisplay(HeatTableDisplay):
+    """Plain and debiased retention by model and category; empty where the backbone carries no signal."""
+
+    title = "Retention: published ratio | debiased"
+    note = "dash: no backbone signal, so the ratio has no meaning"
+    parts = ("published", "debiased")
+    scale, digits = 1.0, 2
+
+    @classmethod
+    def from_table(cls, table: RetentionTable) -> Self:
+        """From a retention table with probes. Raises UsageError if no run was probed."""
+
+        def cell(row: RetentionRow) -> Cell:
+            values = (row.retention, row.retention_debiased) if row.retention_defined else (None, None)
+            return Cell(values)
+
+        return cls._of([row for row in table.all_rows if row.view is not None], cell)
+
+
+def heat_colour(value: float) -> str:
+    """The colour `#RRGGBB` of a share or ratio, from lost (red) to kept (green)."""
+    return f"#{next(rgb for bound, _, rgb in HEAT if value < bound)}"
+
+
+def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    row = next(iter(line.values()))
+    views = {other.view for other in rows if other.view is not None}
+    return f"{model_name(row)}, {row.view}" if len(views) > 1 and row.view else model_name(row)

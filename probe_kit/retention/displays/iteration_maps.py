@@ -1,0 +1,152 @@
+"""Layer × iteration maps: where and when in the action expert the answer can be read."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.sites import ACTION_STREAMS
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.layer_curves import DEPTH
+from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.style import OTHER_STREAM, STREAMS, axes_for, caption, panels, spell
+from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap, Normalize
+    from matplotlib.figure import Figure
+
+_LEAST_SPAN = 0.2  # so that noise around chance does not look like signal
+_LEGEND = f"dot: above chance, family-wise p < {SIGNIFICANCE} · frame: most accurate site · grey: below chance"
+
+
+@dataclass
+class IterationMapDisplay:
+    """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
+
+    accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream.
+    peak: iteration and layer of the most accurate site. depth: (L,) of each layer.
+    """
+
+    category: str
+    view: str
+    stream: str
+    chance: float
+    depth: NDArray[np.float64]
+    accuracy: NDArray[np.float64]
+    significant: NDArray[np.bool_]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_results(
+        cls, results: ProbeResults, category: str, view: str | None = None, stream: str = "expert"
+    ) -> Self:
+        """From stored probes; view: the first probed one by default.
+
+        Raises UnknownSiteError for a view that was not probed or a stream without iterations,
+        UnknownCategoryError for a category that was not probed.
+        """
+        view = known_view(results, view)
+        curve = curve_of(results, category, view)
+        scores = scores_of(results, category, view)
+        scores = scores[(scores["stream"] == stream) & scores["iteration"].notna()]
+        if scores.empty:
+            raise UnknownSiteError(f"stream {stream!r} in view {view!r} has no iterations; see the layer curve")
+        grid = scores.pivot(index="iteration", columns="layer", values=["accuracy", "p_fwe"])
+        return cls(
+            category=category,
+            view=view,
+            stream=stream,
+            chance=curve.chance,
+            depth=np.sort(scores["depth"].unique()),
+            accuracy=grid["accuracy"].to_numpy(dtype=float),
+            significant=grid["p_fwe"].to_numpy(dtype=float) < SIGNIFICANCE,
+            certificate=Certificate.of_results(results, view),
+        )
+
+    @property
+    def peak(self) -> tuple[int, int]:
+        """Iteration and layer of the most accurate site, the first one on ties."""
+        iteration, layer = np.unravel_index(int(self.accuracy.argmax()), self.accuracy.shape)
+        return int(iteration), int(layer)
+
+    def plot(self, ax: "Axes | None" = None, top: float | None = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with colour bar and caption.
+
+        top: share at the dark end of the scale; the map's own maximum by default.
+        """
+        axes, figure = axes_for(ax, 5.2, 3.6)
+        drawn = _draw(axes, self, top or _top([self]))
+        if figure is not None:
+            axes.set_ylabel("iteration", fontsize=9)
+            _scale(figure, [axes], drawn, self)
+            caption(figure, f"{self.certificate.line} · {_LEGEND}", label=DEPTH)
+        self.ax_ = axes
+        return self
+
+
+def iteration_maps(results: ProbeResults, view: str | None = None, stream: str = "expert") -> "Figure":
+    """A layer × iteration map of every category on one scale of colours.
+
+    Raises UnknownSiteError for a view that was not probed or a stream without iterations.
+    """
+    categories = results.settings.categories
+    displays = [IterationMapDisplay.from_results(results, name, view, stream) for name in categories]
+    figure, grid = panels(len(displays), width=2.7, height=2.1)
+    for display, axes in zip(displays, grid, strict=True):
+        drawn = _draw(axes, display, _top(displays))
+    figure.supylabel("iteration", fontsize=9)
+    _scale(figure, grid, drawn, displays[0])
+    caption(figure, f"{displays[0].certificate.line} · {_LEGEND}", label=DEPTH)
+    return figure
+
+
+def _top(displays: list[IterationMapDisplay]) -> float:
+    return max(max(float(d.accuracy.max()), d.chance + _LEAST_SPAN) for d in displays)
+
+
+def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMappable":
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import Rectangle
+
+    norm = Normalize(100 * display.chance, 100 * top)
+    colours = _colours(display.stream)
+    image = axes.imshow(100 * display.accuracy, cmap=colours, norm=norm, aspect="auto", origin="lower")
+    iterations, layers = display.accuracy.shape
+    for iteration, layer in np.argwhere(display.significant):
+        ink = _ink(100 * display.accuracy[iteration, layer], norm)
+        axes.plot(layer, iteration, marker="o", ms=2.2, color=ink, mew=0)
+    iteration, layer = display.peak
+    axes.add_patch(Rectangle((layer - 0.5, iteration - 0.5), 1, 1, fill=False, ec="black", lw=1.4, zorder=3))
+    middle = (layers - 1) / 2
+    axes.set_xticks([0, middle, layers - 1], ["0", "0.5", "1"])
+    axes.set_yticks([0, iterations - 1] if iterations > 1 else [0])
+    axes.tick_params(labelsize=8)
+    axes.set_title(spell(display.category), fontsize=10, loc="left")
+    return image
+
+
+def _colours(stream: str) -> "Colormap":
+    """White at chance, through the stream's colour, to nearly black: lightness alone orders the cells."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colour = STREAMS.get(stream, OTHER_STREAM).colour
+    dark = "#331400" if stream in ACTION_STREAMS else "#001B2E"
+    return LinearSegmentedColormap.from_list(stream, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
+
+
+def _ink(value: float, norm: "Normalize") -> str:
+    return "white" if norm(value) > 0.45 else "black"
+
+
+def _scale(figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable", display: IterationMapDisplay) -> None:
+    bar = figure.colorbar(drawn, ax=grid, extend="min", aspect=30, shrink=0.9, pad=0.01)
+    bar.set_label(f"held-out accuracy (%), view {display.view}", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    bar.outline.set_visible(False)

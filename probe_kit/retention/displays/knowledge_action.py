@@ -1,0 +1,156 @@
+"""The knowledge–action gap: what a probe reads inside the model against what the model does."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import floor
+from typing import TYPE_CHECKING, Literal, Self
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.cells import model_name
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.labels import place_labels
+from probe_kit.retention.displays.style import axes_for, caption, darker, plain, series, spell
+from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.table import RetentionTable
+from probe_kit.train.controls import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Limits = tuple[float | None, float | None] | None
+
+
+@dataclass(frozen=True)
+class GapPoint:
+    """One category of one run: probe accuracy and success rate, as shares, with 95 % intervals if known."""
+
+    model: str
+    category: str
+    accuracy: float
+    accuracy_ci: Limits
+    sr: float
+    sr_ci: Limits
+    significant: bool
+
+
+@dataclass
+class KnowledgeActionDisplay:
+    """Success rate against the best probe of a stream, a point per category and model.
+
+    On the diagonal the policy acts on what can be read; below it, it knows more than it does.
+    """
+
+    stream: str
+    points: tuple[GapPoint, ...]
+    certificates: tuple[Certificate, ...]
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_table(
+        cls, table: RetentionTable, stream: Literal["backbone", "expert"] = "backbone", view: str | None = None
+    ) -> Self:
+        """From a retention table; view: the first one of each run by default.
+
+        Raises UsageError if no run was probed in that stream and view.
+        """
+        shown: dict[tuple[str | None, str], str | None] = {}
+        points = []
+        for row in table.rows:
+            if row.view is None or shown.setdefault((row.group, row.run), view or row.view) != row.view:
+                continue
+            if (point := _point(row, stream)) is not None:
+                points.append(point)
+        if not points:
+            raise UsageError(f"no run has probes of stream {stream!r}" + (f" in view {view!r}" if view else ""))
+        means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
+        return cls(stream, tuple(points), tuple(Certificate.of_row(mean) for mean in means))
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and captions."""
+        axes, figure = axes_for(ax, 6.2, 6.4)
+        _draw_ground(axes, _lower_end(self.points))
+        models = list(dict.fromkeys(point.model for point in self.points))
+        for position, model in enumerate(models):
+            _draw_model(axes, [point for point in self.points if point.model == model], position, model)
+        plain(axes)
+        axes.set_xlabel(f"best held-out probe in the {self.stream} (%)", fontsize=9)
+        axes.set_ylabel("success rate (%)", fontsize=9)
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=8, frameon=False, borderaxespad=0.2)
+        caption(figure, *(certificate.line for certificate in self.certificates))
+        if figure is not None:
+            figure.draw_without_rendering()  # labels need the final places of points
+        words = [spell(point.category) for point in self.points]
+        inks = [darker(series(models.index(point.model)).colour) for point in self.points]
+        place_labels(axes, [(100 * p.accuracy, 100 * p.sr) for p in self.points], words, inks)
+        self.ax_ = axes
+        return self
+
+
+def _point(row: RetentionRow, stream: str) -> GapPoint | None:
+    prefix = stream == "backbone"
+    accuracy = row.prefix_accuracy if prefix else row.action_accuracy
+    if accuracy is None:
+        return None
+    p_fwe = row.prefix_p_fwe if prefix else row.action_p_fwe
+    return GapPoint(
+        model=model_name(row),
+        category=row.category,
+        accuracy=accuracy,
+        accuracy_ci=row.prefix_ci if prefix else row.action_ci,
+        sr=row.sr,
+        sr_ci=row.sr_ci,
+        significant=p_fwe is not None and p_fwe < SIGNIFICANCE,
+    )
+
+
+def _lower_end(points: Sequence[GapPoint]) -> float:
+    """Where both axes begin, in percent: a ten below the lowest value, so that points have room."""
+    lowest = min(min(point.accuracy, point.sr) for point in points)
+    return max(0.0, min(40.0, 10 * floor(10 * lowest - 0.5)))
+
+
+def _draw_ground(axes: "Axes", low: float) -> None:
+    axes.fill_between([0, 100], [0, 100], [0, 0], color="0.955", lw=0, zorder=0)
+    axes.plot([0, 100], [0, 100], color="0.45", lw=1, zorder=1)
+    for draw in (axes.axvline, axes.axhline):
+        draw(50, color="0.45", lw=0.8, ls="--", zorder=1)
+    axes.text(
+        99,
+        low + 0.02 * (100 - low),
+        "knows more than it does",
+        ha="right",
+        fontsize=8,
+        style="italic",
+        color="0.35",
+    )
+    axes.text(low + 0.5, 50.5, "guessing", fontsize=7, color="0.35")
+    axes.text(50.5, 100, "chance", fontsize=7, color="0.35", rotation=90, va="top")
+    margin = 0.02 * (100 - low)
+    axes.set_xlim(low - margin, 100 + margin)
+    axes.set_ylim(low - margin, 100 + margin)
+    axes.set_aspect("equal")
+
+
+def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: str) -> None:
+    line = series(position)
+    for point in points:
+        across, up = _arms(point.accuracy, point.accuracy_ci), _arms(point.sr, point.sr_ci)
+        axes.errorbar(
+            100 * point.accuracy, 100 * point.sr, xerr=across, yerr=up, fmt="none", ecolor=line.colour,
+            elinewidth=0.7, alpha=0.28, zorder=2,
+        )  # fmt: skip
+    for filled in (True, False):
+        chosen = [point for point in points if point.significant == filled]
+        label = f"{model}: {'probe above chance' if filled else 'probe not above chance'}"
+        if chosen:
+            axes.plot(
+                [100 * point.accuracy for point in chosen], [100 * point.sr for point in chosen], ls="none",
+                marker=line.marker, ms=6, color=line.colour, mfc=line.colour if filled else "white", label=label,
+                zorder=3,
+            )  # fmt: skip
+
+
+def _arms(value: float, limits: Limits) -> list[list[float]] | None:
+    if limits is None or limits[0] is None or limits[1] is None:
+        return None
+    return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]

@@ -1,0 +1,83 @@
+"""Paired layouts: how many items are right in both, one or none of their two layouts."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, plain, spell
+from probe_kit.retention.success import PairedItems, paired_items
+from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Name, colour, hatch: told apart without colour too.
+_PARTS = (
+    ("right in both layouts", GREEN, ""),
+    ("right in one", SKY, "..."),
+    ("wrong picture in both", VERMILION, "///"),
+    ("none right, otherwise", "#D9D9D9", ""),
+)
+
+
+@dataclass
+class PairedLayoutsDisplay:
+    """Items by outcome of their two layouts, per category.
+
+    Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its
+    strength. The p beside a bar is the exact test of right twice against wrong twice.
+    """
+
+    items: dict[str, PairedItems]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_run(cls, run: RunReader) -> Self:
+        """From the episodes of a run; items that ran in one layout are left out."""
+        by_category = run.episodes.groupby("category", sort=False)
+        items = {str(category): paired_items(episodes) for category, episodes in by_category}
+        return cls(items, Certificate.of_run(run))
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 6.2, 0.33 * len(self.items) + 1.35)
+        for row, paired in enumerate(self.items.values()):
+            _draw_bar(axes, row, paired)
+        axes.set_yticks(range(len(self.items)), [spell(name) for name in self.items])
+        axes.set_ylim(len(self.items) - 0.4, -0.6)
+        axes.set_xlim(0, 100)
+        axes.set_xlabel("items (%)", fontsize=9)
+        plain(axes)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        if figure is not None:
+            handles, labels = axes.get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper left", ncols=4, fontsize=7.5, frameon=False)
+        caption(figure, self.certificate.line)
+        self.ax_ = axes
+        return self
+
+
+def _draw_bar(axes: "Axes", row: int, paired: PairedItems) -> None:
+    counts = (paired.both, paired.one, paired.both_wrong, paired.none - paired.both_wrong)
+    total = sum(counts)
+    left = 0.0
+    for (label, colour, hatch), count in zip(_PARTS, counts, strict=True):
+        width = 100 * count / max(1, total)
+        axes.barh(
+            row, width, left=left, height=0.72, color=colour, hatch=hatch, edgecolor="white", lw=0.8,
+            label=label if row == 0 else None,
+        )  # fmt: skip
+        if width >= 5:
+            box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85} if hatch else None
+            ink = "white" if colour == GREEN else "black"
+            axes.text(left + width / 2, row, str(count), ha="center", va="center", fontsize=8, color=ink, bbox=box)
+        left += width
+    weight = "bold" if paired.p < SIGNIFICANCE else "normal"
+    axes.text(101, row, f"p {_p(paired.p)}  n {total}", va="center", fontsize=7.5, weight=weight)
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"= {value:.3f}"

@@ -1,0 +1,99 @@
+"""Role-resolved curves: whose tokens carry the answer, by depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+from probe_kit.errors import UnknownSiteError
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.layer_curves import DEPTH, StreamCurve, draw_curve, filled_marker
+from probe_kit.retention.displays.selection import curve_of, scores_of
+from probe_kit.retention.displays.style import STREAM_NAMES, axes_for, caption, panels, plain, series, spell
+from probe_kit.train.results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass
+class RoleCurvesDisplay:
+    """Held-out accuracy against depth, one line per view of one stream, for one category.
+
+    curves: by view, such as `mean:language`; of iterative streams, the best iteration at each depth.
+    """
+
+    category: str
+    stream: str
+    chance: float
+    curves: dict[str, StreamCurve]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_results(
+        cls, results: ProbeResults, category: str, stream: str = "backbone", views: Sequence[str] | None = None
+    ) -> Self:
+        """From stored probes; views: all probed ones of the stream by default.
+
+        Raises UnknownSiteError if none of them was probed there, UnknownCategoryError for a category.
+        """
+        asked = tuple(views or results.settings.views)
+        curve_of(results, category, results.settings.views[0])
+        found = {}
+        for view in asked:
+            scores = scores_of(results, category, view)
+            rows = scores[scores["stream"] == stream]
+            if not rows.empty:
+                found[view] = StreamCurve.of(rows)
+        if not found:
+            raise UnknownSiteError(f"none of the views {', '.join(asked)} was probed in stream {stream!r}")
+        shown = next(iter(found))
+        return cls(
+            category=category,
+            stream=stream,
+            chance=curve_of(results, category, shown).chance,
+            curves=found,
+            certificate=Certificate.of_results(results, shown),
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 6.2, 3.9)
+        axes.axhline(100 * self.chance, color="0.45", lw=1, ls=(0, (1, 1)), label="chance")
+        spread = 0.008
+        for position, (view, curve) in enumerate(self.curves.items()):
+            sidestep = spread * (position - (len(self.curves) - 1) / 2)
+            draw_curve(axes, curve, series(position), view, sidestep)
+        plain(axes)
+        axes.set_xlim(-0.04, 1.04)
+        axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "0.25", "0.5", "0.75", "1"])
+        axes.set_title(spell(self.category), fontsize=10, loc="left")
+        if figure is not None:
+            axes.set_ylabel(_label(self.stream), fontsize=9)
+            _draw_legend(figure, axes)
+        caption(figure, self.certificate.line, label=DEPTH)
+        self.ax_ = axes
+        return self
+
+
+def role_curves(results: ProbeResults, stream: str = "backbone", views: Sequence[str] | None = None) -> "Figure":
+    """Curves of all probed views of one stream, a panel per category. Raises UnknownSiteError without any."""
+    categories = results.settings.categories
+    displays = [RoleCurvesDisplay.from_results(results, name, stream, views) for name in categories]
+    figure, grid = panels(len(displays))
+    for display, axes in zip(displays, grid, strict=True):
+        display.plot(axes)
+    figure.supylabel(_label(stream), fontsize=9)
+    caption(figure, displays[0].certificate.line, label=DEPTH)
+    _draw_legend(figure, grid[0])
+    return figure
+
+
+def _label(stream: str) -> str:
+    return f"held-out accuracy (%), {STREAM_NAMES.get(stream, stream)}"
+
+
+def _draw_legend(figure: "Figure", panel: "Axes") -> None:
+    handles = [*panel.get_legend_handles_labels()[0], filled_marker()]
+    figure.legend(handles=handles, loc="outside upper left", ncols=3, fontsize=8, frameon=False)

@@ -1,0 +1,78 @@
+"""What every number of the report means, in words that need no paper beside them."""
+
+from types import MappingProxyType
+
+GLOSSARY = MappingProxyType(
+    {
+        "SR": (
+            "Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 "
+            "% interval, whole questions resampled. Two pictures: guessing gives 50 %."
+        ),
+        "Δ": (
+            "How far from 50 % guessing alone may lead with this many episodes. Only a success rate above 50 % "
+            "+ Δ is evidence of knowledge."
+        ),
+        "wrong": "Share of episodes that ended on the other picture.",
+        "outside": "Share of episodes that ended on neither picture.",
+        "never moved": (
+            "Share of episodes, part of outside, in which the cube was never carried away: a failed grasp "
+            "rather than a wrong answer."
+        ),
+        "original": "Success rate in the layout as drawn.",
+        "swapped": "Success rate with the two pictures exchanged.",
+        "left": "Success rate where the correct picture lay on the left.",
+        "right": "Success rate where it lay on the right. Left and right far apart: the policy goes to a side.",
+        "goes left": (
+            "Among episodes that reached a picture, the share that ended on the left one. 50 %: no habit."
+        ),
+        "right twice": (
+            "Questions answered correctly in both layouts, of those that ran in both. A habit of going to one "
+            "side cannot produce these."
+        ),
+        "p (twice)": "Probability that luck alone gives so many questions right twice rather than wrong twice.",
+        "reading": (
+            "Knowledge: above 50 % + Δ. Not reliable: within 50 % ± Δ. Failure: below; the policy misses both "
+            "pictures or prefers the wrong one."
+        ),
+        "normalised score": "Mean success rate on a scale where guessing is 0 and perfection 100.",
+        "n": "Episodes, and in brackets questions; each question is asked in two layouts.",
+        "probe": (
+            "A logistic regression that is shown activations of one layer and must name the side of the correct "
+            "picture, in episodes and questions it was not fitted on."
+        ),
+        "backbone": "Best held-out accuracy of a probe in the vision-language backbone, over its layers.",
+        "expert": (
+            "Best held-out accuracy of a probe in the part that makes actions, over layers and iterations."
+        ),
+        "chance": "Accuracy of always naming the more frequent side.",
+        "depth": (
+            "Layer as a fraction: 0 enters the first block, 1 leaves the last. After @: the iteration, a flow- "
+            "matching step or an action token."
+        ),
+        "p": (
+            "Probability that the best layer of a stream looks this good when the answers are relabelled at "
+            "random. It allows for having looked at all layers (family-wise)."
+        ),
+        "retention": (
+            "(expert − chance) / (backbone − chance): the share of what can be read in the backbone that can "
+            "still be read in the expert. Biased upwards when signals are weak, because both are maxima."
+        ),
+        "debiased": (
+            "The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
+            "interval; “unbounded” means that the backbone's signal is too weak for any ratio."
+        ),
+        "gap": "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
+        "groups": "Independent groups of questions; questions that share a picture count once.",
+        "n/a": "The backbone itself is not above chance, so there is nothing that could be retained.",
+        "selectivity": "Accuracy above that of the same probe on random labels, for backbone / expert.",
+        "position, instruction, pixels": (
+            "The same probe on the layout, the words, or the two pictures alone. Red: the suite gives the "
+            "answer away without a model."
+        ),
+        "twin": (
+            "The same probes on another run of the same episodes, usually with untrained weights, subtracted."
+        ),
+        "random weights": "Nobody trained this model. It shows what knowing nothing looks like.",
+    }
+)
+"""Term to meaning; the headings of the tables show these too."""

@@ -1,0 +1,92 @@
+"use strict";
+(() => {
+  // -- tables: a click on a heading sorts, a second one turns the order round; empty cells stay last ------------
+  const number = (text) => (text === "" || Number.isNaN(Number(text)) ? null : Number(text));
+
+  function compare(a, b, sign) {
+    if (a === undefined || b === undefined) return (a === undefined) - (b === undefined);
+    const [x, y] = [number(a), number(b)];
+    if (x !== null && y !== null) return sign * (x - y);
+    return sign * a.localeCompare(b, undefined, { numeric: true });
+  }
+
+  function sort(table, column) {
+    const heading = table.tHead.rows[0].cells[column];
+    const up = heading.getAttribute("aria-sort") !== "ascending";
+    for (const other of table.tHead.rows[0].cells) other.removeAttribute("aria-sort");
+    heading.setAttribute("aria-sort", up ? "ascending" : "descending");
+    const body = table.tBodies[0];
+    const key = (row) => row.cells[column].dataset.sort;
+    body.append(...[...body.rows].sort((a, b) => compare(key(a), key(b), up ? 1 : -1)));
+  }
+
+  for (const table of document.querySelectorAll("table.sortable")) {
+    [...table.tHead.rows[0].cells].forEach((cell, column) =>
+      cell.firstElementChild.addEventListener("click", () => sort(table, column)));
+  }
+
+  // -- episodes: a page of cards at a time, made when they are wanted --------------------------------------------
+  const PAGE = 48;
+  const OUTCOMES = { correct: "✓ correct", wrong: "✗ wrong picture", oob: "○ on neither" };
+  const cards = JSON.parse(document.getElementById("cards").textContent);
+  const form = document.getElementById("filters");
+  const grid = document.getElementById("grid");
+  const more = document.getElementById("more");
+  let matching = [];
+
+  function element(name, properties, ...children) {
+    const made = Object.assign(document.createElement(name), properties);
+    made.append(...children);
+    return made;
+  }
+
+  function draw(card) {
+    const frames = element("div", { className: "frames" });
+    if (card.picture) {
+      const alt = `first and last frame: ${card.instruction}`;
+      frames.append(
+        element("img", { alt, src: `data:image/webp;base64,${card.picture}`, loading: "lazy", decoding: "async" }),
+        element("i", { textContent: "first" }), element("i", { textContent: "last" }));
+    }
+    const outcome = OUTCOMES[card.outcome] + (card.unmoved ? ", cube never moved" : "");
+    const answer = card.answer ? `answer: ${card.answer}, ${card.side}` : `answer: ${card.side}`;
+    const where = [card.category.replaceAll("_", " "), card.layout].join(" · ");
+    const text = element("div", { className: "text" },
+      element("b", { textContent: card.instruction || card.id }),
+      element("span", { className: "outcome", textContent: outcome }),
+      element("br", {}),
+      element("small", { textContent: `${answer} · ${where}`, title: `${card.run} ${card.id}` }));
+    const made = element("article", { className: `card ${card.outcome}` }, ...(card.picture ? [frames] : []), text);
+    made.dataset.id = card.id;
+    return made;
+  }
+
+  function showMore() {
+    const shown = grid.childElementCount;
+    grid.append(...matching.slice(shown, shown + PAGE).map(draw));
+    more.hidden = grid.childElementCount === matching.length;
+    document.getElementById("count").textContent =
+      `${grid.childElementCount} shown, ${matching.length} match, ${cards.length} in all`;
+  }
+
+  function filter() {
+    const words = form.elements.words.value.trim().toLowerCase();
+    const wanted = [...form.querySelectorAll("select")].filter((select) => select.value);
+    matching = cards.filter((card) =>
+      wanted.every((select) => card[select.name] === select.value) &&
+      (!words || card.instruction.toLowerCase().includes(words)));
+    grid.replaceChildren();
+    showMore();
+  }
+
+  for (const select of form.querySelectorAll("select")) {
+    for (const value of new Set(cards.map((card) => card[select.name]))) {
+      const label = select.name === "outcome" ? OUTCOMES[value] : value.replaceAll("_", " ");
+      select.append(element("option", { value, textContent: label }));
+    }
+  }
+  form.addEventListener("input", filter);
+  form.addEventListener("submit", (event) => event.preventDefault());
+  more.addEventListener("click", showMore);
+  filter();
+})();

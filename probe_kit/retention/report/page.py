@@ -1,0 +1,127 @@
+"""Putting the page together: one HTML file with everything in it."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from probe_kit import __version__
+from probe_kit.errors import UsageError
+from probe_kit.retention.displays.gallery import Exhibit, gallery, run_names
+from probe_kit.retention.report.episodes import PICTURES, episode_grid
+from probe_kit.retention.report.glossary import GLOSSARY
+from probe_kit.retention.report.pictures import data_uri
+from probe_kit.retention.report.provenance import citation, provenance
+from probe_kit.retention.report.readings import Summary, summarise
+from probe_kit.retention.report.tables import (
+    behaviour_table,
+    control_table,
+    difference_tables,
+    more_behaviour_table,
+    retention_table,
+)
+from probe_kit.retention.table import RetentionTable, retention
+from probe_kit.train.reader import RunReader
+
+_HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in the page. run: its name, empty for a figure of all runs."""
+
+    title: str
+    run: str
+    reading: str
+    source: str
+    extra: bool
+
+
+def write_report(
+    runs: Sequence[RunReader],
+    path: Path | str,
+    table: RetentionTable | None = None,
+    *,
+    pictures: int = PICTURES,
+) -> Path:
+    """Write the report of `runs` as one HTML file, whole or not at all, and return its path.
+
+    table: their retention table, made with its defaults if it is not given. pictures: at most so many episodes
+    show their frames. Raises UsageError without runs.
+    """
+    path = Path(path)
+    page = report_html(runs, table, pictures=pictures)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as draft:
+        draft.write(page)
+    aside = Path(draft.name)
+    aside.chmod(0o644)
+    return aside.replace(path)
+
+
+def report_html(
+    runs: Sequence[RunReader], table: RetentionTable | None = None, *, pictures: int = PICTURES
+) -> str:
+    """The page as text; the same runs and probes give the same text. See `write_report`."""
+    if not runs:
+        raise UsageError("a report needs at least one run")
+    table = table or retention(runs)
+    names = run_names(runs)
+    exhibits = [exhibit for exhibit in gallery(runs, table) if not exhibit.is_table]
+    sentence, bibtex = citation(runs)
+    rows = table.all_rows
+    return _render(
+        title=" and ".join(dict.fromkeys(run.model for run in runs)),
+        suites=list(dict.fromkeys(run.suite for run in runs)),
+        version=__version__,
+        random_weights=any(run.random_weights for run in runs),
+        summaries=_summaries(table),
+        behaviour=behaviour_table(rows),
+        more_behaviour=more_behaviour_table(rows),
+        retention=retention_table(rows),
+        controls=control_table(rows),
+        differences=difference_tables(table.differences),
+        pictures={
+            subject: _pictures(exhibits, subject, names) for subject in ("behaviour", "probes", "retention")
+        },
+        grid=episode_grid(runs, names, pictures),
+        several=len(runs) > 1,
+        provenance=[provenance(name, run) for name, run in zip(names, runs, strict=True)],
+        glossary=GLOSSARY,
+        sentence=sentence,
+        bibtex=bibtex,
+    )
+
+
+def _render(**content: Any) -> str:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    assets = {name: Markup((_HERE / f"page.{name}").read_text()) for name in ("css", "js")}
+    return environment.get_template("page.html.jinja").render(**assets, **content)
+
+
+def _summaries(table: RetentionTable) -> list[list[Summary]]:
+    """Per run, one summary per view."""
+    found: dict[tuple[str | None, str], list[Summary]] = {}
+    for mean in table.means:
+        own = [r for r in table.rows if (r.group, r.run, r.view) == (mean.group, mean.run, mean.view)]
+        found.setdefault((mean.group, mean.run), []).append(summarise([*own, mean]))
+    return list(found.values())
+
+
+def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -> list[Picture]:
+    """Figures of one subject; all but the first of a kind and run are extra, to be unfolded."""
+    found: list[Picture] = []
+    for exhibit in exhibits:
+        if exhibit.subject == subject:
+            run = "" if exhibit.run is None else names[exhibit.run]
+            kind = exhibit.title.partition(",")[0]
+            extra = any(other.run == run and other.title.partition(",")[0] == kind for other in found)
+            found.append(Picture(exhibit.title, run, exhibit.reading, data_uri(exhibit), extra))
+    return found

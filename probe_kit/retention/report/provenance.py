@@ -1,0 +1,87 @@
+"""Where the numbers come from and how to cite them."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit import __version__
+from probe_kit.errors import NoProbesError
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.train.reader import RunReader
+from probe_kit.train.store import load_results
+
+PAPER = "arXiv:2606.19297"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """One run's identity. facts: name and value. documents: name and pretty JSON."""
+
+    name: str
+    line: str
+    facts: tuple[tuple[str, str], ...]
+    documents: tuple[tuple[str, str], ...]
+
+
+def provenance(name: str, run: RunReader) -> Provenance:
+    """What a run says about itself; runs that were not made by probe_kit say less."""
+    settings: dict[str, Any] = getattr(run, "settings", {})
+    certificate: dict[str, Any] = getattr(run, "certificate", {})
+    probes = _probe_settings(run)
+    facts = {
+        "model": run.model,
+        "weights": "random: nobody trained them" if run.random_weights else "",
+        "weights sha256": run.weights_sha256 or "none (scripted)",
+        "suite": run.suite,
+        "episodes": str(len(run.episodes)),
+        "streams": "; ".join(_stream(run, stream) for stream in run.streams) or "none",
+        "run settings sha256": run.settings_sha256,
+        "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
+            certificate.get("hooks_on_equals_hooks_off"), "no"
+        ),
+        "probes": str(probes.get("key", "none")),
+    }
+    documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
+    return Provenance(
+        name,
+        Certificate.of_run(run).line,
+        tuple((key, value) for key, value in facts.items() if value),
+        tuple((key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value),
+    )
+
+
+def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
+    """A sentence for a methods section, and BibTeX."""
+    lines = "; ".join(Certificate.of_run(run).line.replace(" · ", ", ") for run in runs)
+    sentence = (
+        f"Evaluated with probe_kit {__version__} under the Act2Answer protocol ({PAPER}): {lines}. Success rates "
+        "from a PyBullet scene are comparable with each other, not with those of other simulators."
+    )
+    bibtex = (
+        "@software{probe_kit,\n"
+        "  title   = {probe\\_kit: where a Vision-Language-Action model knows the answer, and where it is lost},\n"
+        f"  version = {{{__version__}}},\n"
+        "  license = {Apache-2.0}\n}\n\n"
+        "@misc{act2answer,\n"
+        "  title         = {Does {VLA} Even Know the Basics?},\n"
+        "  eprint        = {2606.19297},\n"
+        "  archivePrefix = {arXiv}\n}"
+    )
+    return sentence, bibtex
+
+
+def _stream(run: RunReader, name: str) -> str:
+    stream = run.streams[name]
+    steps = f" × {stream.iterations} iterations" if stream.iterations else ""
+    return f"{name} {stream.layers} layers{steps}, width {stream.width}"
+
+
+def _probe_settings(run: RunReader) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    try:
+        results = load_results(run)
+    except NoProbesError:
+        return {}
+    return {"key": results.key, "created": results.created, **asdict(results.settings)}

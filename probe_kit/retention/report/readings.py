@@ -1,0 +1,188 @@
+"""What the tables say, in sentences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from probe_kit.retention.cells import model_name, percent
+from probe_kit.retention.displays.style import spell
+from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.success import Regime
+from probe_kit.train.controls import SIGNIFICANCE
+
+_MOSTLY = 0.5  # share of episodes above which something is said first
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One number of a run's summary, and what it is."""
+
+    value: str
+    name: str
+    gloss: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A run and view in a few numbers and sentences. warnings: what would be misread without them."""
+
+    name: str
+    view: str | None
+    random_weights: bool
+    headlines: tuple[Headline, ...]
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+    by_category: tuple[tuple[str, str], ...]
+
+
+def summarise(rows: Sequence[RetentionRow]) -> Summary:
+    """The summary of one run and view. rows: its categories, and their mean."""
+    mean = next(row for row in rows if row.category == MEAN)
+    single = [row for row in rows if row.category != MEAN]
+    return Summary(
+        name=model_name(mean).replace(" (random weights)", ""),
+        view=mean.view,
+        random_weights=mean.random_weights,
+        headlines=tuple(_headlines(mean)),
+        sentences=tuple(_sentences(mean, single)),
+        warnings=tuple(_warnings(mean, single)),
+        by_category=tuple((spell(row.category), " ".join(read_row(row))) for row in single),
+    )
+
+
+def _headlines(mean: RetentionRow) -> list[Headline]:
+    found = [Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")]
+    if mean.prefix_accuracy is not None:
+        found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
+    if mean.action_accuracy is not None:
+        found.append(
+            Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
+        )
+    if mean.prefix_accuracy is not None and mean.action_accuracy is not None:
+        found.append(_retention_headline(mean))
+    return found
+
+
+def _retention_headline(mean: RetentionRow) -> Headline:
+    if not mean.retention_defined or mean.retention_debiased is None:
+        return Headline("n/a", "retention", "no backbone signal to retain")
+    return Headline(f"{mean.retention_debiased:.2f}", "retention, debiased", _interval_words(mean))
+
+
+def _interval_words(row: RetentionRow) -> str:
+    if row.retention_ci is None:
+        return "no interval"
+    low, high = row.retention_ci
+    return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
+
+
+def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    found = [_behaviour(mean, rows)]
+    if any(row.prefix_accuracy is not None for row in rows):
+        found.append(_knowledge(rows))
+    if any(row.retention is not None for row in rows):
+        found.append(_retention(mean, rows))
+    if mean.gap is not None and any(_clear(row.prefix_p_fwe) for row in rows):
+        found.append(
+            f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
+            f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
+        )
+    return found
+
+
+def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
+    knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
+    fails = [row for row in rows if row.regime == Regime.FAILURE]
+    text = f"The cube ended on the correct picture in {percent(mean.sr)} % of episodes, averaged over categories. "
+    text += f"In {_of(knows, rows)} that is more than guessing explains"
+    return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
+
+
+def _knowledge(rows: Sequence[RetentionRow]) -> str:
+    backbone = [row for row in rows if _clear(row.prefix_p_fwe)]
+    expert = [row for row in rows if _clear(row.action_p_fwe)]
+    text = f"A linear probe reads the answer above chance in the backbone in {_of(backbone, rows)}"
+    if any(row.action_accuracy is not None for row in rows):
+        text += f", and in the {rows[0].action_name} in {_of(expert, rows)}"
+    return f"{text}."
+
+
+def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
+    counted = [row for row in rows if row.retention_defined]
+    if not counted or mean.retention_debiased is None:
+        return "Retention is not defined: where the backbone is at chance, there is nothing to retain."
+    left = f" ({len(mean.left_out)} left out for lack of a backbone signal)" if mean.left_out else ""
+    return (
+        f"Of what can be read in the backbone above chance, a share of {mean.retention_debiased:.2f} can still be "
+        f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
+    )
+
+
+def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    found = []
+    if mean.random_weights:
+        found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
+    if (mean.p_never_moved or 0) > _MOSTLY:
+        found.append(
+            f"The cube never moved in {percent(mean.p_never_moved)} % of episodes: the policy does not grasp, so "
+            "its success rate says nothing about what it knows."
+        )
+    elif (mean.p_oob or 0) > _MOSTLY:
+        found.append(f"The cube reached neither picture in {percent(mean.p_oob)} % of episodes.")
+    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
+    if biased:
+        found.append(f"The policy has a habit of going to one side in {_of(biased, rows)}.")
+    if mean.leaks:
+        found.append(
+            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
+            "believing a probe."
+        )
+    return found
+
+
+def read_row(row: RetentionRow) -> list[str]:
+    """One category in sentences."""
+    right = round(row.sr * row.n_episodes)
+    found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
+    if row.items_both_right is not None:
+        items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
+        found.append(f"{row.items_both_right} of {items} questions right in both layouts.")
+    if row.prefix_accuracy is not None:
+        found.append(
+            f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
+            f"{row.prefix_depth:.2f}: {_clear_words(row.prefix_p_fwe)}."
+        )
+    if row.action_accuracy is not None:
+        step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
+        found.append(
+            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}: "
+            f"{_clear_words(row.action_p_fwe)}."
+        )
+    if row.retention_defined and row.retention_debiased is not None:
+        found.append(f"Debiased retention {row.retention_debiased:.2f} ({_interval_words(row)}).")
+    return found
+
+
+def _clear(p: float | None) -> bool:
+    return p is not None and p < SIGNIFICANCE
+
+
+def _clear_words(p: float | None) -> str:
+    if p is None:
+        return "not tested, for lack of relabellings"
+    return f"{'above chance' if _clear(p) else 'not above chance'}, p = {p:.3f}"
+
+
+def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """The shorter of the two lists: those that are in, or those that are not."""
+    rest = [row for row in rows if row not in part]
+    shown, prefix = (rest, "all but ") if len(rest) < len(part) else (part, "")
+    return prefix + ", ".join(spell(row.category) for row in shown)
+
+
+def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow], names: bool = True) -> str:
+    """How many of the categories, and which if not all."""
+    noun = "category" if len(rows) == 1 else "categories"
+    if len(part) == len(rows):
+        return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
+    named = f" ({_names(part, rows)})" if part and names else ""
+    return f"{len(part) or 'none'} of {len(rows)} {noun}{named}"

@@ -1,0 +1,111 @@
+"""Training samples as the solver needs them: products with them, never all their entries."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from probe_kit.train.arrays import Array, namespace
+from probe_kit.train.rows import ChosenRows
+from probe_kit.train.standardiser import Standardiser
+
+
+class Design(Protocol):
+    """N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, R)."""
+
+    @property
+    def spectrum(self) -> Array:
+        """(R, 1) squared length of every column."""
+
+    def __matmul__(self, weights: Array) -> Array:
+        """Z · weights, (N, K) for (R, K)."""
+
+    def gather(self, values: Array) -> Array:
+        """Zᵀ · values, (R, K) for (N, K)."""
+
+    def moments(self, weights: Array) -> Array:
+        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
+
+
+@dataclass(frozen=True)
+class DenseDesign:
+    """Samples in memory, (N, R) float64."""
+
+    samples: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, R)."""
+        return self.samples.shape[0], self.samples.shape[1]
+
+    @property
+    def spectrum(self) -> Array:
+        """(R, 1) squared length of every column."""
+        return namespace(self.samples).square(self.samples).sum(axis=0)[:, None]
+
+    def __matmul__(self, weights: Array) -> Array:
+        return self.samples @ weights
+
+    def gather(self, values: Array) -> Array:
+        """Zᵀ · values, (R, K) for (N, K)."""
+        return self.samples.T @ values
+
+    def moments(self, weights: Array) -> Array:
+        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
+        return (self.samples.T * weights) @ self.samples
+
+
+@dataclass(frozen=True)
+class StreamedDesign:
+    """Samples made from raw features block by block in every product: standardised, then turned to `axes`.
+
+    axes: (kept, R − 1). variances: (R − 1,) squared lengths of the columns without the intercept's.
+    Memory is one block in float64, and (N, K) for K problems.
+    """
+
+    features: ChosenRows
+    standardise: Standardiser
+    axes: Array
+    variances: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, R)."""
+        return len(self.features), self.axes.shape[1] + 1
+
+    @property
+    def spectrum(self) -> Array:
+        """(R, 1) squared length of every column."""
+        xp = namespace(self.axes)
+        return xp.hstack([self.variances, xp.ones_like(self.axes[0, :1]) * len(self.features)])[:, None]
+
+    def __matmul__(self, weights: Array) -> Array:
+        turned = self.axes @ weights[:-1]
+        return self._joined([self.standardise(block) @ turned for block in self.features.blocks()]) + weights[-1]
+
+    def gather(self, values: Array) -> Array:
+        """Zᵀ · values, (R, K) for (N, K)."""
+        start, total = 0, 0.0
+        for block in self.features.blocks():
+            total = total + self.standardise(block).T @ values[start : start + len(block)]
+            start += len(block)
+        return self._joined([self.axes.T @ total, values.sum(axis=0)[None]])
+
+    def moments(self, weights: Array) -> Array:
+        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
+        xp, start = namespace(self.axes), 0
+        inner, border = 0.0, 0.0
+        for block in self.features.blocks():
+            samples, share = self.standardise(block), weights[start : start + len(block)]
+            inner = inner + (samples.T * share) @ samples
+            border = border + samples.T @ share
+            start += len(block)
+        turned = self.axes.T @ inner @ self.axes
+        edge = (self.axes.T @ border)[:, None]
+        corner = weights.sum()[None, None]
+        return xp.vstack([xp.hstack([turned, edge]), xp.hstack([edge.T, corner])])
+
+    def _joined(self, parts: list[Any]) -> Array:
+        return namespace(self.axes).concatenate(parts)

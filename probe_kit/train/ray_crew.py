@@ -1,0 +1,59 @@
+"""Probing on a Ray cluster."""
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+from probe_kit.extras import require
+from probe_kit.train.samples import Samples
+from probe_kit.train.workers import Probed, Problems, probe_column
+
+
+class RayCrew:
+    """Tasks on a cluster, one core each; a task whose worker dies is repeated by Ray.
+
+    address: of the cluster, whose nodes have probe_kit installed; `auto` for the one this process belongs to, or
+    else a new one on this machine. size: columns at once, by default as many as the cluster has cores.
+    Raises MissingExtraError without Ray, and ConnectionError if nothing answers at the address.
+    """
+
+    def __init__(self, problems: Problems, address: str, size: int | None = None) -> None:
+        self._ray = require("ray", "ray")
+        self._problems, self._address = problems, address
+        self._size = size
+
+    def __enter__(self) -> Self:
+        ray = self._ray
+        self._started = not ray.is_initialized()
+        if self._started:
+            address = None if self._address == "auto" else self._address
+            ray.init(address=address, include_dashboard=False, log_to_driver=False)
+        self.size = self._size or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self._probe = ray.remote(num_cpus=1)(_probe_alone)
+        self._shared = ray.put(self._problems)  # once, not with every column
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._started:
+            self._ray.shutdown()
+
+    def submit(self, samples: Samples) -> Any:
+        """A task that probes one column."""
+        return self._probe.remote(samples, self._shared)
+
+    def first_of(self, tasks: Sequence[Any]) -> list[Any]:
+        """Wait until at least one task is done; those that are."""
+        ready, _ = self._ray.wait(list(tasks), num_returns=1)
+        return list(ready)
+
+    def result(self, task: Any) -> Probed:
+        """What a finished task found."""
+        found: Probed = self._ray.get(task)
+        return found
+
+
+def _probe_alone(samples: Samples, problems: Problems) -> Probed:
+    """One BLAS thread, as the task was given one core."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    with threadpool_limits(1):
+        return probe_column(samples, problems)

@@ -1,0 +1,157 @@
+"""Noisy demonstrations of the scripted expert on plain tiles; pictures are painted onto the tiles later."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pi0_tiny_training.window import seen_by_policy
+from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.env.scene import SIDES
+from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK
+
+NOISE = 0.007
+"""Standard deviation, metres, of what is added to an executed action of 4 cm or more."""
+FULL_NOISE_FROM = 0.04
+TOLERANCE = 0.004
+GRASP_HEIGHT = 0.022
+START_JITTER = 0.012
+LONGEST = 60
+IDLE_STEPS = 4
+"""Idle actions after which a recording ends; more than the expert waits for the cube to settle."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Every frame of every episode, as the policy sees it.
+
+    pictures: (F, 96, 96, 3) uint8. tiles: (F, 2, 96, 96) uint8, share of a pixel that shows the left and the
+    right tile, times 255. states: (F, 8) float32. chunks: (F, chunk, 7) float32, clean actions from this frame
+    on. side: (F,) int8, 0 left, 1 right. deciding: (F,) bool, whether the chunk gives the side away and the
+    state does not.
+    """
+
+    pictures: NDArray[np.uint8]
+    tiles: NDArray[np.uint8]
+    states: NDArray[np.float32]
+    chunks: NDArray[np.float32]
+    side: NDArray[np.int8]
+    deciding: NDArray[np.bool_]
+
+    def save(self, path: Path) -> None:
+        """Write to one .npz file."""
+        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read what `save` wrote."""
+        with np.load(path) as arrays:
+            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+
+    @classmethod
+    def joined(cls, parts: list[Self]) -> Self:
+        """Several recordings as one."""
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+
+class Recorder:
+    """Records twins: two episodes with the same jitter, one to each side, equal until they part."""
+
+    def __init__(self, start_grasped: bool) -> None:
+        jitter = 0.0 if start_grasped else START_JITTER
+        spec = SceneSpec(start_grasped=start_grasped, start_jitter=jitter, max_steps=100)
+        self._env = Act2AnswerEnv(spec)
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+    def twins(self, seed: int, mislead: bool) -> Demonstrations | None:
+        """Both episodes of one seed; None if the expert failed in one.
+
+        mislead: begin with an empty, closed hand somewhere above the cube, as after a failed grasp.
+        """
+        left, right = (self._episode(seed, side, mislead) for side in (0, 1))
+        if left is None or right is None:
+            return None
+        together = min(len(left.chunks), len(right.chunks))
+        apart = np.any(left.chunks[:together, 0] != right.chunks[:together, 0], axis=1)
+        parting = int(apart.argmax())
+        for twin in (left, right):
+            twin.deciding[max(0, parting - CHUNK + 2) : parting + 1] = True
+        return Demonstrations.joined([left, right])
+
+    def _episode(self, seed: int, side: int, mislead: bool) -> Demonstrations | None:
+        env = self._env
+        env.reset(seed=seed, options={"layout": "original" if side == 0 else "swapped"})
+        rng = np.random.default_rng([seed, 1])
+        if mislead:
+            self._close_above_cube(rng)
+        expert = ScriptedExpert(env, grasp_height=GRASP_HEIGHT, tolerance=TOLERANCE)
+        expert.reset()
+        scene, arm = env.scene, env.scene.arm
+        pictures, tiles, states, actions = [], [], [], []
+        while len(actions) < LONGEST and not _at_rest(actions[-IDLE_STEPS:]):
+            frame = scene.frame()
+            pictures.append(seen_by_policy(scene.picture(frame)))
+            tiles.append([seen_by_policy(255 * np.uint8(frame.bodies == scene.quads[name])) for name in SIDES])
+            states.append(np.array([*arm.tool_state(), 0.0, arm.opening()], np.float32))
+            actions.append(expert.act())
+            env.advance(_disturbed(actions[-1], rng))
+        if env.outcome().zone != "correct":
+            return None
+        return _frames(np.array(pictures), np.array(tiles), np.array(states), np.array(actions), side)
+
+    def _close_above_cube(self, rng: np.random.Generator) -> None:
+        """Move the closed hand to a random place above the cube, without touching it."""
+        cube = self._env.scene.cube_state().position
+        goal = np.array([*(cube[:2] + rng.normal(0, 0.02, 2)), rng.uniform(0.06, 0.13)])
+        for _ in range(4):
+            shift = np.clip(goal - self._env.trial.controller.target.position, -0.05, 0.05)
+            self._env.advance(np.array([*shift, 0, 0, 0, 0.0]))
+
+
+def _disturbed(action: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
+    """The action with noise that dies out near a way-point."""
+    noise = NOISE * min(1.0, float(np.linalg.norm(action[:3])) / FULL_NOISE_FROM) * rng.standard_normal(3)
+    return np.concatenate([action[:3] + noise, action[3:]]).astype(np.float64)
+
+
+def _at_rest(actions: list[NDArray[np.float32]]) -> bool:
+    return len(actions) == IDLE_STEPS and all(not action[:6].any() and action[6] > 0.5 for action in actions)
+
+
+def _frames(
+    pictures: NDArray[np.uint8],
+    tiles: NDArray[np.uint8],
+    states: NDArray[np.float32],
+    actions: NDArray[np.float32],
+    side: int,
+) -> Demonstrations:
+    length = len(actions)
+    rest = np.zeros((CHUNK, actions.shape[1]), np.float32)
+    rest[:, 6] = 1.0
+    padded = np.concatenate([actions, rest])
+    chunks = np.stack([padded[k : k + CHUNK] for k in range(length)])
+    chunks[..., [d for d in range(actions.shape[1]) if d not in ACTION_DIMS]] = 0.0
+    return Demonstrations(pictures, tiles, states, chunks, np.full(length, side, np.int8), np.zeros(length, bool))
+
+
+def record(path: Path, table_seeds: range, grasped_seeds: range, mislead_share: float, report) -> Demonstrations:
+    """Twins from the table and from the hand, kept in `path`."""
+    if path.is_file():
+        return Demonstrations.read(path)
+    parts = []
+    for seeds, start_grasped in ((table_seeds, False), (grasped_seeds, True)):
+        recorder = Recorder(start_grasped)
+        for number, seed in enumerate(seeds):
+            mislead = not start_grasped and np.random.default_rng([seed, 2]).random() < mislead_share
+            twins = recorder.twins(seed, mislead)
+            parts += [twins] if twins else []
+            report(f"demonstrations {number + 1}/{len(seeds)}, grasped {start_grasped}, kept {len(parts)}")
+        recorder.close()
+    demonstrations = Demonstrations.joined(parts)
+    demonstrations.save(path)
+    return demonstrations

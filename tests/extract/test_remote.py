@@ -1,0 +1,177 @@
+"""Runs in an object store: the same bytes as in a folder, and the same promises."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatchError, StoreError
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal, verify_run
+from probe_kit.extract.extraction import SingleWriterWarning
+from probe_kit.extract.layout import COLUMNS
+from probe_kit.extract.location import Location, locate
+from probe_kit.hooks import Site
+from probe_kit.suite import Suite, build_suite
+from probe_kit.train import load_results, train_probes
+
+KILLING = Path(__file__).with_name("killing.py")
+SHORT = SceneSpec(max_steps=2)
+SITE = Site("expert", 1, iteration=3)
+
+
+def start(run: str | Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, str(KILLING), str(run), str(suite.folder), *point])
+
+
+def objects(run: str | Path) -> dict[str, bytes]:
+    """Every object by key; the columns by what they are called in a folder."""
+    location = locate(run)
+    stamped = f"{location.derived(COLUMNS, open_run(run).stamp)}/"
+    return {key.replace(stamped, f"{COLUMNS}/"): location.read(key) for key in location.keys("")}
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "six", ["color"], 6)
+
+
+@pytest.fixture(scope="module")
+def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Synthetic episodes in a folder."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert start(run, suite).wait() == 0
+    return run
+
+
+@pytest.fixture
+def copied(recorded_run: Run, bucket: str) -> Run:
+    """A real run, with all tokens, in a bucket."""
+    here, there = recorded_run.location, locate(f"{bucket}/run")
+    for key in here.keys(""):
+        if not key.startswith((COLUMNS, "probes")):
+            there.write(key, here.read(key))
+    assert seal(there)
+    return open_run(there)
+
+
+@pytest.mark.slow
+def test_a_run_in_a_bucket_has_the_same_bytes_as_one_in_a_folder(
+    suite: Suite, tmp_path: Path, bucket: str
+) -> None:
+    settings = ExtractSettings("pi0-tiny", suite=suite.folder, items=2, scene=SHORT, tokens="all", env_workers=0)
+    local = extract_run(settings, tmp_path / "run")
+    remote = extract_run(settings, f"{bucket}/prefix/run")
+    assert (remote.stamp, remote.settings_sha256, remote.sealed) == (local.stamp, local.settings_sha256, True)
+    assert objects(f"{bucket}/prefix/run") == objects(tmp_path / "run")
+
+
+@pytest.mark.parametrize("point", ["before-commit", pytest.param("after-commit", marks=pytest.mark.slow)])
+def test_killed_and_resumed_in_a_bucket_equals_never_killed(
+    point: str, suite: Suite, whole: Path, bucket: str
+) -> None:
+    run = f"{bucket}/run"
+    assert start(run, suite, point).wait() == -signal.SIGKILL
+    assert len(open_run(run, allow_partial=True).episodes) == (3 if point == "after-commit" else 2)
+    assert verify_run(run, deep=True).ok
+    assert start(run, suite).wait() == 0
+    assert objects(run) == objects(whole)
+
+
+@pytest.mark.slow
+def test_three_writers_at_once_give_the_same_store_in_a_bucket(suite: Suite, whole: Path, bucket: str) -> None:
+    run = f"{bucket}/run"
+    writers = [start(run, suite) for _ in range(3)]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
+    assert objects(run) == objects(whole)
+
+
+@pytest.mark.slow
+def test_worker_processes_share_a_bucket(suite: Suite, tmp_path: Path, bucket: str) -> None:
+    settings = ExtractSettings("expert", suite=suite.folder, scene=SHORT, env_workers=0)
+    alone = extract_run(settings, tmp_path / "run")
+    together = extract_run(replace(settings, workers=2), f"{bucket}/run")
+    assert together.stamp == alone.stamp
+
+
+def test_other_settings_are_refused_in_a_bucket_too(suite: Suite, bucket: str) -> None:
+    settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT)
+    extract_run(settings, f"{bucket}/run")
+    with pytest.raises(SettingsMismatchError, match=r"seed: stored 0, asked 1"):
+        extract_run(replace(settings, seed=1), f"{bucket}/run")
+
+
+def test_a_store_that_ignores_conditions_is_refused_for_several_writers(suite: Suite, deaf_bucket: str) -> None:
+    settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT)
+    with pytest.raises(StoreError, match=r"ignores conditional puts.*--workers"):
+        extract_run(replace(settings, workers=2), f"{deaf_bucket}/run")
+    with pytest.warns(SingleWriterWarning, match="no second process"):
+        run = extract_run(settings, f"{deaf_bucket}/run")
+    assert len(run.episodes) == 4
+
+
+def test_reading_gives_the_same_numbers_from_a_bucket(recorded_run: Run, copied: Run) -> None:
+    assert copied.sealed
+    np.testing.assert_array_equal(copied.column(SITE), recorded_run.column(SITE))
+    for ours, theirs in zip(copied.tokens(SITE), recorded_run.tokens(SITE), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert copied.xarray().sizes == recorded_run.xarray().sizes
+
+
+def test_probes_of_a_bucket_are_stored_in_it(recorded_run: Run, copied: Run) -> None:
+    chosen = {"categories": ["color"], "permutations": 0}
+    results = train_probes(copied, **chosen)
+    expected = train_probes(recorded_run, **chosen)
+    again = load_results(open_run(copied.location))
+    assert again.key == results.key == expected.key
+    np.testing.assert_array_equal(again.scores["accuracy"], expected.scores["accuracy"])
+    place = next(iter(expected.directions))
+    np.testing.assert_array_equal(again.directions[place].weights, expected.directions[place].weights)
+
+
+def flip_a_bit(location: Location, key: str) -> None:
+    content = bytearray(location.read(key))
+    content[len(content) // 2] ^= 1
+    location.write(key, bytes(content))
+
+
+def test_damage_in_a_bucket_is_found_and_never_read_as_numbers(copied: Run) -> None:
+    shard = next(key for key in copied.location.keys("data.zarr/expert/tokens") if "/c/7/" in key)
+    flip_a_bit(copied.location, shard)
+    assert verify_run(copied.location).ok
+    (problem,) = verify_run(copied.location, deep=True).problems
+    assert shard in problem
+    with pytest.raises(RunDamagedError):
+        copied.rows("expert", "tokens")[7]
+    copied.location.remove(shard.rpartition("/")[0])
+    with pytest.raises(RunDamagedError, match="is missing"):
+        open_run(copied.location)
+
+
+@pytest.mark.slow
+def test_the_commands_take_urls(copied: Run, tmp_path: Path, bucket: str) -> None:
+    def probe_kit(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "probe_kit", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+
+    run = str(copied.location)
+    made = probe_kit("extract", "--model", "expert", "--categories", "color", "--items", "2", "--max-steps", "2",
+                     "--out", f"{bucket}/scripted")  # fmt: skip
+    assert (made.returncode, made.stdout.strip()) == (0, f"{bucket}/scripted"), made.stderr
+    assert f"probe-kit retention {bucket}/scripted" in made.stderr
+    verified = probe_kit("run", "verify", run, "--deep")
+    assert (verified.returncode, "sealed; every byte checked" in verified.stdout) == (0, True), verified.stderr
+    assert probe_kit("run", "seal", run).stdout.strip() == "nothing to do"
+    assert probe_kit("export", run, "--format", "safetensors").returncode == 0
+    assert {path.name for path in tmp_path.iterdir()} >= {"run.safetensors", "run.safetensors.sha256"}
+    table = probe_kit("retention", f"{bucket}/scripted", "--format", "json")
+    assert (table.returncode, f"{bucket}/scripted" in table.stdout) == (0, True), table.stderr
+
+
+def test_a_url_without_a_run_is_named(bucket: str) -> None:
+    with pytest.raises(RunNotFoundError, match=f"{bucket}/nothing is not a run"):
+        open_run(f"{bucket}/nothing")

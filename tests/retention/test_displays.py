@@ -1,0 +1,300 @@
+"""Displays: the numbers they carry are those of the run, and what they draw says where it comes from."""
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from probe_kit.env.spec import SceneSpec
+from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
+from probe_kit.retention import layer_curve, retention
+from probe_kit.retention.displays import (
+    FinalPositionsDisplay,
+    IterationMapDisplay,
+    KnowledgeActionDisplay,
+    LayerCurveDisplay,
+    ModelDepthDisplay,
+    PairedLayoutsDisplay,
+    RetentionTableDisplay,
+    RoleCurvesDisplay,
+    SideTableDisplay,
+    SuccessTableDisplay,
+    final_positions,
+    gallery,
+    iteration_maps,
+    model_depths,
+    role_curves,
+    save_figures,
+)
+from probe_kit.retention.displays.heat_table import heat_colour
+from probe_kit.retention.displays.labels import place_labels
+from probe_kit.train import ArrayRun, load_results
+
+ProbedRun = Callable[..., ArrayRun]
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
+NOISE = ([0.5, 0.52, 0.5], [[0.5, 0.5], [0.5, 0.51]])
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures() -> Iterator[None]:
+    yield
+    plt.close("all")
+
+
+@dataclass(frozen=True)
+class PlacedRun(ArrayRun):
+    """Knows its scene, as recorded runs do."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"scene": SceneSpec().to_json()}
+
+
+def placed_run(folder: Path, outcome_table: Callable[..., pd.DataFrame]) -> PlacedRun:
+    """Three right, two wrong, one unmoved and one beyond the frame; all for questions answered on the left."""
+    scene = SceneSpec()
+    episodes = outcome_table(3, 2, 3).iloc[:7].assign(side_correct="left")
+    places = [scene.tile_left] * 3 + [scene.tile_right] * 2 + [scene.cube_xy, (3.0, 0.0)]
+    episodes[["cube_x", "cube_y"]] = places
+    episodes["never_moved"] = [False] * 5 + [True, False]
+    return PlacedRun(folder, "pi0", "suite@1#0123456789ab", episodes, {})
+
+
+# -- layer curves ----------------------------------------------------------------------------------------------
+
+
+def test_one_panel_per_category_with_both_streams(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": SIGNAL, "traffic_sign": SIGNAL}))
+    figure = layer_curve(results)
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in panels] == ["color", "traffic sign"]
+    labels = panels[0].get_legend_handles_labels()[1]
+    assert {"backbone", "action expert, best iteration", "action expert, all iterations", "chance"} <= set(labels)
+    figure.savefig(io.BytesIO(), format="png")
+
+
+def test_the_caption_names_model_weights_suite_sizes_and_random_weights(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": SIGNAL}, "pi0-tiny", random_weights=True))
+    caption = layer_curve(results).get_supxlabel()
+    for part in ("pi0-tiny", "RANDOM WEIGHTS", "suite@1#0123456789ab", "n = 200", results.key):
+        assert part in caption
+
+
+def test_a_layer_curve_carries_the_best_iteration_and_the_span_of_all(probed_run: ProbedRun) -> None:
+    display = LayerCurveDisplay.from_results(load_results(probed_run({"color": SIGNAL})), "color")
+    backbone, expert = display.streams
+    np.testing.assert_allclose(backbone.accuracy, [0.5, 0.9, 0.7])
+    np.testing.assert_allclose(backbone.depth, [0, 0.5, 1])
+    np.testing.assert_allclose(expert.accuracy, [0.6, 0.7])
+    np.testing.assert_allclose(expert.least, [0.5, 0.65])
+    assert (expert.iterations, backbone.iterations) == (2, 1)
+    assert (backbone.low < backbone.accuracy).all()
+    assert display.chance == 0.5
+    assert display.null_band == pytest.approx((0.405, 0.595), abs=0.002), "the null is even from 0.4 to 0.6"
+
+
+def test_significant_sites_are_filled(probed_run: ProbedRun) -> None:
+    axes = layer_curve(load_results(probed_run({"color": SIGNAL}))).axes[0]
+    filled = [line for line in axes.lines if line.get_linestyle() == "None" and line.get_marker() == "o"]
+    assert [round(depth, 1) for line in filled for depth in line.get_xdata()] == [0.5, 1.0]
+
+
+def test_views_and_categories_that_were_not_probed_are_errors(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": SIGNAL}))
+    with pytest.raises(UnknownSiteError, match="probed: mean"):
+        layer_curve(results, "last")
+    with pytest.raises(UnknownCategoryError, match="probed: color"):
+        LayerCurveDisplay.from_results(results, "shape")
+    with pytest.raises(UnknownSiteError, match="probed in stream 'vision'"):
+        RoleCurvesDisplay.from_results(results, "color", "vision")
+    with pytest.raises(UnknownSiteError, match="no iterations"):
+        IterationMapDisplay.from_results(results, "color", stream="backbone")
+
+
+def test_plot_draws_on_the_given_axes_and_returns_the_display(probed_run: ProbedRun) -> None:
+    display = LayerCurveDisplay.from_results(load_results(probed_run({"color": SIGNAL})), "color")
+    axes = Figure().subplots()
+    assert display.plot(axes) is display
+    assert display.ax_ is axes
+    assert axes.lines
+    own = display.plot().ax_
+    assert own is not axes
+    assert "settings" in own.figure.get_supxlabel()
+
+
+# -- maps, roles, depths ---------------------------------------------------------------------------------------
+
+
+def test_an_iteration_map_holds_every_site_and_frames_the_best(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": SIGNAL, "shape": NOISE}))
+    display = IterationMapDisplay.from_results(results, "color")
+    np.testing.assert_allclose(display.accuracy, [[0.6, 0.7], [0.5, 0.65]])
+    assert display.peak == (0, 1)
+    assert display.significant.tolist() == [[True, True], [False, True]]
+    axes = display.plot().ax_
+    (frame,) = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
+    assert frame.get_xy() == (0.5, -0.5)
+    dots = [line.get_xydata().tolist()[0] for line in axes.lines]
+    assert dots == [[0, 0], [1, 0], [1, 1]], "layer and iteration of every significant site"
+    assert not IterationMapDisplay.from_results(results, "shape").significant.any()
+
+
+def test_the_maps_of_one_figure_share_one_scale(probed_run: ProbedRun) -> None:
+    figure = iteration_maps(load_results(probed_run({"color": SIGNAL, "shape": NOISE})))
+    norms = [image.norm for axes in figure.axes for image in axes.images]
+    assert [(norm.vmin, norm.vmax) for norm in norms] == [(50, 70)] * 2
+
+
+def test_role_curves_have_a_line_per_view(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": SIGNAL}))
+    display = RoleCurvesDisplay.from_results(results, "color", "expert")
+    np.testing.assert_allclose(display.curves["mean"].accuracy, [0.6, 0.7])
+    role_curves(results).savefig(io.BytesIO())
+
+
+def test_models_are_compared_by_accuracy_above_chance_averaged_over_categories(probed_run: ProbedRun) -> None:
+    deep = probed_run({"color": SIGNAL, "shape": NOISE}, "pi0")
+    shallow = probed_run({"color": ([0.5, 0.6], [[0.5]]), "shape": ([0.5, 0.8], [[0.5]])}, "smolvla")
+    results = [load_results(deep), load_results(shallow)]
+    first, second = ModelDepthDisplay.from_results(results).models
+    np.testing.assert_allclose(first.above_chance, [0, 0.21, 0.1])
+    np.testing.assert_allclose(second.above_chance, [0, 0.2])
+    np.testing.assert_allclose(second.depth, [0, 1])
+    with pytest.raises(UsageError, match="vision"):
+        ModelDepthDisplay.from_results(results, "vision")
+    caption = model_depths(results).get_supxlabel()
+    assert "pi0 ·" in caption
+    assert "smolvla ·" in caption
+
+
+# -- tables ----------------------------------------------------------------------------------------------------
+
+
+def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) -> None:
+    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
+    success = SuccessTableDisplay.from_table(table)
+    assert success.columns == ("color", "shape", "mean")
+    assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
+    assert [cell.bold for cell in success.cells[0]] == [True, True, False], "0.6 is above 0.5 + Δ = 0.569"
+    row = table.rows[0]
+    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.sr_left, row.sr_right)
+    color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
+    assert color.values == (row.retention, row.retention_debiased)
+    assert shape.values == (None, None), "no backbone signal"
+
+
+def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
+    display = RetentionTableDisplay.from_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})])).plot()
+    texts = [text.get_text() for text in display.ax_.texts]
+    plain, debiased = display.cells[0][0].values
+    assert texts[:4] == [f"{plain:.2f}", f"{debiased:.2f}", "–", "–"]
+
+
+def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_table: Any) -> None:
+    table = retention([placed_run(tmp_path, outcome_table)])
+    with pytest.raises(UsageError, match="no rows"):
+        RetentionTableDisplay.from_table(table)
+    with pytest.raises(UsageError, match="no run has probes"):
+        KnowledgeActionDisplay.from_table(table)
+
+
+@pytest.mark.parametrize("value", [-0.3, 0.1, 0.3, 0.5, 0.7, 0.9, 1.4])
+def test_black_text_is_readable_on_every_heat_colour(value: float) -> None:
+    colour = heat_colour(value)
+    channels = np.array([int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    assert (linear @ [0.2126, 0.7152, 0.0722] + 0.05) / 0.05 > 7, "WCAG AAA"
+
+
+# -- behaviour -------------------------------------------------------------------------------------------------
+
+
+def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_run: ProbedRun) -> None:
+    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
+    display = KnowledgeActionDisplay.from_table(table)
+    assert [(p.category, p.accuracy, p.sr, p.significant) for p in display.points] == [
+        ("color", 0.9, 0.6, True),
+        ("shape", 0.52, 0.6, False),
+    ]
+    axes = display.plot().ax_
+    assert {"color", "shape"} <= {text.get_text() for text in axes.texts}
+    labels = axes.get_legend_handles_labels()[1]
+    assert labels == ["pi0: probe above chance", "pi0: probe not above chance"]
+    assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == 0.7
+
+
+def test_names_of_crowded_points_do_not_cover_each_other() -> None:
+    figure = Figure(figsize=(6, 6))
+    axes = figure.subplots()
+    axes.set_xlim(0, 100)
+    axes.set_ylim(0, 100)
+    names = ["attribute", "celebrity", "color", "emotion", "living world", "shape"]
+    place_labels(axes, [(50, 50), (51, 50), (50, 51), (99, 99), (99, 98), (1, 1)], names, ["black"] * 6)
+    boxes = [text.get_window_extent().padded(-1) for text in axes.texts]
+    assert not any(a.overlaps(b) for position, a in enumerate(boxes) for b in boxes[position + 1 :])
+    frame = axes.get_window_extent().padded(2)
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes), "no name leaves the axes"
+
+
+def test_paired_layouts_count_items_and_draw_their_shares(tmp_path: Path, outcome_table: Any) -> None:
+    # Items in order: 3 right twice, 1 right and wrong, 2 wrong twice, 1 wrong and outside, 1 outside twice.
+    run = ArrayRun(tmp_path, "pi0", "suite", outcome_table(7, 6, 3), {})
+    display = PairedLayoutsDisplay.from_run(run)
+    paired = display.items["color"]
+    assert (paired.both, paired.one, paired.both_wrong, paired.none) == (3, 1, 2, 4)
+    bars = display.plot().ax_.patches
+    np.testing.assert_allclose([bar.get_width() for bar in bars], [37.5, 12.5, 25, 25])
+
+
+def test_final_positions_lie_over_the_tiles_as_seen_from_behind_the_robot(
+    tmp_path: Path, outcome_table: Any
+) -> None:
+    run = placed_run(tmp_path, outcome_table)
+    display = FinalPositionsDisplay.from_run(run, "color")
+    assert display.counts == {"correct": 3, "wrong": 2, "oob": 2}
+    axes = display.plot().ax_
+    right, wrong, neither = (collection.get_offsets() for collection in axes.collections)
+    assert tuple(right[0]) == pytest.approx((-0.183, 0.397)), "+y is the robot's left, and left in the picture"
+    assert tuple(wrong[0]) == pytest.approx((0.127, 0.397))
+    assert len(neither) == 1
+    assert "1 beyond the frame" in [text.get_text() for text in axes.texts]
+    assert axes.get_xlabel() == "3 right · 2 wrong · 2 out (1 unmoved)"
+    zones = [patch for patch in axes.patches if isinstance(patch, Circle)]
+    assert [(zone.center, zone.radius) for zone in zones] == [((-0.183, 0.397), 0.065), ((0.127, 0.397), 0.065)]
+
+
+def test_final_positions_need_positions_and_a_scene(tmp_path: Path, outcome_table: Any) -> None:
+    bare = ArrayRun(tmp_path, "pi0", "suite", outcome_table(2, 2, 2), {})
+    with pytest.raises(UsageError, match="cube_x"):
+        final_positions(bare)
+    with pytest.raises(UsageError, match="no episodes of category 'shape'"):
+        FinalPositionsDisplay.from_run(placed_run(tmp_path, outcome_table), "shape")
+
+
+# -- gallery ---------------------------------------------------------------------------------------------------
+
+
+def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: ProbedRun, tmp_path: Path) -> None:
+    run = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    saved = list(save_figures(gallery([run], retention([run])), tmp_path / "figures"))
+    assert [path.stem for path in saved] == [
+        "success", "sides", "knowledge-action", "retention", "pi0-paired-layouts", "pi0-layer-curves",
+        "pi0-iteration-maps",
+    ]  # fmt: skip
+    assert all(path.stat().st_size > 5000 and path.with_suffix(".pdf").is_file() for path in saved)
+    assert plt.get_fignums() == []
+
+
+def test_runs_whose_folders_have_one_name_get_figures_of_their_own(tmp_path: Path, outcome_table: Any) -> None:
+    runs = [placed_run(tmp_path / study / "run", outcome_table) for study in "abc"]
+    names = [exhibit.name for exhibit in gallery(runs, retention(runs))]
+    assert len(set(names)) == len(names)
+    assert {"run-final-positions", "run-2-final-positions", "run-3-final-positions"} <= set(names)

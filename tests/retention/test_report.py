@@ -1,0 +1,218 @@
+"""The report: one file, complete, with numbers that are the table's and words that fit them."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.thumbnails import write_thumbnail
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.report import report_html, write_report
+from probe_kit.retention.report.episodes import episode_grid
+from probe_kit.retention.report.glossary import GLOSSARY
+from probe_kit.retention.report.provenance import citation
+from probe_kit.retention.report.readings import summarise
+from probe_kit.retention.report.tables import behaviour_table, control_table, retention_table
+from probe_kit.train import ArrayRun
+
+ProbedRun = Callable[..., ArrayRun]
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
+NOISE = ([0.5, 0.52, 0.5], [[0.5, 0.5], [0.5, 0.51]])
+
+
+def plain_run(folder: Path, episodes: pd.DataFrame, model: str = "pi0") -> ArrayRun:
+    return ArrayRun(folder, model, "suite@1#0123456789ab", episodes, {})
+
+
+def cards(page: str) -> list[dict[str, Any]]:
+    found = re.search(r'<script type="application/json" id="cards">(.*?)</script>', page, re.DOTALL)
+    assert found
+    listed: list[dict[str, Any]] = json.loads(found[1])
+    return listed
+
+
+def test_the_page_needs_nothing_but_itself(probed_run: ProbedRun) -> None:
+    page = report_html([probed_run({"color": SIGNAL})])
+    assert not re.findall(r"(?:src|href)=[\"'](?!#|data:)", page)
+    assert "@import" not in page
+    assert "default-src 'none'" in page
+
+
+def test_the_same_run_gives_the_same_page(probed_run: ProbedRun) -> None:
+    run = probed_run({"color": SIGNAL, "shape": NOISE})
+    assert report_html([run]) == report_html([run])
+
+
+def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> None:
+    page = report_html([probed_run({"color": SIGNAL})])
+    links = re.findall(r'href="#([\w-]+)"', page)
+    assert {"summary", "behaviour", "knowledge", "retention", "episodes", "settings", "words", "cite"} <= set(
+        links
+    )
+    assert all(f'id="{link}"' in page for link in links)
+
+
+def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
+    page = report_html([probed_run({"color": NOISE}, "pi0-tiny", random_weights=True)])
+    assert '<span class="badge random">random weights</span>' in page
+    assert "RANDOM WEIGHTS" in page
+    assert "nobody trained" in page
+
+
+def test_names_and_instructions_cannot_become_markup(tmp_path: Path, outcome_table: Any) -> None:
+    hostile = "</script><img src=x onerror=alert(1)>"
+    page = report_html([plain_run(tmp_path, outcome_table(6, 4, 2).assign(instruction=hostile), hostile)])
+    assert "<img src=x" not in page
+    assert cards(page)[0]["instruction"] == hostile
+
+
+def test_a_run_without_probes_has_a_report_of_its_behaviour(tmp_path: Path, outcome_table: Any) -> None:
+    page = report_html([plain_run(tmp_path, outcome_table(6, 4, 2))])
+    assert 'id="knowledge"' not in page
+    assert "50.0 %" in page
+
+
+def test_a_report_without_runs_is_an_error() -> None:
+    with pytest.raises(UsageError, match="at least one run"):
+        report_html([])
+
+
+def test_a_report_is_written_whole_and_replaces_an_older_one(tmp_path: Path, outcome_table: Any) -> None:
+    run = plain_run(tmp_path / "run", outcome_table(6, 4, 2))
+    path = tmp_path / "new" / "report.html"
+    assert write_report([run], path) == path
+    path.write_text("old")
+    write_report([run], path)
+    assert path.read_text().rstrip().endswith("</html>")
+    assert list(path.parent.iterdir()) == [path], "no draft stays behind"
+
+
+def test_making_a_report_imports_neither_simulator_nor_model(tmp_path: Path, outcome_table: Any) -> None:
+    outcome_table(6, 4, 2).to_json(tmp_path / "episodes.json")
+    code = f"""
+import sys
+from pathlib import Path
+import pandas as pd
+from probe_kit.retention.report import write_report
+from probe_kit.train import ArrayRun
+episodes = pd.read_json({str(tmp_path / "episodes.json")!r})
+write_report([ArrayRun(Path({str(tmp_path)!r}), "pi0", "suite", episodes, {{}})], {str(tmp_path / "r.html")!r})
+print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])
+"""
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert loaded.stdout.strip() == "[]"
+
+
+# -- tables and words ------------------------------------------------------------------------------------------
+
+
+def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: ProbedRun) -> None:
+    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
+    made = behaviour_table(table.all_rows)
+    assert [column.name for column in made.columns][:2] == ["category", "SR\u00a0% [95\u00a0%]"], (
+        "one run: no model"
+    )
+    success = made.body[0][1]
+    assert success.sort == table.rows[0].sr == 0.6
+    assert success.text.startswith("60.0 [")
+    assert success.strong
+    assert [row[0].text for row in made.foot] == ["mean"]
+
+
+def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
+    made = retention_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows)
+    assert made is not None
+    position = [column.name for column in made.columns].index("retention")
+    color, shape = (row[position] for row in made.body)
+    assert color.heat is not None
+    assert (shape.text, shape.sort, shape.heat, shape.note) == ("n/a", None, None, "n/a (no backbone signal)")
+
+
+def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
+    table = retention([probed_run({"color": SIGNAL})])
+    leaking = {"baselines": {"pixels": 0.8}, "leaks": ("pixels",)}
+    rows = [replace(row, **leaking) for row in table.all_rows]
+    made = control_table(rows)
+    assert made is not None
+    assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.body[0])
+    assert any("pixels" in warning for warning in summarise(rows).warnings)
+    assert control_table(table.all_rows) is None
+
+
+def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
+    rows = retention([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
+    for made in (behaviour_table(rows), retention_table(rows)):
+        assert made is not None
+        assert all(len(column.explanation) > 10 for column in made.columns)
+
+
+def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> None:
+    table = retention([probed_run({"color": SIGNAL, "shape": NOISE, "time": SIGNAL})])
+    summary = summarise(table.all_rows)
+    words = " ".join(summary.sentences)
+    assert "60.0 % of episodes" in words
+    assert "in the backbone in 2 of 3 categories (all but shape)" in words
+    assert "1 left out" in words
+    assert [headline.value for headline in summary.headlines[:2]] == ["60.0 %", "77.3 %"]
+    assert "120 of 200 episodes" in dict(summary.by_category)["color"]
+    assert "not above chance" in dict(summary.by_category)["shape"]
+
+
+def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:
+    table: RetentionTable = retention([plain_run(tmp_path, outcome_table(0, 2, 10).assign(never_moved=True))])
+    (warning,) = summarise(table.all_rows).warnings
+    assert "does not grasp" in warning
+
+
+def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
+    sentence, bibtex = citation([probed_run({"color": SIGNAL})])
+    assert "suite@1#0123456789ab" in sentence
+    assert "2606.19297" in bibtex
+
+
+def test_the_glossary_has_a_sentence_for_every_word() -> None:
+    assert all(meaning.endswith(".") for meaning in GLOSSARY.values())
+
+
+# -- episodes --------------------------------------------------------------------------------------------------
+
+
+def framed_run(folder: Path, episodes: pd.DataFrame) -> ArrayRun:
+    run = plain_run(folder, episodes)
+    frame = np.full((12, 16, 3), 200, np.uint8)
+    for number in range(len(episodes)):
+        write_thumbnail(folder, number, (frame, frame))
+    return run
+
+
+def test_all_episodes_have_their_pictures_up_to_the_limit(tmp_path: Path, outcome_table: Any) -> None:
+    run = framed_run(tmp_path, outcome_table(6, 4, 2))
+    grid = episode_grid([run], ["run"], pictures=12)
+    assert len(grid.cards) == 12
+    assert all(card["picture"] for card in grid.cards)
+    assert grid.note == ""
+
+
+def test_above_the_limit_whole_items_keep_their_pictures_and_the_page_says_so(
+    tmp_path: Path, outcome_table: Any
+) -> None:
+    run = framed_run(tmp_path, outcome_table(6, 4, 2))
+    grid = episode_grid([run], ["run"], pictures=5)
+    kept = [card["id"].split(":")[0] for card in grid.cards if card["picture"]]
+    assert kept == ["color-0", "color-0", "color-3", "color-3"]
+    assert len(grid.cards) == 12
+    assert grid.note.startswith("Pictures of 4 of 12 episodes")
+
+
+def test_runs_without_frames_say_so(tmp_path: Path, outcome_table: Any) -> None:
+    grid = episode_grid([plain_run(tmp_path, outcome_table(6, 4, 2))], ["run"])
+    assert "keep no frames" in grid.note
