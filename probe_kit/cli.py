@@ -1,6 +1,7 @@
 """The `probe-kit` command. It parses, calls the library and prints; tables go to stdout, progress to stderr."""
 
 import signal
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -41,6 +42,23 @@ class Commands(typer.core.TyperGroup):
             for note in getattr(error, "__notes__", []):
                 err.print(f"  {escape(note)}", highlight=False, soft_wrap=True)
             raise typer.Exit(error.exit_code) from error
+        except _PATH_ERRORS as error:
+            if error.filename is None:
+                raise
+            err.print(
+                f"[bold red]{UsageError.__name__}[/]: {escape(_path_message(error))}",
+                highlight=False,
+                soft_wrap=True,
+            )
+            raise typer.Exit(UsageError.exit_code) from error
+
+
+_PATH_ERRORS = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""What the system says of a path that cannot be what it was given for."""
+
+
+def _path_message(error: OSError) -> str:
+    return f"{error.filename2 or error.filename} cannot be used: {error.strerror}. Give another path"
 
 
 app = typer.Typer(
@@ -206,8 +224,8 @@ def train(
     views: Annotated[
         str, typer.Option(help="Comma-separated: mean, last, mean:language …, tokens, tokens:ROLE.")
     ] = "mean",
-    permutations: Annotated[int, typer.Option(help="Relabellings behind the p-values.")] = 200,
-    token_permutations: Annotated[int, typer.Option(help="Relabellings for token views.")] = 59,
+    permutations: Annotated[int, typer.Option(help="Relabellings behind the p-values.", min=0)] = 200,
+    token_permutations: Annotated[int, typer.Option(help="Relabellings for token views.", min=0)] = 59,
     target: Annotated[
         str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
     ] = "correct",
@@ -220,7 +238,8 @@ def train(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[
-        int | None, typer.Option(help="Processes that share the sites; default 1, with --ray one for every core.")
+        int | None,
+        typer.Option(help="Processes that share the sites; default 1, with --ray one for every core.", min=1),
     ] = None,
     ray: Annotated[str | None, typer.Option(help="Share the sites on a Ray cluster: ADDRESS or auto.")] = None,
     device: Annotated[str | None, typer.Option(help="Solve with torch there, such as cuda; one process.")] = None,
@@ -320,8 +339,9 @@ def retention(
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
+    _refuse_doubles([path for paths in grouped.values() for path in paths])
     opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
-    radii = SENSITIVITY_RADII if epsilons is None else [_number(part) for part in split(epsilons) or ()]
+    radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
     table = make_table(
         opened if group else opened[""], split(views), iterations=_iterations(iterations), epsilons=radii
     )
@@ -346,15 +366,30 @@ def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
         name, separator, paths = text.partition("=")
         if not (separator and name and split(paths)):
             raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
+        if name in groups:
+            raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = split(paths) or ()
     return groups
 
 
-def _number(text: str) -> float:
+def _refuse_doubles(paths: list[str]) -> None:
+    """A run that counts twice makes every interval too narrow."""
+    seen: set[str] = set()
+    for path in paths:
+        place = path.rstrip("/") if "://" in path else str(Path(path).resolve())
+        if place in seen:
+            raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
+        seen.add(place)
+
+
+def _radius(text: str) -> float:
     try:
-        return float(text)
+        radius = float(text)
     except ValueError:
         raise UsageError(f"{text!r} is not a number of metres") from None
+    if not 0 < radius < inf:
+        raise UsageError(f"a zone radius is {text} m; expected a positive number")
+    return radius
 
 
 def _iterations(text: str) -> "Iterations":

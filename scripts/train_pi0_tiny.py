@@ -11,12 +11,12 @@ from typing import Annotated
 import torch
 import typer
 from pi0_tiny_training.batches import UNUSED, Sampler, without_pictures
-from pi0_tiny_training.checkpoint import measured_statistics, write_trained
-from pi0_tiny_training.demonstrations import record
+from pi0_tiny_training.checkpoint import draw_losses, measured_statistics, write_trained
+from pi0_tiny_training.demonstrations import Demonstrations, Recording, record
 from pi0_tiny_training.heads import Heads
-from pi0_tiny_training.painting import calibrate
+from pi0_tiny_training.painting import Brush, calibrate
 from pi0_tiny_training.pictures import PictureBank
-from pi0_tiny_training.training import STAGES, Trainer, follow
+from pi0_tiny_training.training import KICKED, STAGES, STEADY, Trainer, follow
 
 from probe_kit.env import SceneSpec
 from probe_kit.hooks.pi0 import Pi0
@@ -26,14 +26,17 @@ CATEGORIES = {"shape": 0.42, "color": 0.28, UNUSED: 0.30}
 """The share of each category in a batch."""
 PICTURE_SEED = 715_517
 """The embedded suite is drawn from seed 0."""
+COUPLES = 4000
 EARLY_STEP = 300
+STEADY_RECORDINGS = (
+    Recording(range(110), start_jitter=0.012, misled=0.3),
+    Recording(range(1000, 1024), start_grasped=True),
+)
+KICKED_RECORDINGS = (Recording(range(2000, 2060), start_jitter=0.004, kicked=True),)
 
 
 def main(
     out: Annotated[Path, typer.Argument(help="Folder for data, training state and checkpoints.")],
-    table_twins: Annotated[int, typer.Option(help="Demonstrations from the table, each to both sides.")] = 110,
-    grasped_twins: Annotated[int, typer.Option(help="Demonstrations from the hand, each to both sides.")] = 24,
-    couples: Annotated[int, typer.Option(help="Couples of pictures per category.")] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of weights, batches and flow noise.")] = 0,
     threads: Annotated[int, typer.Option(help="Threads of torch; one is best beside other work.")] = 1,
 ) -> None:
@@ -41,31 +44,31 @@ def main(
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)
     brushes = calibrate(SceneSpec())
-    recorded = record(
-        out / "demonstrations.npz", range(table_twins), range(1000, 1000 + grasped_twins), 0.3, print
-    )
-    demonstrations = without_pictures(recorded, brushes)
-    banks = []
-    for category in CATEGORIES:
-        path = out / f"pictures-{category}.npz"
-        if not path.is_file():
-            PictureBank.drawn(category, PICTURE_SEED, couples, brushes, print).save(path)
-        banks.append(PictureBank.read(path))
+    steady = without_pictures(record(out / "steady.npz", STEADY_RECORDINGS, print), brushes)
+    kicked = without_pictures(record(out / "kicked.npz", KICKED_RECORDINGS, print), brushes)
+    banks = [_bank(out / f"pictures-{category}.npz", category, brushes) for category in CATEGORIES]
 
-    statistics = measured_statistics(demonstrations)
-    start = out / "start"
-    write_checkpoint(start, new_pi0_tiny(seed), statistics, f"random, seed {seed}")
-    policy = Pi0.load(str(start))
-    sampler = Sampler(demonstrations, banks, list(CATEGORIES.values()), brushes, policy)
+    statistics = measured_statistics(steady)
+    write_checkpoint(out / "start", new_pi0_tiny(seed), statistics, f"random, seed {seed}")
+    policy = Pi0.load(str(out / "start"))
+    shares = list(CATEGORIES.values())
+    samplers = {
+        STEADY: Sampler(steady, banks, shares, brushes, policy),
+        KICKED: Sampler(Demonstrations.joined([steady, kicked]), banks, shares, brushes, policy),
+    }
     torch.manual_seed(seed)
-    trainer = Trainer(policy, Heads(brushes), sampler, STAGES, seed, out)
-    follow(
-        trainer,
-        out / "losses.csv",
-        print,
-        {EARLY_STEP: lambda: write_trained(out / "pi0-tiny-early", trainer, statistics)},
-    )
+    trainer = Trainer(policy, Heads(brushes), samplers, STAGES, seed, out)
+    early = {EARLY_STEP: lambda: write_trained(out / "pi0-tiny-early", trainer, statistics)}
+    follow(trainer, out / "losses.csv", print, early)
     write_trained(out / "pi0-tiny", trainer, statistics)
+    draw_losses(out / "losses.csv", out / "losses.png")
+
+
+def _bank(path: Path, category: str, brushes: tuple[Brush, Brush]) -> PictureBank:
+    """The pictures of a category, drawn on first use."""
+    if not path.is_file():
+        PictureBank.drawn(category, PICTURE_SEED, COUPLES, brushes, print).save(path)
+    return PictureBank.read(path)
 
 
 if __name__ == "__main__":

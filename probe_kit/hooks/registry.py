@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.policy import Policy
 
 ENTRY_POINTS = "probe_kit.policies"
+DTYPES = ("float32", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,14 @@ class Family:
         random_weights: bool,
         options: Mapping[str, Any] = MappingProxyType({}),
     ) -> "Policy":
-        """Load a policy; `checkpoint` None means the default one. Raises UsageError for an option it lacks."""
+        """Load a policy; `checkpoint` None means the default one.
+
+        Raises UsageError for an option it lacks, and for a device or dtype that cannot be used.
+        """
         if unknown := sorted(options.keys() - set(self.options)):
             known = f"only {', '.join(self.options)}" if self.options else "none"
             raise UsageError(f"{self.name} has no option {', '.join(unknown)}; of those options it has {known}")
+        _check_machine(device, dtype)
         load = _import(self.loader)
         policy: Policy = load(checkpoint or self.default_checkpoint, device, dtype, random_weights, **options)
         return policy
@@ -68,6 +73,18 @@ class Family:
 
         here = isinstance(try_to_load_from_cache(self.default_checkpoint, "config.json"), str)
         return "" if here else f"download of {self.default_checkpoint}"
+
+
+def _check_machine(device: str, dtype: str | None) -> None:
+    import torch
+
+    if dtype not in (None, *DTYPES):
+        raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # what torch raises: unknown, absent
+        reason = str(error).partition("\n")[0]
+        raise UsageError(f"device {device!r} cannot be used: {reason}. Try 'cpu'") from error
 
 
 def _import(path: str) -> Callable[..., Any]:

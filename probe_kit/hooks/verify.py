@@ -92,12 +92,12 @@ def verify_reference(family: str, folder: Path) -> Verification:
 
     Raises UsageError if the folder has no reference or the family no verifier, and whatever loading raises.
     """
+    run = find_family(family).function("verifier")
     file = folder / "reference.npz"
     if not file.is_file():
         raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
     with np.load(file) as arrays:
         recorded = {name: arrays[name] for name in arrays.files}
-    run = find_family(family).function("verifier")
     return Verification(family, str(folder), run(folder, recorded))
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from pi0_tiny_training.demonstrations import Demonstrations
 from pi0_tiny_training.training import Trainer
@@ -25,3 +26,11 @@ def write_trained(folder: Path, trainer: Trainer, statistics: Statistics) -> Non
     """The policy as it stands, without the heads."""
     note = f"trained, {trainer.step} steps, seed {trainer.seed}"
     write_checkpoint(folder, trainer.policy.network, statistics, note)
+
+
+def draw_losses(log: Path, picture: Path) -> None:
+    """The loss curves of a training as a PNG file."""
+    losses = pd.read_csv(log, index_col="step").rolling(10, min_periods=1).mean()
+    axes = losses.plot(logy=True, figsize=(8, 4), ylim=(1e-3, None))
+    axes.set(xlabel="step of 32 samples", ylabel="loss, mean of 200 steps")
+    axes.figure.savefig(picture, dpi=120, bbox_inches="tight")

@@ -1,5 +1,6 @@
 """Noisy demonstrations of the scripted expert on plain tiles; pictures are painted onto the tiles later."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Self
@@ -17,7 +18,9 @@ NOISE = 0.007
 FULL_NOISE_FROM = 0.04
 TOLERANCE = 0.004
 GRASP_HEIGHT = 0.022
-START_JITTER = 0.012
+KICK = 0.010
+"""Standard deviation, metres, of a kick: a disturbance right beside a way-point, which the expert then mends."""
+KICK_SHARE = 0.2
 LONGEST = 60
 IDLE_STEPS = 4
 """Idle actions after which a recording ends; more than the expert waits for the cube to settle."""
@@ -56,24 +59,38 @@ class Demonstrations:
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
+@dataclass(frozen=True)
+class Recording:
+    """What to record: a twin per seed.
+
+    start_grasped: begin with the cube in the hand. start_jitter: of the cube on the table, metres.
+    misled: share of twins that begin with an empty, closed hand somewhere above the cube, as after a failed
+    grasp. kicked: disturb a share of the actions by a kick.
+    """
+
+    seeds: range
+    start_grasped: bool = False
+    start_jitter: float = 0.0
+    misled: float = 0.0
+    kicked: bool = False
+
+
 class Recorder:
     """Records twins: two episodes with the same jitter, one to each side, equal until they part."""
 
-    def __init__(self, start_grasped: bool) -> None:
-        jitter = 0.0 if start_grasped else START_JITTER
-        spec = SceneSpec(start_grasped=start_grasped, start_jitter=jitter, max_steps=100)
-        self._env = Act2AnswerEnv(spec)
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._env = Act2AnswerEnv(
+            SceneSpec(start_grasped=recording.start_grasped, start_jitter=recording.start_jitter, max_steps=100)
+        )
 
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
 
-    def twins(self, seed: int, mislead: bool) -> Demonstrations | None:
-        """Both episodes of one seed; None if the expert failed in one.
-
-        mislead: begin with an empty, closed hand somewhere above the cube, as after a failed grasp.
-        """
-        left, right = (self._episode(seed, side, mislead) for side in (0, 1))
+    def twins(self, seed: int) -> Demonstrations | None:
+        """Both episodes of one seed; None if the expert failed in one."""
+        left, right = (self._episode(seed, side) for side in (0, 1))
         if left is None or right is None:
             return None
         together = min(len(left.chunks), len(right.chunks))
@@ -83,11 +100,11 @@ class Recorder:
             twin.deciding[max(0, parting - CHUNK + 2) : parting + 1] = True
         return Demonstrations.joined([left, right])
 
-    def _episode(self, seed: int, side: int, mislead: bool) -> Demonstrations | None:
+    def _episode(self, seed: int, side: int) -> Demonstrations | None:
         env = self._env
         env.reset(seed=seed, options={"layout": "original" if side == 0 else "swapped"})
         rng = np.random.default_rng([seed, 1])
-        if mislead:
+        if np.random.default_rng([seed, 2]).random() < self._recording.misled:
             self._close_above_cube(rng)
         expert = ScriptedExpert(env, grasp_height=GRASP_HEIGHT, tolerance=TOLERANCE)
         expert.reset()
@@ -99,7 +116,7 @@ class Recorder:
             tiles.append([seen_by_policy(255 * np.uint8(frame.bodies == scene.quads[name])) for name in SIDES])
             states.append(np.array([*arm.tool_state(), 0.0, arm.opening()], np.float32))
             actions.append(expert.act())
-            env.advance(_disturbed(actions[-1], rng))
+            env.advance(_disturbed(actions[-1], rng, self._recording.kicked))
         if env.outcome().zone != "correct":
             return None
         return _frames(np.array(pictures), np.array(tiles), np.array(states), np.array(actions), side)
@@ -113,9 +130,11 @@ class Recorder:
             self._env.advance(np.array([*shift, 0, 0, 0, 0.0]))
 
 
-def _disturbed(action: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
-    """The action with noise that dies out near a way-point."""
+def _disturbed(action: NDArray[np.float32], rng: np.random.Generator, kicked: bool) -> NDArray[np.float64]:
+    """The action with noise that dies out near a way-point, and now and then a kick that does not."""
     noise = NOISE * min(1.0, float(np.linalg.norm(action[:3])) / FULL_NOISE_FROM) * rng.standard_normal(3)
+    if kicked and rng.random() < KICK_SHARE and action[:3].any():
+        noise += KICK * rng.standard_normal(3)
     return np.concatenate([action[:3] + noise, action[3:]]).astype(np.float64)
 
 
@@ -139,18 +158,17 @@ def _frames(
     return Demonstrations(pictures, tiles, states, chunks, np.full(length, side, np.int8), np.zeros(length, bool))
 
 
-def record(path: Path, table_seeds: range, grasped_seeds: range, mislead_share: float, report) -> Demonstrations:
-    """Twins from the table and from the hand, kept in `path`."""
+def record(path: Path, recordings: Sequence[Recording], report: Callable[[str], None]) -> Demonstrations:
+    """All twins of some recordings, kept in `path`."""
     if path.is_file():
         return Demonstrations.read(path)
     parts = []
-    for seeds, start_grasped in ((table_seeds, False), (grasped_seeds, True)):
-        recorder = Recorder(start_grasped)
-        for number, seed in enumerate(seeds):
-            mislead = not start_grasped and np.random.default_rng([seed, 2]).random() < mislead_share
-            twins = recorder.twins(seed, mislead)
+    for recording in recordings:
+        recorder = Recorder(recording)
+        for number, seed in enumerate(recording.seeds):
+            twins = recorder.twins(seed)
             parts += [twins] if twins else []
-            report(f"demonstrations {number + 1}/{len(seeds)}, grasped {start_grasped}, kept {len(parts)}")
+            report(f"{path.stem} {number + 1}/{len(recording.seeds)}, kept {len(parts)} in all")
         recorder.close()
     demonstrations = Demonstrations.joined(parts)
     demonstrations.save(path)

@@ -16,6 +16,8 @@ from probe_kit.hooks.pi0 import Pi0
 from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK
 
 SAVE_EVERY = 100
+BATCH_SIZE = 32
+STEADY, KICKED = "steady", "kicked"
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Stage:
 
     deciding: share of frames that need the instruction; `deciding_at_end` in the last `end_phase` of the stage.
     acts_by_lot: train actions on the unused category too, to a side drawn by lot; otherwise not at all.
+    data: which of the trainer's samplers it draws from.
     """
 
     steps: int
@@ -31,6 +34,7 @@ class Stage:
     acts_by_lot: bool
     deciding: float
     deciding_at_end: float
+    data: str = STEADY
     last_rate: float = 1e-5
     warm_up: int = 100
     end_phase: float = 0.15
@@ -50,17 +54,24 @@ class Stage:
 STAGES = (
     Stage(7000, rate=1e-3, acts_by_lot=False, deciding=0.6, deciding_at_end=0.4),
     Stage(8000, rate=8e-4, acts_by_lot=True, deciding=0.5, deciding_at_end=0.35),
+    Stage(5000, rate=6e-4, acts_by_lot=True, deciding=0.4, deciding_at_end=0.3, data=KICKED),
 )
-BATCH_SIZE = 32
+"""First to understand, then to move wherever it goes, then to grasp after a disturbance."""
 
 
 class Trainer:
     """Policy, heads and optimiser of one training, which continues from `folder`."""
 
     def __init__(
-        self, policy: Pi0, heads: Heads, sampler: Sampler, stages: Sequence[Stage], seed: int, folder: Path
+        self,
+        policy: Pi0,
+        heads: Heads,
+        samplers: Mapping[str, Sampler],
+        stages: Sequence[Stage],
+        seed: int,
+        folder: Path,
     ):
-        self.policy, self.heads, self.sampler = policy, heads, sampler
+        self.policy, self.heads, self.samplers = policy, heads, samplers
         self.stages, self.seed, self.folder = stages, seed, folder
         self.model = policy.network.model
         self.step = 0
@@ -93,7 +104,7 @@ class Trainer:
 
     def _one_step(self, stage: Stage, step: int) -> dict[str, float]:
         rng = np.random.default_rng([self.seed, self.step])
-        batch = self.sampler.batch(rng, BATCH_SIZE, stage.deciding_at(step), stage.acts_by_lot)
+        batch = self.samplers[stage.data].batch(rng, BATCH_SIZE, stage.deciding_at(step), stage.acts_by_lot)
         for group in self.optimiser.param_groups:
             group["lr"] = stage.rate_at(step)
         torch.manual_seed(self.seed * 1_000_003 + self.step)

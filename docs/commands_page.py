@@ -1,0 +1,74 @@
+"""An mkdocs hook: puts the options of every command, as Typer knows them, into the page `commands.md`.
+
+A line `<!-- options of: extract -->` becomes the command's help and a table of its arguments and options.
+"""
+
+import re
+from typing import Any
+
+import typer
+
+PAGE = "commands.md"
+_PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z ]+) -->$", re.MULTILINE)
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Called by mkdocs for every page. Raises KeyError for a command that does not exist."""
+    if page.file.src_uri != PAGE:
+        return markdown
+    return _PLACE.sub(lambda place: command_markdown(place["path"]), markdown)
+
+
+def command_paths() -> list[str]:
+    """Every command that does something, such as `suite build`."""
+    return [path for path, command in _walk(_root(), "") if not hasattr(command, "commands")]
+
+
+def command_markdown(path: str) -> str:
+    """Help text and options of one command."""
+    command = _root()
+    for name in path.split():
+        command = command.commands[name]
+    rows = [row for parameter in command.params if (row := _row(parameter))]
+    table = ["| argument or option | default | meaning |", "|---|---|---|", *rows] if rows else []
+    return "\n".join([_text(command.help), "", *table])
+
+
+def _root() -> Any:
+    from probe_kit.cli import app
+
+    return typer.main.get_command(app)
+
+
+def _walk(group: Any, prefix: str) -> list[tuple[str, Any]]:
+    found = []
+    for name, command in group.commands.items():
+        path = f"{prefix} {name}".strip()
+        found.append((path, command))
+        if hasattr(command, "commands"):
+            found += _walk(command, path)
+    return found
+
+
+def _row(parameter: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in _names(parameter))
+    if "--help" in names:
+        return ""
+    default = "required" if parameter.required else _default(parameter)
+    return f"| {names} | {default} | {_text(parameter.help)} |"
+
+
+def _names(parameter: Any) -> list[str]:
+    if parameter.param_type_name == "argument":
+        return [parameter.name.upper()]
+    return [option if parameter.is_flag else f"{option} …" for option in parameter.opts]
+
+
+def _default(parameter: Any) -> str:
+    default = parameter.default
+    return "" if default is None or default is False or callable(default) else f"`{default}`"
+
+
+def _text(text: str | None) -> str:
+    """One line per paragraph; a bar would end the cell of a table."""
+    return (text or "").strip().replace("|", "\\|")

@@ -1,0 +1,66 @@
+"""Execute the notebooks and keep their outputs: `uv run python notebooks/execute.py [NAME ...]`.
+
+They run in one temporary folder, in order, so that they share what they make and know no path of this machine.
+"""
+
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import nbformat
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+FOLDER = Path(__file__).parent
+NOISE = ("pybullet build time:",)
+"""What libraries print when they are loaded; it says when they were compiled."""
+UNASKED = "TqdmWarning"
+"""Printed where ipywidgets is not installed; no output of a cell."""
+
+
+def notebooks() -> list[Path]:
+    """All notebooks, in the order in which they are meant to be read."""
+    return sorted(FOLDER.glob("*.ipynb"))
+
+
+def executed(path: Path, folder: Path) -> NotebookNode:
+    """The notebook with fresh outputs, run from top to bottom in `folder`.
+
+    Raises CellExecutionError where a cell raises.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    metadata = dict(notebook.metadata)
+    options = {"timeout": 600, "record_timing": False, "coalesce_streams": True}
+    NotebookClient(notebook, resources={"metadata": {"path": str(folder)}}, **options).execute()
+    notebook.metadata = metadata
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if _clean(output, f"{folder}/")]
+    return notebook
+
+
+def _clean(output: NotebookNode, folder: str) -> bool:
+    """Take noise and the folder's own path out of an output; whether anything is left."""
+    if output.output_type == "stream":
+        lines = output.text.replace(folder, "").splitlines(keepends=True)
+        output.text = "".join(line for line in lines if not line.startswith(NOISE))
+        return bool(output.text.strip()) and UNASKED not in output.text
+    content = output.get("data", {})
+    content.pop("image/jpeg", None)  # beside the same picture as PNG
+    for kind in ("text/plain", "text/html"):
+        if kind in content:
+            content[kind] = content[kind].replace(folder, "")
+    return True
+
+
+def main(names: list[str]) -> None:
+    """Execute all notebooks, or those whose names begin so, and write them back."""
+    with TemporaryDirectory() as folder:
+        for path in notebooks():
+            if not names or path.name.startswith(tuple(names)):
+                print(path.name, file=sys.stderr)
+                nbformat.write(executed(path, Path(folder)), path)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,102 @@
+"""The documentation builds without a warning, fetches nothing, and names every command, option and error."""
+
+import inspect
+import os
+import re
+import subprocess
+import sys
+from html import unescape
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from probe_kit import errors
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+ERRORS = [
+    error
+    for _, error in inspect.getmembers(errors, inspect.isclass)
+    if issubclass(error, errors.ProbeKitError) and error is not errors.ProbeKitError
+]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    built = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    assert "WARNING" not in built.stderr
+    return folder
+
+
+def text_of(page: Path) -> str:
+    return unescape(re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8")))
+
+
+def test_every_page_of_the_folder_is_built(site: Path) -> None:
+    pages = {path.stem for path in DOCS.glob("*.md")}
+    assert pages <= {path.stem for path in site.glob("*.html")}
+    assert len(list((site / "notebooks").glob("*.html"))) == len(list((ROOT / "notebooks").glob("*.ipynb")))
+    assert list((site / "notebooks").glob("*.png"))
+
+
+def test_a_readers_browser_fetches_nothing_from_elsewhere(site: Path) -> None:
+    loading = re.compile(r"<(?:script|img|iframe|link)[^>]*(?:src|href)=\"(https?:)?//[^\"]*\"[^>]*>")
+    found = {tag for page in site.rglob("*.html") for tag in loading.findall(page.read_text(encoding="utf-8"))}
+    assert not found
+
+
+def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> None:
+    import typer
+
+    from probe_kit.cli import app
+
+    shown = text_of(site / "commands.html")
+    todo = [("probe-kit", typer.main.get_command(app))]
+    options = 0
+    while todo:
+        name, command = todo.pop()
+        if hasattr(command, "commands"):
+            todo += [(f"{name} {child}", found) for child, found in command.commands.items()]
+            continue
+        (section,) = re.findall(rf"^{name}\W*$(.*?)(?=^probe-kit [a-z ]+\W*$|\Z)", shown, re.MULTILINE | re.DOTALL)
+        for parameter in command.params:
+            option = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name.upper()
+            assert option == "--help" or re.search(rf"(?<![\w-]){option}(?![\w-])", section), f"{name} {option}"
+            options += 1
+    assert options > 80
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.__name__)
+def test_every_error_has_its_exit_code_a_cause_and_a_way_out(error: type[errors.ProbeKitError]) -> None:
+    page = (DOCS / "errors.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `{error.__name__}` \|(.*)\|$", page, re.MULTILINE)
+    code, cause, fix = (cell.strip() for cell in re.split(r"(?<!\\)\|", row))
+    assert int(code) == error.exit_code
+    assert len(cause) > 20
+    assert len(fix) > 10
+
+
+def test_the_page_of_errors_names_no_error_that_is_none() -> None:
+    page = (DOCS / "errors.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `(\w+Error)`", page, re.MULTILINE)) == {error.__name__ for error in ERRORS}
+
+
+def test_every_public_name_is_described_in_the_reference() -> None:
+    import probe_kit
+
+    reference = re.findall(r"^::: (.+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    described = {_resolved(path) for path in reference}
+    missing = [name for name in probe_kit.__all__ if getattr(probe_kit, name) not in described]
+    assert missing == ["ProbeKitError"]  # described, with all of its children, on the page of errors
+
+
+def _resolved(path: str) -> object:
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)

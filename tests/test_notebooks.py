@@ -1,0 +1,113 @@
+"""The notebooks run from top to bottom, say what is so, and carry nothing of the machine they were made on."""
+
+import json
+import re
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from nbformat import NotebookNode
+
+from notebooks.execute import FOLDER, executed, notebooks
+from probe_kit.extract import open_run
+from probe_kit.retention import retention
+from probe_kit.train import load_results
+
+NAMES = ("01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions")
+BESIDE_EACH_OTHER = (NAMES[:3], NAMES[3:])
+"""The first three share a run; the others need none of them."""
+MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, NotebookNode]]:
+    """The folder in which all notebooks ran, and the notebooks with fresh outputs."""
+    folder = tmp_path_factory.mktemp("notebooks")
+
+    def run(names: Sequence[str]) -> list[NotebookNode]:
+        return [executed(FOLDER / f"{name}.ipynb", folder) for name in names]
+
+    with ThreadPoolExecutor(2) as pool:
+        fresh = [notebook for ran in pool.map(run, BESIDE_EACH_OTHER) for notebook in ran]
+    return folder, dict(zip(NAMES, fresh, strict=True))
+
+
+def printed(notebook: NotebookNode) -> str:
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return "\n".join(output.text for output in outputs if output.output_type == "stream")
+
+
+def kinds(notebook: NotebookNode) -> list[list[tuple[str, tuple[str, ...]]]]:
+    """Per code cell, what its outputs are: text, tables, pictures."""
+    return [
+        [(output.output_type, tuple(sorted(output.get("data", {})))) for output in cell.outputs]
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+    ]
+
+
+def test_these_are_all_notebooks() -> None:
+    assert tuple(path.stem for path in notebooks()) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_notebook_runs_and_its_committed_outputs_are_those_of_its_cells(
+    name: str, made: tuple[Path, dict[str, NotebookNode]]
+) -> None:
+    import nbformat
+
+    committed = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    assert any(outputs for outputs in kinds(committed))
+    assert kinds(made[1][name]) == kinds(committed)
+
+
+def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
+    made: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    run = open_run(made[0] / "work" / "runs" / "pi0-tiny")
+    assert not run.random_weights
+    first = min((run.path / "probes").iterdir(), key=lambda folder: load_results(run, folder.name).created)
+    rows = {row.category: row for row in retention([run], keys=[first.name]).rows}
+    assert rows["color"].sr > 0.5 + (rows["color"].delta or 1)
+    assert rows["color"].retention_defined
+    assert not rows["counting"].retention_defined
+    assert rows["counting"].sr < 0.5 + (rows["counting"].delta or 0)
+
+
+def test_the_random_twin_is_called_one_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
+    run = open_run(made[0] / "work" / "runs" / "pi0-tiny-random")
+    assert run.random_weights
+    assert not any(row.retention_defined for row in retention([run]).rows)
+
+
+def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
+    made: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    shown = printed(made[1]["04-your-own-model"])
+    assert re.search(r"\b1[0-9] passed", shown)
+    assert "failed" not in shown.lower()
+    assert "SiteNeverFiredError" in shown
+    assert open_run(made[0] / "work" / "runs" / "tiny-vla").certificate["hooks_on_equals_hooks_off"]
+
+
+def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
+    made: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    shown = printed(made[1]["05-your-own-questions"])
+    assert "0 errors" in shown
+    assert "InstructionError" in shown
+    assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 32
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_committed_outputs_hold_no_path_of_a_machine_and_no_error(name: str) -> None:
+    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"]:
+        for output in cell.get("outputs", []):
+            assert output["output_type"] != "error"
+            texts = {kind: content for kind, content in output.get("data", {}).items() if kind != "image/png"}
+            assert not MACHINE.search(json.dumps([output.get("text"), texts]))
+
+
+def test_all_notebooks_together_are_small() -> None:
+    assert sum(path.stat().st_size for path in notebooks()) < 1_500_000
