@@ -340,8 +340,8 @@ def retention(
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
     _refuse_doubles([path for paths in grouped.values() for path in paths])
-    opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
     radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
+    opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
     table = make_table(
         opened if group else opened[""], split(views), iterations=_iterations(iterations), epsilons=radii
     )

@@ -58,7 +58,7 @@ def main(
     }
     torch.manual_seed(seed)
     trainer = Trainer(policy, Heads(brushes), samplers, STAGES, seed, out)
-    early = {EARLY_STEP: lambda: write_trained(out / "pi0-tiny-early", trainer, statistics)}
+    early = {EARLY_STEP: lambda: write_trained(out / "pi0-tiny-early", trainer, statistics, torch.float16)}
     follow(trainer, out / "losses.csv", print, early)
     write_trained(out / "pi0-tiny", trainer, statistics)
     draw_losses(out / "losses.csv", out / "losses.png")

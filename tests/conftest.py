@@ -63,7 +63,7 @@ def pi0_tiny() -> "Pi0":
 def observation() -> "Observation":
     from probe_kit.hooks import Observation
 
-    image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     state = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
     return Observation(image, state, "Put the cube on the red shape")
 
@@ -78,9 +78,11 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
 
 @pytest.fixture(scope="session")
 def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
-    """A real run of pi0-tiny with all tokens: 48 episodes of four actions."""
+    """A real run of pi0-tiny's random twin with all tokens: 48 episodes of four actions."""
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run
 
-    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all")
+    settings = ExtractSettings(
+        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
+    )
     return extract_run(settings, tmp_path_factory.mktemp("runs") / "recorded")

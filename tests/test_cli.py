@@ -29,8 +29,8 @@ def probe_kit(*arguments: object, cwd: Path | None = None) -> subprocess.Complet
 def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     made = probe_kit(
-        "extract", "--model", "pi0-tiny", "--suite", small_suite.folder, "--categories", "color,shape",
-        "--max-steps", 2, "--out", run,
+        "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
+        "--categories", "color,shape", "--max-steps", 2, "--out", run,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     assert "RANDOM" in made.stderr
@@ -50,8 +50,9 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     for style in ("table", "csv", "markdown", "latex"):
         assert "random" in probe_kit("retention", run, "--format", style).stdout.lower()
     again = probe_kit(
-        "extract", "--model", "pi0-tiny", "--suite", small_suite.folder, "--max-steps", 3, "--out", run
-    )
+        "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder, "--max-steps", 3,
+        "--out", run,
+    )  # fmt: skip
     assert again.returncode == 3
     assert "scene.max_steps: stored 2, asked 3" in again.stderr
 
@@ -78,6 +79,15 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_pa
         (["models", "pi9"], 2, "unknown model 'pi9'"),
         (["extract", "--model", "pi0", "--checkpoint", "./nowhere"], 3, "does not exist"),
         (["suite", "build", "out", "--n", "7"], 2, "7"),
+        (["train", "nowhere", "--permutations", "-3"], 2, "--permutations"),
+        (["train", "nowhere", "--jobs", "0"], 2, "--jobs"),
+        (["retention", "nowhere", "./nowhere/"], 2, "given twice"),
+        (["retention", "--group", "a=one", "--group", "a=two"], 2, "given twice"),
+        (["retention", "nowhere", "--format", "csv", "--epsilons", "-1"], 2, "positive"),
+        (["verify", "pi00", "nowhere"], 2, "Did you mean 'pi0'"),
+        (["extract", "--model", "pi0-tiny", "--device", "nonsense"], 2, "cannot be used"),
+        (["extract", "--model", "pi0-tiny", "--dtype", "int8"], 2, "float32, bfloat16"),
+        (["demo", "--out", "/dev/null/demo"], 2, "Give another path"),
     ],
 )  # fmt: skip
 def test_bad_input_is_a_clear_error_with_the_contracts_exit_code(
@@ -154,7 +164,7 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
 def test_the_demo_makes_everything_it_promises(tmp_path: Path) -> None:
     answer = probe_kit("demo", "--out", tmp_path / "demo")
     assert answer.returncode == 0, answer.stderr
-    assert "random weights" in answer.stdout
+    assert "knowledge" in answer.stdout
     for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif", "report.html"):
         assert (tmp_path / "demo" / name).is_file()
 

@@ -71,8 +71,6 @@ def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     rows = {row.category: row for row in retention([run], keys=[first.name]).rows}
     assert rows["color"].sr > 0.5 + (rows["color"].delta or 1)
     assert rows["color"].retention_defined
-    assert not rows["counting"].retention_defined
-    assert rows["counting"].sr < 0.5 + (rows["counting"].delta or 0)
 
 
 def test_the_random_twin_is_called_one_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
@@ -97,7 +95,7 @@ def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     shown = printed(made[1]["05-your-own-questions"])
     assert "0 errors" in shown
     assert "InstructionError" in shown
-    assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 32
+    assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 24
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -266,7 +266,8 @@ class LerobotFlow(Policy):
     @cached_property
     def window(self) -> PictureWindow:
         """The part of the picture this checkpoint looks at."""
-        return read_window(self.folder, f"{IMAGES}{self.cameras[0]}")
+        camera = f"{IMAGES}{self.cameras[0]}"
+        return read_window(self.folder, camera, tuple(self.config.image_features[camera].shape[-2:]))
 
     @cached_property
     def state_units(self) -> Normaliser:

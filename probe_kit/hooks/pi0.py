@@ -102,7 +102,7 @@ def load_pi0(checkpoint: str, device: str = "cpu", dtype: str | None = None, ran
 def load_pi0_tiny(
     checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
 ) -> Pi0:
-    """The embedded default: pi0 at 0.76 million parameters, trained on Color and Shape."""
+    """The embedded default: pi0 at 0.82 million parameters, trained on Color and Shape."""
     return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights)
 
 

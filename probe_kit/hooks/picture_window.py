@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 
@@ -17,14 +18,19 @@ class PictureWindow:
     """Crop, then resize (bilinear, antialiased) as lerobot's `ImageCropResizeProcessorStep` does.
 
     crop: top, left, height, width in pixels of the camera, or None. size: (height, width) after, or None.
+    camera: (height, width) of the pictures that `crop` was chosen on; others are brought to it first, with their
+    proportions kept by padding, as pi0 brings pictures to its own resolution. None for any.
     """
 
     crop: tuple[int, int, int, int] | None = None
     size: tuple[int, int] | None = None
+    camera: tuple[int, int] | None = None
 
     def __call__(self, pictures: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] to what the policy looks at. Raises ObservationError if the crop lies outside."""
         if self.crop is not None:
+            if self.camera is not None and self.camera != tuple(pictures.shape[-2:]):
+                pictures = resize_with_pad_torch(pictures, *self.camera)
             top, left, height, width = self.crop
             if top + height > pictures.shape[-2] or left + width > pictures.shape[-1]:
                 raise ObservationError(
@@ -37,8 +43,10 @@ class PictureWindow:
         return pictures
 
 
-def read_window(folder: Path, camera: str) -> PictureWindow:
+def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) -> PictureWindow:
     """The window of one camera (`observation.images.<name>`); the whole picture if the checkpoint names none.
+
+    size: (height, width) of that camera, as the checkpoint's configuration declares it.
 
     Raises CheckpointError if the step holds something else than lerobot writes.
     """
@@ -48,8 +56,8 @@ def read_window(folder: Path, camera: str) -> PictureWindow:
         if step["registry_name"] == STEP:
             try:
                 crop = (step["config"].get("crop_params_dict") or {}).get(camera)
-                size = step["config"].get("resize_size")
-                return PictureWindow(_crop(*crop) if crop else None, _size(*size) if size else None)
+                after = step["config"].get("resize_size")
+                return PictureWindow(_crop(*crop) if crop else None, _size(*after) if after else None, size)
             except TypeError as error:
                 raise CheckpointError(f"{path}: {STEP} cannot be read: {error}") from error
     return PictureWindow()

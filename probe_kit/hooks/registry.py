@@ -96,7 +96,7 @@ def _import(path: str) -> Callable[..., Any]:
 _EMBEDDED = (
     Family(
         "pi0-tiny",
-        "pi0 at 0.76 million parameters, the embedded default: trained on Color and Shape",
+        "pi0 at 0.82 million parameters, the embedded default: trained on Color and Shape",
         None,
         "probe_kit.hooks.pi0:load_pi0_tiny",
         streams="backbone 4 layers, expert 4 layers x 10 iterations",

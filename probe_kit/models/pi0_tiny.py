@@ -1,4 +1,4 @@
-"""The embedded default: a pi0 of 0.76 million parameters, written as an ordinary lerobot checkpoint.
+"""The embedded default: a pi0 of 0.82 million parameters, written as an ordinary lerobot checkpoint.
 
 Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_pi0_tiny.py` makes them.
 """
@@ -96,7 +96,7 @@ def write_checkpoint(
 def _config() -> PI0Config:
     return PI0Config(
         input_features={
-            CAMERA: PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIDE, IMAGE_SIDE)),
+            CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 480, 640)),
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},

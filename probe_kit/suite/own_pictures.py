@@ -81,7 +81,7 @@ def suite_from_pictures(
     refuse_foreign_folder(folder)
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
-    terms = {
+    terms: dict[str, str | bool] = {
         "license": license,
         "attribution": attribution,
         "redistributable": redistributable,

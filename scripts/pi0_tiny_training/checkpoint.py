@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from pi0_tiny_training.demonstrations import Demonstrations
 from pi0_tiny_training.training import Trainer
@@ -22,10 +23,12 @@ def measured_statistics(demonstrations: Demonstrations) -> Statistics:
     }
 
 
-def write_trained(folder: Path, trainer: Trainer, statistics: Statistics) -> None:
+def write_trained(
+    folder: Path, trainer: Trainer, statistics: Statistics, dtype: torch.dtype = torch.float32
+) -> None:
     """The policy as it stands, without the heads."""
     note = f"trained, {trainer.step} steps, seed {trainer.seed}"
-    write_checkpoint(folder, trainer.policy.network, statistics, note)
+    write_checkpoint(folder, trainer.policy.network, statistics, note, dtype)
 
 
 def draw_losses(log: Path, picture: Path) -> None:

@@ -47,3 +47,13 @@ def test_a_broken_step_names_the_file(tmp_path: Path) -> None:
     write_step(tmp_path, {"crop_params_dict": {CAMERA: [1, 2, 3]}})
     with pytest.raises(CheckpointError, match="policy_preprocessor"):
         read_window(tmp_path, CAMERA)
+
+
+def test_a_smaller_picture_is_brought_to_the_size_the_crop_was_chosen_on() -> None:
+    window = PictureWindow(crop=(10, 0, 20, 40), size=(20, 40), camera=(40, 40))
+    whole = torch.linspace(0, 1, 40).expand(1, 3, 40, 40)
+    halved = torch.nn.functional.interpolate(whole, (20, 20), mode="area")
+    assert (window(halved) - window(whole)).abs().max() < 0.02
+    wide = window(torch.ones(1, 3, 10, 40))
+    assert float(wide[..., 0, :].max()) == 0.0, "padding is black"
+    assert float(wide[..., 10, :].min()) == pytest.approx(1.0)

@@ -11,9 +11,11 @@ def test_an_unknown_model_is_refused_with_the_nearest_name() -> None:
         load_policy("pi0-tyni")
 
 
-def test_the_embedded_default_says_that_its_weights_are_random() -> None:
-    assert "random weights" in families()["pi0-tiny"].notes
-    assert load_policy("pi0-tiny").card.random_weights
+def test_the_embedded_policies_are_trained_and_differ() -> None:
+    trained, early = load_policy("pi0-tiny").card, load_policy("pi0-tiny-early").card
+    assert not trained.random_weights
+    assert not early.random_weights
+    assert trained.weights_sha256 != early.weights_sha256
 
 
 def test_a_checkpoint_folder_that_is_not_there_is_refused() -> None:
@@ -26,7 +28,7 @@ def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pyte
     entry = SimpleNamespace(load=lambda: mine)
     monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == "probe_kit.policies" else [])
     assert families()["mine"] is mine
-    assert load_policy("mine").card.random_weights
+    assert load_policy("mine", random_weights=True).card.random_weights
 
 
 def test_a_third_party_cannot_replace_an_embedded_family(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,6 +100,7 @@ def test_the_hash_names_every_bit(checkpoint: Path) -> None:
 
 
 def test_the_random_mark_travels_in_the_weights_file(checkpoint: Path) -> None:
+    save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE, metadata=RANDOM)
     assert load_pi0(str(checkpoint)).card.random_weights
     save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE)
     assert not load_pi0(str(checkpoint)).card.random_weights
