@@ -82,7 +82,7 @@ def test_a_batch_equals_its_rows_one_by_one(pi0_tiny: Pi0, observation: Observat
 
 def test_actions_have_the_shape_of_the_contract(pi0_tiny: Pi0, observation: Observation) -> None:
     chunk = pi0_tiny.act([observation], [0])
-    assert chunk.shape == (1, 8, 7)
+    assert chunk.shape == (1, 16, 7)
     assert chunk.dtype == np.float32
     assert np.isfinite(chunk).all()
 
