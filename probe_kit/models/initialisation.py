@@ -10,13 +10,15 @@ def initialise(network: nn.Module, seed: int) -> None:
     """Fill every parameter with random numbers of a scale that keeps activations of order one.
 
     Matrices N(0, 1/fan_in), residual outputs half of that, embeddings 1/sqrt(width), position embeddings
-    0.5, biases and norms untouched. Drawn by numpy in name order, so that a seed means the same bits
+    0.5, biases zero, norms untouched. Drawn by numpy in name order, so that a seed means the same bits
     on every machine.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     residual_outputs = ("o_proj.weight", "out_proj.weight", "down_proj.weight", "fc2.weight")
     for name, parameter in sorted(network.named_parameters()):
         if parameter.ndim < 2:
+            if name.endswith("bias"):
+                parameter.zero_()  # torch draws them from its global generator
             continue
         scale = 1 / float(np.sqrt(parameter[0].numel()))
         if "position_embedding" in name or "pos_embed" in name:

@@ -1,0 +1,49 @@
+"""The verdict over a row, and the truths the organisms were made to have."""
+
+import pytest
+
+from probe_kit.console import out
+from probe_kit.organisms import ORGANISMS, TRAINED, Finding, to_rich, verdict
+from probe_kit.retention import RetentionRow
+
+
+def row(sr: float, p: float | None) -> RetentionRow:
+    return RetentionRow(
+        "run", "pi0-tiny", False, "0" * 64, "suite@1", "s", "p", "color", "mean", 48, 24, sr,
+        delta=0.14, prefix_accuracy=0.9, prefix_p_fwe=p,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sr", "p", "expected"),
+    [
+        (0.9, 0.005, "used"),
+        (0.64, 0.005, "encoded, unused"),
+        (0.02, 0.005, "encoded, unused"),
+        (0.5, 0.2, "absent"),
+        (0.5, None, "absent"),
+        (0.9, 0.2, "acted on, not found"),
+    ],
+)
+def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_on(
+    sr: float, p: float | None, expected: str
+) -> None:
+    assert verdict(row(sr, p)) == expected
+
+
+def test_only_the_trained_organism_knows_anything() -> None:
+    assert TRAINED.expected("state") == "encoded, unused"
+    assert TRAINED.expected("counting") == "absent"
+    assert {organism.expected("color") for organism in ORGANISMS if organism != TRAINED} == {"absent"}
+
+
+def test_the_table_counts_the_true_verdicts() -> None:
+    findings = [
+        Finding("trained", "color", "used", "used", row(0.9, 0.005)),
+        Finding("trained", "state", "encoded, unused", "absent", row(0.5, 0.3)),
+    ]
+    with out.capture() as printed:
+        out.print(to_rich(findings), width=100)
+    text = printed.get()
+    assert "1 of 2 verdicts are true" in text
+    assert "encoded" in text
