@@ -111,18 +111,14 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     n_items = int(episodes["item_id"].nunique())
     delta = chance_margin(len(episodes))
     name, reason = regime(sr, delta, p_wrong, p_oob)
-    if correct.nunique() == 1:
-        ci = _exact_interval(sr, n_items)
-    else:
-        low, high = group_bootstrap(correct.to_numpy()[:, None], episodes["item_id"].to_numpy(dtype=str), seed)
-        ci = float(low[0]), float(high[0])
+    low, high = group_bootstrap(correct.to_numpy(bool)[:, None], episodes["item_id"].to_numpy(dtype=str), seed)
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
     return SuccessRate(
         n_episodes=len(episodes),
         n_items=n_items,
         sr=sr,
-        ci=ci,
+        ci=(float(low[0]), float(high[0])),
         sr_original=original,
         sr_swapped=swapped,
         layout_mean=None if original is None or swapped is None else (original + swapped) / 2,
@@ -138,12 +134,6 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         side_preference=_rate(placed == "left"),
         paired=paired_items(episodes),
     )
-
-
-def _exact_interval(rate: float, items: int) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval where all items agree and a bootstrap would have no width."""
-    reach = 0.025 ** (1 / items)
-    return (reach, 1.0) if rate == 1 else (0.0, 1 - reach)
 
 
 def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:

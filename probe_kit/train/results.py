@@ -22,7 +22,7 @@ from probe_kit.train.targets import Target
 if TYPE_CHECKING:
     import pandas as pd
 
-FORMAT = 2  # raise when settings have other fields or would give other numbers
+FORMAT = 3  # raise when settings have other fields or would give other numbers
 
 
 @dataclass(frozen=True)

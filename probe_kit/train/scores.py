@@ -54,8 +54,14 @@ def group_bootstrap(
     """95 % percentile interval of the mean over episodes, with whole groups resampled.
 
     values: (E, S), a score per episode in each of S columns. groups: (E,). Returns low and high, (S,) each.
+    Where all of a column's truth values agree, resampling has no width and would claim certainty: there it is
+    Clopper and Pearson's interval, with a group as one trial.
     """
     low, high = np.percentile(bootstrap_means(values, groups, seed, draws), [2.5, 97.5], axis=0)
+    if values.dtype == np.bool_:
+        reach = 0.025 ** (1 / np.unique(np.asarray(groups)).size)
+        low = np.where(values.all(axis=0), reach, low)
+        high = np.where(values.any(axis=0), high, 1 - reach)
     return low, high
 
 

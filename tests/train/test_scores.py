@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 from sklearn import metrics
 
 from probe_kit.train.folds import Fold
@@ -42,6 +43,15 @@ def test_interval_widens_when_episodes_of_a_group_agree() -> None:
     low, high = group_bootstrap(right, np.arange(200) // 4, seed=0)
     low_ungrouped, high_ungrouped = group_bootstrap(right, np.arange(200), seed=0)
     assert high - low == pytest.approx(2 * (high_ungrouped - low_ungrouped), rel=0.15)
+
+
+def test_an_interval_where_all_agree_is_that_of_clopper_and_pearson_over_groups() -> None:
+    right = np.array([[True, False, True], [True, False, False]]).repeat(20, axis=0)
+    low, high = group_bootstrap(right, np.arange(40) // 4, seed=0)
+    exact = binomtest(10, 10).proportion_ci()
+    assert (low[0], high[0]) == (pytest.approx(exact.low), 1.0)
+    assert (low[1], high[1]) == (0.0, pytest.approx(1 - exact.low))
+    assert 0.0 < low[2] < high[2] < 1.0
 
 
 def test_interval_covers_the_truth_nineteen_times_in_twenty() -> None:
