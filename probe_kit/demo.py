@@ -1,25 +1,20 @@
 """The whole pipeline on the embedded default, small enough to watch: what `probe-kit demo` runs."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import Run
 from probe_kit.extract.layout import VIDEOS
-from probe_kit.organisms import Finding, compare
+from probe_kit.organisms import TRAINED, Finding, Stage, compare, probed
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
 from probe_kit.suite import Suite, build_suite
-from probe_kit.train import train_probes
 
 CATEGORIES = ("color", "shape", "state", "counting")
 ITEMS = 24
 PERMUTATIONS = 200
-
-Progress = Callable[..., None]
-Stage = Callable[[str], Progress]
 
 
 @dataclass(frozen=True)
@@ -61,10 +56,7 @@ def run_demo(folder: Path, stage: Stage) -> Demo:
 
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
-    suite = _questions(folder, stage)
-    settings = ExtractSettings("pi0-tiny", suite=suite.folder, video="first")
-    run = extract_run(settings, folder / "run", progress=stage("episodes"))
-    results = train_probes(run, permutations=PERMUTATIONS, progress=stage("probing sites"))
+    run, results = probed(TRAINED, _questions(folder, stage), folder, PERMUTATIONS, stage)
     table = retention([run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     (folder / "table.md").write_text(table.to_markdown())

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.retention import RetentionRow, retention
 from probe_kit.retention.cells import debiased_value, number, percent
 from probe_kit.suite import Suite
-from probe_kit.train import train_probes
+from probe_kit.train import ProbeResults, train_probes
+from probe_kit.train.controls import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,15 +23,16 @@ if TYPE_CHECKING:
 Verdict = Literal["used", "encoded, unused", "absent", "acted on, not found"]
 Stage = Callable[[str], Callable[..., None]]
 
-SIGNIFICANT = 0.05
-"""Family-wise p below which the backbone knows the answer."""
-
 
 @dataclass(frozen=True)
 class Organism:
-    """A policy by its model name, and the verdict that is true of it per category; `absent` if not named."""
+    """A policy by its model name, and the verdict that is true of it per category; `absent` if not named.
+
+    folder: what its run is called.
+    """
 
     name: str
+    folder: str
     model: str
     random_weights: bool = False
     truth: tuple[tuple[str, Verdict], ...] = ()
@@ -41,12 +43,12 @@ class Organism:
 
 
 TRAINED = Organism(
-    "trained", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
+    "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
 )
 ORGANISMS = (
     TRAINED,
-    Organism("early", "pi0-tiny-early"),
-    Organism("random twin", "pi0-tiny", random_weights=True),
+    Organism("early", "run-early", "pi0-tiny-early"),
+    Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True),
 )
 
 
@@ -72,30 +74,35 @@ def verdict(row: RetentionRow) -> Verdict:
     In the backbone: its best site is family-wise significant. Acted on: the SR is above 0.5 + Δ. *Acted on, not
     found* is a contradiction, and true of no policy: the instrument missed what the policy plainly reads.
     """
-    known = row.prefix_p_fwe is not None and row.prefix_p_fwe < SIGNIFICANT
+    known = row.prefix_p_fwe is not None and row.prefix_p_fwe < SIGNIFICANCE
     if row.delta is not None and row.sr > 0.5 + row.delta:
         return "used" if known else "acted on, not found"
     return "encoded, unused" if known else "absent"
 
 
-def compare(suite: Suite, folder: Path, permutations: int, stage: Stage) -> list[Finding]:
-    """Extract, probe and judge every organism on `suite`; runs lie in `folder`, finished ones are reused.
+def probed(
+    organism: Organism, suite: Suite, folder: Path, permutations: int, stage: Stage
+) -> tuple[Run, ProbeResults]:
+    """The organism's run on `suite`, in `folder`, and its probes; what is finished is reused.
 
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
-    findings = []
-    for organism in ORGANISMS:
-        settings = ExtractSettings(
-            organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
-        )
-        place = folder / ("run" if organism == TRAINED else f"run-{organism.name.replace(' ', '-')}")
-        run = extract_run(settings, place, progress=stage(f"episodes, {organism.name}"))
-        train_probes(run, permutations=permutations, progress=stage(f"probing, {organism.name}"))
-        findings += [
-            Finding(organism.name, row.category, organism.expected(row.category), verdict(row), row)
-            for row in retention([run]).rows
-        ]
-    return findings
+    settings = ExtractSettings(
+        organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
+    )
+    run = extract_run(settings, folder / organism.folder, progress=stage(f"episodes, {organism.name}"))
+    progress = stage(f"probing sites, {organism.name}")
+    return run, train_probes(run, permutations=permutations, progress=progress)
+
+
+def compare(suite: Suite, folder: Path, permutations: int, stage: Stage) -> list[Finding]:
+    """Judge every organism on `suite`; arguments as of `probed`."""
+    runs = [(organism, probed(organism, suite, folder, permutations, stage)[0]) for organism in ORGANISMS]
+    return [
+        Finding(organism.name, row.category, organism.expected(row.category), verdict(row), row)
+        for organism, run in runs
+        for row in retention([run]).rows
+    ]
 
 
 def to_rich(findings: Sequence[Finding]) -> "Table":

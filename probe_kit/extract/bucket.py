@@ -25,7 +25,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
-from probe_kit.extract.extras import require
+from probe_kit.extras import require
 from probe_kit.extract.location import Location
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.extras import require
+from probe_kit.extras import require
 from probe_kit.extract.layout import StoredStream
 from probe_kit.extract.location import Location
 from probe_kit.extract.rows import Rows

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from probe_kit.extract.commits import commit_key
-from probe_kit.extract.extras import require
+from probe_kit.extras import require
 from probe_kit.extract.location import locate
 from probe_kit.extract.scheduler import Done, Event, Scheduler
 from probe_kit.extract.settings import ExtractSettings

@@ -42,6 +42,7 @@ WINDOW = {"crop": (70, 100, 280, 540), "size": (IMAGE_SIDE, IMAGE_SIDE)}
 """Of the 480 x 640 camera picture, the part that holds both tiles: top, left, height, width."""
 ACTION_DIMS = (0, 1, 2, 6)
 """What the policy decides: x, y, z and the gripper. It never turns the hand."""
+IDLE_DIMS = (3, 4, 5)
 
 Statistics = Mapping[str, tuple[ArrayLike, ArrayLike]]
 """Mean and standard deviation per feature, in metres, radians and openness (1 open, 0 closed)."""
@@ -66,7 +67,7 @@ def new_pi0_tiny(seed: int) -> PI0Policy:
     """
     policy = build_pi0(_config(), SIZE)
     initialise(policy, seed)
-    idle = [dimension for dimension in range(7) if dimension not in ACTION_DIMS]
+    idle = list(IDLE_DIMS)
     with torch.no_grad():
         policy.model.action_in_proj.weight[:, idle] = 0.0
         policy.model.action_out_proj.weight[idle] = 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pi0_tiny_training.window import seen_by_policy
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
 from probe_kit.env.scene import SIDES
-from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK
+from probe_kit.models.pi0_tiny import CHUNK, IDLE_DIMS
 
 NOISE = 0.007
 """Standard deviation, metres, of what is added to an executed action of 4 cm or more."""
@@ -154,7 +154,7 @@ def _frames(
     rest[:, 6] = 1.0
     padded = np.concatenate([actions, rest])
     chunks = np.stack([padded[k : k + CHUNK] for k in range(length)])
-    chunks[..., [d for d in range(actions.shape[1]) if d not in ACTION_DIMS]] = 0.0
+    chunks[..., list(IDLE_DIMS)] = 0.0
     return Demonstrations(pictures, tiles, states, chunks, np.full(length, side, np.int8), np.zeros(length, bool))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from pi0_tiny_training.batches import Batch, Sampler
 from pi0_tiny_training.heads import Heads, listening
 from probe_kit.hooks.pi0 import Pi0
-from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK
+from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
 
 SAVE_EVERY = 100
 BATCH_SIZE = 32
@@ -132,9 +132,8 @@ class Trainer:
         return {"flow": flow, **self.heads.losses(heard, batch, words)}
 
     def _keep_idle_dimensions_idle(self) -> None:
-        idle = [dimension for dimension in range(7) if dimension not in ACTION_DIMS]
         if self.model.action_in_proj.weight.grad is not None:
-            self.model.action_in_proj.weight.grad[:, idle] = 0.0
+            self.model.action_in_proj.weight.grad[:, list(IDLE_DIMS)] = 0.0
 
     def _save(self) -> None:
         state = {
