@@ -27,8 +27,8 @@ from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from torch import Tensor, nn
 
 from probe_kit.hooks.capture_context import capture
-from probe_kit.hooks.lerobot_flow import IMAGES, MASK, STATE, TOKENS
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.lerobot_flow import IMAGES, MASK, STATE, TOKENS
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.roles import Roles, pool, view_names
 from probe_kit.hooks.sites import Site
 from probe_kit.models.initialisation import initialise

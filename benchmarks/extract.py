@@ -19,12 +19,12 @@ import zarr
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, open_run, prepare, seal
-from probe_kit.extract.layout import CODECS, StoredStream
-from probe_kit.extract.location import locate
 from probe_kit.extract.plan import Plan, make_plan
-from probe_kit.extract.rollout import Rollout
-from probe_kit.extract.staging import EpisodeBuffers
-from probe_kit.extract.writer import RunWriter
+from probe_kit.extract.play.rollout import Rollout
+from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.extract.store.layout import CODECS, StoredStream
+from probe_kit.extract.store.location import locate
+from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Observation
 from probe_kit.hooks.sites import Site
 from probe_kit.models import pi0_tiny

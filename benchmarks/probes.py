@@ -20,7 +20,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
-from probe_kit.extract.rows import TokenBlock
+from probe_kit.extract.store.rows import TokenBlock
 from probe_kit.train.features import Coordinates
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site

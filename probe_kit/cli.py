@@ -147,7 +147,7 @@ def models(
 
 
 def _model_rows(name: str | None) -> list[dict[str, str]]:
-    from probe_kit.extract.controllers import SCRIPTED
+    from probe_kit.extract.play.controllers import SCRIPTED
     from probe_kit.hooks.registry import families, find_family
 
     chosen = list(families().values())

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from probe_kit.extract import Run
-from probe_kit.extract.layout import VIDEOS
+from probe_kit.extract.store.layout import VIDEOS
 from probe_kit.organisms import TRAINED, Finding, Stage, compare, probed
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.displays import layer_curve

@@ -19,7 +19,7 @@ from pi0_tiny_training.pictures import PictureBank
 from pi0_tiny_training.training import KICKED, STAGES, STEADY, Trainer, follow
 
 from probe_kit.env import SceneSpec
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.pi0_tiny import new_pi0_tiny, write_checkpoint
 
 CATEGORIES = {"shape": 0.42, "color": 0.28, UNUSED: 0.30}

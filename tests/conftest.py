@@ -11,7 +11,7 @@ import pytest
 if TYPE_CHECKING:
     from probe_kit.extract import Run
     from probe_kit.hooks import Observation
-    from probe_kit.hooks.pi0 import Pi0
+    from probe_kit.hooks.families.pi0.adapter import Pi0
     from probe_kit.suite import Suite
 
 SHARED = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[2] / "shared"))
@@ -54,7 +54,7 @@ def golden_prismatic() -> Path:
 
 @pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
-    from probe_kit.hooks.pi0 import load_pi0_tiny
+    from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 
     return load_pi0_tiny()
 

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.extract.export import export_run
     from probe_kit.extract.extraction import Extraction, extract_run, prepare
-    from probe_kit.extract.location import Location, locate
-    from probe_kit.extract.run import Run, open_run
-    from probe_kit.extract.sealing import seal
     from probe_kit.extract.settings import ExtractSettings
-    from probe_kit.extract.verify import Verification, verify_run
+    from probe_kit.extract.store.audit import Verification, verify_run
+    from probe_kit.extract.store.export import export_run
+    from probe_kit.extract.store.location import Location, locate
+    from probe_kit.extract.store.run import Run, open_run
+    from probe_kit.extract.store.sealing import seal
 
 __all__ = [
     "ExtractSettings",
@@ -33,15 +33,15 @@ __getattr__ = lazy_names(
     {
         "ExtractSettings": "settings",
         "Extraction": "extraction",
-        "export_run": "export",
+        "export_run": "store.export",
         "extract_run": "extraction",
         "prepare": "extraction",
-        "Location": "location",
-        "locate": "location",
-        "Run": "run",
-        "open_run": "run",
-        "seal": "sealing",
-        "Verification": "verify",
-        "verify_run": "verify",
+        "Location": "store.location",
+        "locate": "store.location",
+        "Run": "store.run",
+        "open_run": "store.run",
+        "seal": "store.sealing",
+        "Verification": "store.audit",
+        "verify_run": "store.audit",
     },
 )

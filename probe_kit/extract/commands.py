@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.extract import Extraction, Run
-    from probe_kit.extract.location import Location
+    from probe_kit.extract.store.location import Location
 
 run_app = typer.Typer(help="Look after runs.", no_args_is_help=True)
 DAMAGED = 1
@@ -123,7 +123,7 @@ def extract(
     """
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, prepare
-    from probe_kit.extract.location import locate
+    from probe_kit.extract.store.location import locate
 
     options = {
         "unnorm_key": unnorm_key,
@@ -269,7 +269,7 @@ def export(
 ) -> None:
     """Write a run as one ordinary file, with its sha256 beside it."""
     from probe_kit.extract import export_run
-    from probe_kit.extract.location import locate
+    from probe_kit.extract.store.location import locate
 
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")

@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import EpisodesFailedError, StoreError
-from probe_kit.extract.commits import write_failure
-from probe_kit.extract.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
-from probe_kit.extract.disk import refuse_if_full
-from probe_kit.extract.layout import RUN_FILE
-from probe_kit.extract.location import Location, locate
+from probe_kit.extract.crews.processes import run_here, run_in_processes, run_on_ray
+from probe_kit.extract.crews.scheduler import Done, Event, Scheduler
 from probe_kit.extract.plan import Plan, make_plan
-from probe_kit.extract.run import Run, open_run
-from probe_kit.extract.scheduler import Done, Event, Scheduler
-from probe_kit.extract.sealing import seal
+from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
+from probe_kit.extract.play.worker import Worker
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.transports import run_here, run_in_processes, run_on_ray
-from probe_kit.extract.worker import Worker
-from probe_kit.extract.writer import RunWriter
+from probe_kit.extract.store.commits import write_failure
+from probe_kit.extract.store.disk import refuse_if_full
+from probe_kit.extract.store.layout import RUN_FILE
+from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.run import Run, open_run
+from probe_kit.extract.store.sealing import seal
+from probe_kit.extract.store.writer import RunWriter
 from probe_kit.identity import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.extract.layout import StoredStream
+from probe_kit.extract.store.layout import StoredStream
 from probe_kit.identity import derive_seed
 from probe_kit.suite import Episode, Suite
 

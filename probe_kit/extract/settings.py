@@ -7,7 +7,7 @@ from typing import Any
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
-from probe_kit.extract.layout import CODECS
+from probe_kit.extract.store.layout import CODECS
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")

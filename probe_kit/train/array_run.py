@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.extract.location import Location, locate
+from probe_kit.extract.store.location import Location, locate
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.identity import sha256_json
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.extract.rows import TokenBlock
+    from probe_kit.extract.store.rows import TokenBlock
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class ArrayRun:
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
         """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
-        from probe_kit.extract.rows import TokenBlock
+        from probe_kit.extract.store.rows import TokenBlock
 
         yield TokenBlock(0, *self.tokens(site, role))
 

@@ -7,7 +7,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.extract.location import Location
+from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site
 
 Place = tuple[str, str, Site]

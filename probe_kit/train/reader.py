@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.extract.location import Location
+from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site, Stream
 
 if TYPE_CHECKING:

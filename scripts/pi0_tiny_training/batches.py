@@ -12,7 +12,7 @@ from pi0_tiny_training.demonstrations import Demonstrations
 from pi0_tiny_training.painting import Brush
 from pi0_tiny_training.pictures import CONCEPTS, PictureBank
 from probe_kit.env.question import Question
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 
 UNUSED = "state"
 """The category whose answer is made readable but never acted on."""

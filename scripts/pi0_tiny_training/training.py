@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pi0_tiny_training.batches import Batch, Sampler
 from pi0_tiny_training.heads import Heads, listening
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
 
 SAVE_EVERY = 100

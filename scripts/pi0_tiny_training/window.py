@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from probe_kit.hooks.picture_window import PictureWindow
+from probe_kit.hooks.families.lerobot_window import PictureWindow
 from probe_kit.models.pi0_tiny import WINDOW
 
 

@@ -16,11 +16,11 @@ from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from probe_kit.extract import commits, sealing, writer
-from probe_kit.extract.layout import StoredStream
-from probe_kit.extract.location import Location, locate
 from probe_kit.extract.plan import Plan, make_plan
-from probe_kit.extract.rollout import Rollout
-from probe_kit.extract.staging import EpisodeBuffers
+from probe_kit.extract.play.rollout import Rollout
+from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.extract.store.layout import StoredStream
+from probe_kit.extract.store.location import Location, locate
 from probe_kit.suite import load_suite
 
 STREAMS = [

@@ -10,7 +10,7 @@ import zarr
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract import Run, open_run, seal
-from probe_kit.extract.run import NotSealedWarning
+from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.hooks.sites import Site
 
 SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))
@@ -52,7 +52,7 @@ def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy:
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = tree(copy)
     shutil.rmtree(copy / "columns.zarr")
-    monkeypatch.setattr("probe_kit.extract.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
+    monkeypatch.setattr("probe_kit.extract.store.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
     seal(copy)
     assert tree(copy) == before
 

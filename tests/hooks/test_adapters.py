@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from probe_kit.hooks import Observation
-from probe_kit.hooks.pi0 import Pi0, load_pi0
-from probe_kit.hooks.smolvla import SmolVLA, load_smolvla
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.smolvla.adapter import SmolVLA, load_smolvla
 from probe_kit.hooks.testing import AdapterContract, example_observations
 
 GOLDEN_TASKS = ["open the drawer", "pick up the red cube and place it on the tray"]

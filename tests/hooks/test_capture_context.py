@@ -7,7 +7,7 @@ import torch
 
 from probe_kit.errors import CaptureError, NonFiniteActivationError, SiteFiredTooOftenError, SiteNeverFiredError
 from probe_kit.hooks import Observation, Site, capture, edit
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 
 
 def hooks_on(policy: Pi0) -> int:

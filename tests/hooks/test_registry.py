@@ -24,7 +24,7 @@ def test_a_checkpoint_folder_that_is_not_there_is_refused() -> None:
 
 
 def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    mine = Family("mine", "a family of my own", None, "probe_kit.hooks.pi0:load_pi0_tiny")
+    mine = Family("mine", "a family of my own", None, "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny")
     entry = SimpleNamespace(load=lambda: mine)
     monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == "probe_kit.policies" else [])
     assert families()["mine"] is mine

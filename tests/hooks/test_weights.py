@@ -9,7 +9,7 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import WeightsError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.pi0 import Pi0, load_pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.weights import INDEX_FILE, SINGLE_FILE, read_weights
 from probe_kit.models.pi0_tiny import embedded_checkpoint
 

@@ -7,7 +7,7 @@ import torch
 from safetensors import safe_open
 
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.pi0_tiny import ACTION_DIMS, embedded_checkpoint
 from probe_kit.suite import build_suite
 

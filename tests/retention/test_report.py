@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.thumbnails import write_thumbnail
+from probe_kit.extract.store.thumbnails import write_thumbnail
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import episode_grid

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.extract.thumbnails import write_thumbnail
+from probe_kit.extract.store.thumbnails import write_thumbnail
 from probe_kit.retention.report import write_report
 from probe_kit.train import ArrayRun
 

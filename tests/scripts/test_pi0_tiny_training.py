@@ -16,7 +16,7 @@ from pi0_tiny_training.window import seen_by_policy
 
 from probe_kit.env import SceneSpec
 from probe_kit.env.scene import SIDES, Scene
-from probe_kit.hooks.pi0 import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.pi0_tiny import ACTION_DIMS, GUESSED, new_pi0_tiny, write_checkpoint
 from probe_kit.suite.generators import GENERATORS
 from probe_kit.suite.generators.couples import draw_couples

@@ -5,7 +5,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.extract.rows import TokenBlock
+from probe_kit.extract.store.rows import TokenBlock
 from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import STRENGTHS, NestedFold, nested_folds, probe_site

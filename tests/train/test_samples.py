@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
-from probe_kit.extract.rows import TokenBlock
+from probe_kit.extract.store.rows import TokenBlock
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun
 from probe_kit.train.samples import Samples, read_samples, role_of, sites_of

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.extract.thumbnails import read_thumbnail
+from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.train.reader import RunReader
 
 PICTURES = 4000

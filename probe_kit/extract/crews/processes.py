@@ -1,0 +1,158 @@
+"""Ways of working: in this process, or in several. Only episode numbers and outcomes travel between processes."""
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING
+
+from probe_kit.child import Child
+from probe_kit.errors import ProbeKitError, WorkerDiedError
+from probe_kit.extract.crews.scheduler import Event, Scheduler
+from probe_kit.extract.play.worker import Worker
+from probe_kit.extract.settings import ExtractSettings
+
+if TYPE_CHECKING:
+    from probe_kit.extract.extraction import Extraction
+    from probe_kit.extract.store.writer import RunWriter
+
+Listener = Callable[[Event], None]
+MORE = "more"
+
+
+def run_here(extraction: "Extraction", writer: "RunWriter", scheduler: Scheduler, heard: Listener) -> None:
+    """Play every episode in this process, with the model that is loaded."""
+    assert extraction.controller is not None
+    episodes = len(writer.remaining())
+    with Worker(writer, extraction.settings, extraction.controller, episodes) as worker:
+        while not scheduler.finished:
+            for event in worker.run(lambda: scheduler.take(0)):
+                scheduler.hear(0, event)
+                heard(event)
+
+
+def run_in_processes(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
+    """Play the episodes in `settings.workers` processes; one that dies is replaced.
+
+    Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
+    """
+    crew = [_Hand(slot, settings, run) for slot in range(settings.workers)]
+    try:
+        while not scheduler.finished:
+            for hand in crew:
+                hand.offer(scheduler)
+            ready = wait([hand.connection for hand in crew])
+            for hand in crew:
+                if hand.connection in ready:
+                    _hear(hand, scheduler, heard)
+    finally:
+        for hand in crew:
+            hand.connection.close()  # all of them, so that they end side by side
+        for hand in crew:
+            hand.close()
+
+
+class _Hand:
+    """The driver's view of one worker process."""
+
+    def __init__(self, slot: int, settings: ExtractSettings, run: str) -> None:
+        self.slot, self._settings, self._run = slot, settings, run
+        self.start()
+
+    def start(self) -> None:
+        """Start the process; it loads the model by itself."""
+        self.waiting = self.began = False
+        self._child = Child("probe_kit.extract.crews.processes:serve", _environment(self.slot, self._settings))
+        self._child.connection.send((self._settings, self._run))
+
+    @property
+    def connection(self) -> Connection:
+        """What the worker says."""
+        return self._child.connection
+
+    def offer(self, scheduler: Scheduler) -> None:
+        """Answer a worker that asked for an episode, unless it has nothing else and there is none for now."""
+        if not self.waiting:
+            return
+        number = scheduler.take(self.slot)
+        if number is not None or scheduler.holds(self.slot):
+            self.waiting = False
+            with suppress(BrokenPipeError, ConnectionResetError):  # then the next `recv` finds it dead
+                self.connection.send(number)
+
+    def close(self) -> int:
+        """End the process; what it has played is written first."""
+        return self._child.close()
+
+
+def _hear(hand: _Hand, scheduler: Scheduler, heard: Listener) -> None:
+    try:
+        message = hand.connection.recv()
+    except (EOFError, ConnectionResetError):
+        _replace(hand, scheduler, heard)
+        return
+    if isinstance(message, ProbeKitError):
+        raise message
+    if message == MORE:
+        hand.waiting = hand.began = True
+    else:
+        scheduler.hear(hand.slot, message)
+        heard(message)
+
+
+def _replace(hand: _Hand, scheduler: Scheduler, heard: Listener) -> None:
+    code = hand.close()
+    if not hand.began:
+        raise WorkerDiedError(
+            f"worker {hand.slot} ended with code {code} before its first episode; its last words are above. Try "
+            "fewer --workers, or none to see the error in this process"
+        )
+    for event in scheduler.lose(hand.slot, f"the worker playing it ended with code {code}"):
+        heard(event)
+    hand.start()
+
+
+def _environment(slot: int, settings: ExtractSettings) -> dict[str, str]:
+    """One GPU per worker where there are GPUs, and a fair share of the cores."""
+    share = max(1, (os.cpu_count() or 1) // settings.workers)
+    environment = {"OMP_NUM_THREADS": str(share)}
+    if settings.device.startswith("cuda"):
+        import torch
+
+        environment["CUDA_VISIBLE_DEVICES"] = str(slot % max(1, torch.cuda.device_count()))
+    return environment
+
+
+def run_on_ray(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
+    """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
+
+    An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
+    Raises MissingExtraError without Ray, and what an actor raises.
+    """
+    from probe_kit.extract.crews.ray import RayCrew
+
+    with RayCrew(settings, run) as crew:
+        while not scheduler.finished:
+            crew.hand_out(scheduler)
+            for event in crew.collect(scheduler):
+                heard(event)
+
+
+def serve(connection: Connection) -> None:
+    """A worker's side: load the model, then play what the driver hands out until it hangs up."""
+    from probe_kit.extract.extraction import load_worker
+
+    settings, run = connection.recv()
+
+    def ask() -> int | None:
+        connection.send(MORE)
+        number: int | None = connection.recv()
+        return number
+
+    try:
+        with load_worker(settings, run) as worker:
+            while True:
+                for event in worker.run(ask):
+                    connection.send(event)
+    except ProbeKitError as error:
+        connection.send(error)

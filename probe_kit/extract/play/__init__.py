@@ -1,0 +1,1 @@
+"""Playing episodes: a stage with one environment, who decides on it, and the worker that commits them."""

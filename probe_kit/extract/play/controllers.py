@@ -1,0 +1,205 @@
+"""Who decides: a captured policy, or the scripted expert that knows the answer."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CaptureChangedActionError, UsageError
+from probe_kit.extract.store.layout import StoredStream
+from probe_kit.identity import derive_seed
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit.extract.play.staging import EpisodeBuffers
+    from probe_kit.hooks import Observation, Policy, Roles, Site, Tape
+
+SCRIPTED = {
+    "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
+    "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
+}
+# Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
+SMALL = 10_000_000
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One inference that is due.
+
+    seed: of the episode; every inference derives its own. call: how many inferences came before.
+    buffers: where the activations of the first calls go.
+    """
+
+    image: NDArray[np.uint8]
+    state: NDArray[np.float32]
+    instruction: str
+    seed: int
+    call: int
+    buffers: "EpisodeBuffers"
+
+
+class Controller(Protocol):
+    """Decides what happens on every stage.
+
+    script: for `Stage`, None if this controller acts itself.
+    threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
+    """
+
+    identity: dict[str, Any]
+    streams: list[StoredStream]
+    script: str | None
+    threads: int | None
+    on_gpu: bool
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
+
+    def certificate(self) -> dict[str, Any]:
+        """What was checked so far, for the run's certificate."""
+
+
+class ScriptedController:
+    """The scripted expert plays on the stage itself, looks at nothing and leaves no activations."""
+
+    def __init__(self, name: str) -> None:
+        self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
+        self.streams: list[StoredStream] = []
+        self.script: str | None = name
+        self.threads: int | None = None
+        self.on_gpu = False
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Never asked: a scripted stage plays to the end by itself."""
+        raise AssertionError(f"a scripted stage asked for {len(turns)} actions")
+
+    def certificate(self) -> dict[str, Any]:
+        """Nothing was loaded."""
+        return {"policy": self.identity}
+
+
+class PolicyController:
+    """Infers, executes the head of the chunk, and captures the first inferences of every episode."""
+
+    def __init__(
+        self, policy: "Policy", name: str, instructions: Sequence[str], execute: int | None, captured_calls: int,
+        with_tokens: bool,
+    ) -> None:  # fmt: skip
+        if policy.card.chunk < 1:
+            raise UsageError(f"{name} does not act, so it has no episodes; choose a policy of `probe-kit models`")
+        self.policy = policy
+        self.execute = execute or policy.card.execute
+        self.captured_calls, self.with_tokens = captured_calls, with_tokens
+        self.streams = _stored_streams(policy, instructions)
+        card = policy.card
+        self.script: str | None = None
+        self.threads = 1 if card.parameters < SMALL else None
+        self.on_gpu = card.device.startswith("cuda")
+        self.identity: dict[str, Any] = {
+            "model": name,
+            "random_weights": card.random_weights,
+            "weights_sha256": card.weights_sha256,
+            "dtype": card.dtype,
+            "execute": self.execute,
+        }
+        if card.settings:
+            self.identity["policy"] = dict(card.settings)
+        self._fires: dict[str, int] = {}
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """The first `execute` actions of a fresh chunk per turn, from one call of the policy."""
+        from probe_kit.hooks import Observation
+
+        observations = [Observation(turn.image, turn.state, turn.instruction) for turn in turns]
+        seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
+        captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
+        if captured:
+            chunks = self._act_and_capture(observations, seeds, captured)
+        else:
+            chunks = self.policy.act(observations, seeds)
+        return [chunk[: self.execute] for chunk in chunks]
+
+    def certificate(self) -> dict[str, Any]:
+        """The policy's card, fire counts of the last capture, and the check of `_prove_harmless`."""
+        return {
+            "policy": asdict(self.policy.card),
+            "fires_per_inference": self._fires,
+            "hooks_on_equals_hooks_off": True,
+        }
+
+    def _act_and_capture(
+        self, observations: "Sequence[Observation]", seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
+    ) -> NDArray[np.float32]:
+        from probe_kit.hooks import capture
+
+        roles = self.policy.roles(observations)
+        views = {stream.name: stream.views for stream in self.streams}
+
+        def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
+            return _pool_rows(activation, roles[site.stream], views[site.stream])
+
+        with capture(self.policy, self.policy.sites(), None if self.with_tokens else pool_rows) as tape:
+            chunks = self.policy.act(observations, seeds)
+        if not self._fires:
+            self._prove_harmless(observations, seeds, chunks)
+        self._fires = tape.fires
+        for row, buffers in captured.items():
+            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, buffers)
+        return chunks
+
+    def _prove_harmless(
+        self, observations: "Sequence[Observation]", seeds: Sequence[int], chunks: NDArray[np.float32]
+    ) -> None:
+        """Once per process: the same inference without hooks gives the same actions, bit for bit."""
+        plain = self.policy.act(observations, seeds)
+        if not np.array_equal(plain, chunks):
+            raise CaptureChangedActionError(
+                f"capturing changed the actions by up to {np.abs(plain - chunks).max():.3g}; they must be equal "
+                "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
+            )
+
+    def _keep(self, tape: "Tape", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers") -> None:
+        """Hand one episode's share of a capture to its buffers."""
+        import torch
+
+        buffers.keep_roles(roles)
+        for stored in self.streams:
+            own = roles[stored.name]
+            kept = torch.stack([tape[site][row] for site in stored.stream.sites()])
+            if self.with_tokens:
+                valid = torch.from_numpy(own.valid).to(kept.device)
+                bits = (kept * valid[:, None]).to(torch.bfloat16).view(torch.int16)
+                buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
+                kept = torch.stack([_pool_rows(site[None], [own], stored.views)[0] for site in kept])
+            buffers.keep_pooled(stored.name, kept)
+
+
+def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":
+    """(B, V, D) float32 from (B, T, D), on its device."""
+    import torch
+
+    from probe_kit.hooks import pool
+
+    return torch.stack([pool(tokens, own, views) for tokens, own in zip(activation, roles, strict=True)])
+
+
+def _stored_streams(policy: "Policy", instructions: Sequence[str]) -> list[StoredStream]:
+    """The streams at the longest sequence any of the instructions makes."""
+    from probe_kit.hooks import Observation
+    from probe_kit.hooks.roles import view_names
+
+    blank = np.zeros((8, 8, 3), np.uint8)
+    roles = policy.roles([Observation(blank, np.zeros(8, np.float32), text) for text in instructions])
+    return [
+        StoredStream(
+            name=name,
+            layers=stream.layers,
+            width=stream.width,
+            iterations=stream.iterations,
+            tokens=max(len(row) for row in roles[name]),
+            views=view_names(policy.role_names[name]),
+        )
+        for name, stream in policy.streams.items()
+    ]

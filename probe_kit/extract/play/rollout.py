@@ -1,0 +1,141 @@
+"""Playing episodes: two groups of stages take turns; one simulates while the policy thinks for the other."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.play.controllers import Controller, Turn
+from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Seen
+from probe_kit.extract.play.staging import EpisodeBuffers, Ring
+from probe_kit.extract.store.thumbnails import Ends
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for."""
+
+    planned: PlannedEpisode
+    outcome: dict[str, Any]
+    buffers: EpisodeBuffers
+    frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An episode that could not be played to its end."""
+
+    planned: PlannedEpisode
+    reason: str
+
+
+class Seat:
+    """One place in a batch: a stage and the episode on it, if any."""
+
+    def __init__(self, stage: AskableStage) -> None:
+        self.stage = stage
+        self.planned: PlannedEpisode | None = None
+        self.seen: Seen | None = None
+        self.calls = 0
+
+    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
+        """Begin an episode."""
+        self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
+        self.stage.ask("begin", planned, film)
+
+    def turn(self) -> Turn:
+        """The inference that is due."""
+        assert self.planned is not None
+        assert self.seen is not None
+        item, seed = self.planned.episode.item, self.planned.policy_seed
+        return Turn(self.seen.image, self.seen.state, item.instruction, seed, self.calls, self.buffers)
+
+    def go_on(self, actions: NDArray[np.float32]) -> None:
+        """Carry out actions."""
+        self.seen = None
+        self.calls += 1
+        self.stage.ask("advance", actions)
+
+    def leave(self) -> None:
+        """The episode is over."""
+        self.planned, self.seen = None, None
+
+
+class Play:
+    """Plays episode after episode on two groups of stages.
+
+    next_episode: what to play next, None for nothing. All seats of a group take their turn in one call of the
+    policy; a seat whose episode ends begins the next one at once.
+    """
+
+    def __init__(
+        self, stages: Sequence[AskableStage], controller: Controller, ring: Ring,
+        next_episode: Callable[[], PlannedEpisode | None], film: Callable[[PlannedEpisode], bool],
+    ) -> None:  # fmt: skip
+        seats = [Seat(stage) for stage in stages]
+        self._groups = [seats[: len(seats) // 2], seats[len(seats) // 2 :]]
+        self._controller, self._ring = controller, ring
+        self._next_episode, self._film = next_episode, film
+
+    def __iter__(self) -> Iterator[Rollout | Failure]:
+        """Rollouts in the order they end."""
+        for group in self._groups:
+            for seat in group:
+                self._begin_next(seat)
+        while any(seat.planned for group in self._groups for seat in group):
+            for group in self._groups:
+                yield from self._settle(group)
+                yield from self._infer(group)
+
+    def _begin_next(self, seat: Seat) -> None:
+        planned = self._next_episode()
+        if planned is None:
+            seat.leave()
+        else:
+            seat.sit(planned, self._ring.take(), self._film(planned))
+
+    def _settle(self, group: list[Seat]) -> Iterator[Rollout | Failure]:
+        """Collect answers until the group can take its turn together.
+
+        If all its episodes ended at once, it begins the next ones during the other group's turn.
+        """
+        while waiting := [seat for seat in group if seat.planned and not seat.seen]:
+            for seat in waiting:
+                assert seat.planned is not None
+                try:
+                    answer = seat.stage.answer()
+                except EPISODE_ERRORS as error:
+                    yield self._give_up(seat, error)
+                    continue
+                if isinstance(answer, Seen):
+                    seat.seen = answer
+                else:
+                    yield Rollout(seat.planned, answer.outcome, seat.buffers, answer.frames, answer.ends)
+                    self._begin_next(seat)
+            if not any(seat.seen for seat in group):
+                return
+
+    def _infer(self, group: list[Seat]) -> Iterator[Failure]:
+        due = [seat for seat in group if seat.seen]
+        if not due:
+            return
+        try:
+            chunks = self._controller.act([seat.turn() for seat in due])
+        except EPISODE_ERRORS as error:
+            for seat in due:
+                yield self._give_up(seat, error)
+            return
+        for seat, actions in zip(due, chunks, strict=True):
+            seat.go_on(actions)
+
+    def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
+        assert seat.planned is not None
+        failure = Failure(seat.planned, f"{type(error).__name__}: {error}")
+        self._ring.give_back(seat.buffers)
+        self._begin_next(seat)
+        return failure

@@ -1,0 +1,171 @@
+"""A stage: one environment and the episode on it, driven one chunk of actions at a time."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.errors import (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    ProbeKitError,
+    SceneError,
+    StageDiedError,
+)
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.store.thumbnails import Ends, shrink
+
+# What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
+EPISODE_ERRORS = (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    SceneError,
+    StageDiedError,
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a policy may look at before its next inference.
+
+    image: (H, W, 3) uint8. state: (8,) float32, as in `Act2AnswerEnv`.
+    """
+
+    image: NDArray[np.uint8]
+    state: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails."""
+
+    outcome: dict[str, Any]
+    frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
+
+
+Answer = Seen | Ending
+
+
+class Stage:
+    """Plays episodes in this process.
+
+    script: `expert` or `expert-mirrored` to let the scripted expert play every episode to its end at once.
+    keep_ends: whether every episode ends with small pictures of its first and last frame.
+    """
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self.script, self._keep_ends = script, keep_ends
+        self._env = Act2AnswerEnv(scene)
+
+    def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
+        """Set up an episode. Errors carry a note naming it."""
+        self._planned, self._film, self._frames = planned, film, list[NDArray[np.uint8]]()
+        try:
+            options = {"item": planned.episode.item, "layout": planned.episode.layout}
+            _, start = self._env.reset(seed=planned.scene_seed, options=options)
+            self._visible = start["tile_visibility"]
+            self._shoot()
+            self._first = shrink(self._env.render()) if self._keep_ends else None
+            return self._see() if self.script is None else self._follow_script()
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def advance(self, actions: Iterable[NDArray[np.float32]]) -> Answer:
+        """Carry out actions until they or the episode end."""
+        try:
+            return self._carry_out(actions) or self._see()
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+    def _follow_script(self) -> Ending:
+        expert = ScriptedExpert(self._env, mirrored=self.script == "expert-mirrored")
+        expert.reset()
+        ending = None
+        while ending is None:
+            ending = self._carry_out([expert.act()])
+        return ending
+
+    def _carry_out(self, actions: Iterable[NDArray[np.float32]]) -> Ending | None:
+        for action in actions:
+            _, terminated, truncated, _ = self._env.advance(action)
+            self._shoot()
+            if terminated or truncated:
+                return Ending(_record(self._env, self._visible), self._frames, self._ends())
+        return None
+
+    def _ends(self) -> Ends | None:
+        return None if self._first is None else (self._first, shrink(self._env.render()))
+
+    def _see(self) -> Seen:
+        seen = self._env.observe()
+        return Seen(seen["pixels"]["image"], seen["agent_pos"])
+
+    def _shoot(self) -> None:
+        if self._film:
+            self._frames.append(self._env.render())
+
+    def _named(self, error: ProbeKitError) -> ProbeKitError:
+        episode = self._planned.episode
+        error.add_note(f"in episode {episode.episode_id} ({episode.item.instruction!r})")
+        return error
+
+
+def _record(env: Act2AnswerEnv, tile_visibility: dict[str, float]) -> dict[str, Any]:
+    """The outcome as flat columns, beside those the plan already has."""
+    outcome = env.outcome().to_json()
+    x, y = outcome.pop("cube_xy")
+    return {
+        "outcome": outcome.pop("zone"),
+        "cube_x": x,
+        "cube_y": y,
+        **{key: value for key, value in outcome.items() if key not in ("layout", "side_correct")},
+        **{f"visible_{side}": share for side, share in tile_visibility.items()},
+    }
+
+
+class AskableStage(Protocol):
+    """A stage somewhere: asked first, answered later, so that several can work at a time."""
+
+    def ask(self, method: str, *arguments: Any) -> None:
+        """Start `Stage.begin` or `Stage.advance`."""
+
+    def answer(self) -> Answer:
+        """What the last question gave; raises what it raised."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class LocalStage:
+    """A stage in this process: the work is done when the answer is wanted."""
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._stage = Stage(scene, script, keep_ends)
+
+    def ask(self, method: str, *arguments: Any) -> None:
+        """Remember the question."""
+        self._question = method, arguments
+
+    def answer(self) -> Answer:
+        """Do the work."""
+        method, arguments = self._question
+        answer: Answer = getattr(self._stage, method)(*arguments)
+        return answer
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._stage.close()

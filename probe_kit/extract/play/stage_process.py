@@ -1,0 +1,62 @@
+"""Stages in processes of their own, so that simulation, drawing and inference overlap."""
+
+from multiprocessing.connection import Connection
+from typing import Any
+
+from probe_kit.child import Child
+from probe_kit.env import SceneSpec
+from probe_kit.errors import StageDiedError
+from probe_kit.extract.play.stage import EPISODE_ERRORS, Answer, Stage
+
+
+class ProcessStage:
+    """A stage in a child process; a child that dies costs its episode and is replaced."""
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._settings = scene, script, keep_ends
+        self._start()
+
+    def _start(self) -> None:
+        self._child = Child("probe_kit.extract.play.stage_process:serve")
+        self._child.connection.send(self._settings)
+
+    def ask(self, method: str, *arguments: Any) -> None:
+        """Send the question; the child works while this process goes on."""
+        try:
+            self._child.connection.send((method, arguments))
+        except (BrokenPipeError, ConnectionResetError):
+            return  # `answer` finds out and says so
+
+    def answer(self) -> Answer:
+        """Wait for the answer."""
+        try:
+            answer = self._child.connection.recv()
+        except (EOFError, ConnectionResetError):
+            code = self._child.close()
+            self._start()
+            raise StageDiedError(
+                f"the process that simulates the episode ended with code {code}; look above for its last words"
+            ) from None
+        if isinstance(answer, Exception):
+            raise answer
+        result: Answer = answer
+        return result
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
+
+def serve(connection: Connection) -> None:
+    """The child's side: answer questions until the parent hangs up."""
+    stage = Stage(*connection.recv())
+    try:
+        while True:
+            method, arguments = connection.recv()
+            try:
+                answer: Answer | Exception = getattr(stage, method)(*arguments)
+            except EPISODE_ERRORS as error:
+                answer = error
+            connection.send(answer)
+    finally:
+        stage.close()

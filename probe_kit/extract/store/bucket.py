@@ -1,0 +1,274 @@
+"""A prefix in an object store as the location of a run (extra `remote`).
+
+Single objects appear whole or not at all, and `If-None-Match: *` creates them exclusively: that is all the commit
+protocol needs. What folders have besides, locks and renaming, is missing, and replaced as follows.
+
+* No process can know that it is alone, so nothing that others may be writing is ever removed. There is little to
+  remove: half an upload is no object, and objects without a commit are written again under the same key.
+* A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
+  same bytes, or one of them is refused.
+* Derived groups carry their stamp in their key, so that processes that saw different commits never mix them.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import cached_property
+from io import SEEK_SET, BufferedReader, RawIOBase
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Literal
+from urllib.parse import urlsplit
+
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import WrapperStore
+
+from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
+from probe_kit.extract.store.location import Location
+from probe_kit.extras import require
+
+if TYPE_CHECKING:
+    from obstore import ReadableFile
+    from obstore.store import ObjectStore
+
+# Small objects are read side by side, because each of them takes a round trip.
+READERS = 32
+RETRY_TIMEOUT = timedelta(seconds=60)
+STAMP_DIGITS = 16
+
+
+class Bucket(Location):
+    """A prefix of a bucket. Endpoint and credentials come from the environment, such as AWS_ACCESS_KEY_ID.
+
+    Raises MissingExtraError without obstore, UsageError for a URL without bucket or name, StoreError if the store
+    cannot be reached or refuses.
+    """
+
+    def __init__(self, url: str) -> None:
+        require("obstore", "remote")
+        self._url = url.rstrip("/")
+        parts = urlsplit(self._url)
+        if not (parts.netloc and parts.path.strip("/")):
+            raise UsageError(f"{url} names no run; expected {parts.scheme}://BUCKET/PREFIX/RUN")
+
+    def __str__(self) -> str:
+        return self._url
+
+    @property
+    def name(self) -> str:
+        """After the last slash."""
+        return self._url.rpartition("/")[2]
+
+    @property
+    def path(self) -> Path:
+        """Raises UsageError."""
+        raise UsageError(f"{self} lies in an object store and has no folder; read it through `open_run`")
+
+    @property
+    def address(self) -> str:
+        """The URL."""
+        return self._url
+
+    def beside(self, name: str) -> Path:
+        """In the working directory."""
+        return Path(name)
+
+    def free_bytes(self) -> None:
+        """No bound."""
+        return
+
+    @cached_property
+    def _objects(self) -> "ObjectStore":
+        return self._below("")
+
+    def _below(self, folder: str) -> "ObjectStore":
+        from obstore.store import from_url
+
+        with self.in_words():
+            store: ObjectStore = from_url(
+                f"{self._url}/{folder}".rstrip("/"), retry_config={"retry_timeout": RETRY_TIMEOUT}
+            )
+        return store
+
+    @contextmanager
+    def in_words(self) -> Iterator[None]:
+        """Whatever obstore says."""
+        from obstore.exceptions import BaseError
+
+        try:
+            yield
+        except BaseError as error:
+            why = str(error).split("\n\nDebug source", maxsplit=1)[0]
+            raise StoreError(
+                f"{self} cannot be used: {why}. Check the bucket, the network, and what the environment says of "
+                "endpoint and credentials (AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID …); the same command continues"
+            ) from error
+
+    def exists(self, key: str) -> bool:
+        """One request for the head of the object."""
+        import obstore
+
+        try:
+            with self.in_words():
+                obstore.head(self._objects, key)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def read(self, key: str) -> bytes:
+        """One request."""
+        import obstore
+
+        with self.in_words():
+            return bytes(obstore.get(self._objects, key).bytes())
+
+    def open(self, key: str) -> BinaryIO:
+        """Reads ranges when they are asked for."""
+        import obstore
+
+        with self.in_words():
+            return BufferedReader(_Ranges(obstore.open_reader(self._objects, key)))
+
+    def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
+        """A listing, then many requests side by side."""
+        names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
+        names = [name for name in names if name.endswith(suffix) and "/" not in name]
+        with ThreadPoolExecutor(READERS) as readers:
+            return dict(zip(names, readers.map(lambda name: self.read(f"{folder}/{name}"), names), strict=True))
+
+    def keys(self, folder: str) -> list[str]:
+        """From a listing."""
+        return sorted(self._listing(folder))
+
+    def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
+        """From a listing of all that is there."""
+        there = self._listing(folder)
+        return {key: there[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in there}
+
+    def _listing(self, folder: str) -> dict[str, int]:
+        import obstore
+
+        with self.in_words():
+            return {meta["path"]: meta["size"] for page in obstore.list(self._objects, folder) for meta in page}
+
+    def create(self, key: str, content: bytes) -> bool:
+        """A conditional put."""
+        return self._put(key, content, "create")
+
+    def write(self, key: str, content: bytes) -> None:
+        """A put."""
+        self._put(key, content, "overwrite")
+
+    def _put(self, key: str, content: bytes, mode: Literal["create", "overwrite"]) -> bool:
+        import obstore
+
+        with self.in_words():
+            try:
+                obstore.put(self._objects, key, content, mode=mode)
+            except obstore.exceptions.AlreadyExistsError:
+                return False
+            except FileNotFoundError as error:  # no object can be missing here, only the bucket
+                raise obstore.exceptions.GenericError(str(error)) from error
+        return True
+
+    def remove(self, folder: str) -> None:
+        """A listing, then bulk deletions."""
+        self._delete(self.keys(folder))
+
+    def _delete(self, keys: list[str]) -> None:
+        import obstore
+
+        if keys:
+            with self.in_words():
+                obstore.delete(self._objects, keys)
+
+    def store(self, folder: str, read_only: bool = False) -> Store:
+        """Zarr's own, over obstore."""
+        from zarr.storage import ObjectStore
+
+        store: Store = ObjectStore(self._below(folder), read_only=read_only)
+        return store
+
+    def found(self, objects: Mapping[str, bytes], last: str) -> None:
+        """One after another, none over another's."""
+        strange = sorted(set(self.keys("")) - set(objects))
+        if strange and not self.exists(last):
+            raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
+        for key, content in objects.items():
+            if key != last and not self.create(key, content) and self.read(key) != content:
+                raise SettingsMismatchError(
+                    f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
+                    "or beginning now in another process. Choose another --out, or remove it"
+                )
+        self.create(last, objects[last])
+
+    @contextmanager
+    def held(self, clear: Callable[[], None]) -> Iterator[None]:
+        """Nothing is locked."""
+        clear()
+        yield
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Nobody waits: whoever is second writes the same bytes once more."""
+        yield
+
+    def derived(self, folder: str, stamp: str) -> str:
+        """A folder per stamp."""
+        return f"{folder}/{stamp[:STAMP_DIGITS]}"
+
+    @contextmanager
+    def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
+        """In its final place, which nobody reads before its stamp is written, and as if nothing were there.
+
+        Two processes that build it at once write the same bytes, and neither removes what the other wrote.
+        """
+        here = self.derived(folder, stamp)
+        yield _Blank(self.store(here))
+        self._delete([key for key in self.keys(folder) if not key.startswith(f"{here}/")])
+
+
+class _Blank(WrapperStore[Store]):
+    """A store that shows only what was written through it."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store)
+        self._written: set[str] = set()
+
+    async def set(self, key: str, value: Buffer) -> None:
+        self._written.add(key)
+        await super().set(key, value)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        return await super().get(key, prototype, byte_range) if key in self._written else None
+
+    async def exists(self, key: str) -> bool:
+        return key in self._written
+
+    async def delete_dir(self, prefix: str) -> None:
+        for key in [key for key in self._written if key.startswith(prefix)]:
+            await self.delete(key)
+
+
+class _Ranges(RawIOBase):
+    """What obstore can read of an object here and there, as Python's own file type."""
+
+    def __init__(self, file: "ReadableFile") -> None:
+        self._file = file
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        content = self._file.read(len(buffer))
+        buffer[: len(content)] = bytes(content)
+        return len(content)

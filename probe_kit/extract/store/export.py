@@ -1,0 +1,134 @@
+"""Exporting: a run as one ordinary file, for people and tools that want one.
+
+Everything is written row by row, so that a run larger than memory can be exported; every row passes its checksum
+on the way, and the sha256 of the file is written beside it in the form `sha256sum --check` reads.
+"""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.store.layout import StoredStream
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.rows import Rows
+from probe_kit.extract.store.run import Run, open_run
+from probe_kit.extras import require
+
+
+def export_run(path: Path | str | Location, style: str, out: Path, allow_partial: bool = False) -> Path:
+    """Write the run at `path` to the file `out` and its sha256 to `out`.sha256; returns `out`.
+
+    h5: `<stream>/pooled`, `<stream>/tokens`, and a dataset per column under `episodes`.
+    safetensors: `<stream>.pooled` and `<stream>.tokens`, the latter true bfloat16; episodes in the metadata.
+    parquet: a row per episode, inference, site and view with its vector; no tokens.
+    Array axes are (episode, step, [iteration,] layer, view or token, feature).
+    Raises UsageError for another format or a file that exists, MissingExtraError, RunDamagedError.
+    """
+    if style not in _WRITERS:
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_WRITERS)}")
+    if out.exists():
+        raise UsageError(f"{out} exists; choose another --out or remove it")
+    run = open_run(path, allow_partial)
+    if not run.streams:
+        raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+        aside = Path(folder) / out.name
+        _WRITERS[style](run, aside)
+        with aside.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        aside.rename(out)
+    out.with_name(f"{out.name}.sha256").write_text(f"{digest}  {out.name}\n")
+    return out
+
+
+def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
+    """Stream, kind and rows of every array of the run."""
+    kinds: tuple[Literal["pooled", "tokens"], ...] = ("pooled", "tokens")
+    for stream in run.streams:
+        for kind in kinds[: 1 + (run.settings["tokens"] == "all")]:
+            yield stream, kind, run.rows(stream, kind)
+
+
+def _episodes(run: Run) -> dict[str, list[Any]]:
+    table = run.episodes
+    columns: dict[str, list[Any]] = json.loads(table.to_json(orient="split"))
+    return {name: [row[i] for row in columns["data"]] for i, name in enumerate(columns["columns"])}
+
+
+def _write_h5(run: Run, out: Path) -> None:
+    h5py = require("h5py", "export")
+    with h5py.File(out, "w") as file:
+        file.attrs["settings"] = json.dumps(run.settings)
+        for stream, kind, rows in _arrays(run):
+            shape = rows.array.shape[1:]
+            dataset = file.create_dataset(
+                f"{stream}/{kind}", (len(rows), *shape), rows.array.dtype, chunks=(1, *shape), fletcher32=True
+            )
+            dataset.attrs["views"] = list(run.views(stream))
+            dataset.attrs["dtype"] = "float32" if kind == "pooled" else "bfloat16 bits"
+            for position in range(len(rows)):
+                dataset[position] = rows[position]
+        for name, values in _episodes(run).items():
+            numeric = all(isinstance(value, bool | int | float) for value in values)
+            file[f"episodes/{name}"] = values if numeric else ["" if v is None else str(v) for v in values]
+
+
+def _write_safetensors(run: Run, out: Path) -> None:
+    header: dict[str, Any] = {
+        "__metadata__": {
+            "settings": json.dumps(run.settings),
+            "episodes": json.dumps(_episodes(run)),
+            **{f"{stream}.views": json.dumps(run.views(stream)) for stream in run.streams},
+        }
+    }
+    end = 0
+    for stream, kind, rows in _arrays(run):
+        shape = [len(rows), *rows.array.shape[1:]]
+        start, end = end, end + int(np.prod(shape)) * rows.array.dtype.itemsize
+        dtype = "F32" if kind == "pooled" else "BF16"
+        header[f"{stream}.{kind}"] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
+    with out.open("wb") as file:
+        _write_header(file, header)
+        for _, _, rows in _arrays(run):
+            for position in range(len(rows)):
+                file.write(np.ascontiguousarray(rows[position]).tobytes())
+
+
+def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
+    """Length, then JSON padded to eight bytes, as the format wants it."""
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    file.write(len(text).to_bytes(8, "little") + text)
+
+
+def _write_parquet(run: Run, out: Path) -> None:
+    pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
+    keys = ["episode_id", "item_id", "category", "layout", "side_correct", "outcome"]
+    fields = [*((key, pa.string()) for key in keys), ("call", pa.int32()), ("site", pa.string())]
+    schema = pa.schema([*fields, ("view", pa.string()), ("vector", pa.list_(pa.float32()))])
+    pooled = [(run.stored(stream), rows) for stream, kind, rows in _arrays(run) if kind == "pooled"]
+    with pq.ParquetWriter(out, schema) as writer:
+        for position, episode in enumerate(run.episodes[keys].to_dict("records")):
+            vectors = [vector for stored, rows in pooled for vector in _vectors(stored, rows[position])]
+            writer.write_table(pa.Table.from_pylist([{**episode, **vector} for vector in vectors], schema))
+
+
+def _vectors(stored: StoredStream, row: Any) -> Iterator[dict[str, Any]]:
+    for call, captured in enumerate(row):
+        for site in stored.stream.sites():
+            for view, vector in zip(stored.views, captured[stored.at(site)], strict=True):
+                yield {"call": call, "site": str(site), "view": view, "vector": vector}
+
+
+_WRITERS: dict[str, Callable[[Run, Path], None]] = {
+    "h5": _write_h5,
+    "safetensors": _write_safetensors,
+    "parquet": _write_parquet,
+}

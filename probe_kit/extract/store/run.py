@@ -1,0 +1,302 @@
+"""Reading a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from probe_kit.errors import RunDamagedError, RunIncompleteError, RunNotFoundError, UnknownSiteError
+from probe_kit.extract.store.columns import Columns, find_columns
+from probe_kit.extract.store.commits import Commit, read_commits, read_failures, stamp_of
+from probe_kit.extract.store.layout import (
+    CERTIFICATE_FILE,
+    DATA,
+    PLAN_FILE,
+    RUN_FILE,
+    SCHEMA_VERSION,
+    StoredStream,
+    open_array,
+)
+from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
+from probe_kit.hooks.sites import Site, Stream
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class NotSealedWarning(UserWarning):
+    """A column was read from rows, which gives the same numbers slowly."""
+
+
+def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
+    """Open the run in folder `path`, or at a URL such as `s3://bucket/prefix/run` (extra `remote`).
+
+    allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
+    Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
+    is another one or a committed object is missing.
+    """
+    run = Run(locate(path))
+    done = len(run.episodes)
+    if done < run.planned and not allow_partial:
+        failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
+        raise RunIncompleteError(
+            f"{path} has {done} of {run.planned} episodes{failed}. Finish it with the same `probe-kit extract`, "
+            "or accept what is there (--partial, allow_partial=True)"
+        )
+    return run
+
+
+def read_card(location: Location) -> dict[str, Any]:
+    """What `run.json` says. Raises RunNotFoundError if there is none."""
+    try:
+        card: dict[str, Any] = json.loads(location.read(RUN_FILE))
+    except FileNotFoundError:
+        raise RunNotFoundError(
+            f"{location} is not a run: it has no {RUN_FILE}. Make one with `probe-kit extract`"
+        ) from None
+    return card
+
+
+class Run:
+    """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order."""
+
+    def __init__(self, location: Location) -> None:
+        self.location = location
+        card = read_card(location)
+        if card["schema_version"] != SCHEMA_VERSION:
+            raise RunDamagedError(
+                f"{location} has schema {card['schema_version']}; this version reads {SCHEMA_VERSION}; update it"
+            )
+        self.settings: dict[str, Any] = card["settings"]
+        self.settings_sha256: str = card["settings_sha256"]
+        self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
+
+    @property
+    def path(self) -> Path:
+        """The run's folder. Raises UsageError if it lies in an object store."""
+        return self.location.path
+
+    @property
+    def model(self) -> str:
+        """The model's name, as given to `probe-kit extract`."""
+        return str(self.settings["model"])
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted; None for a scripted run."""
+        weights: str | None = self.settings["weights_sha256"]
+        return weights
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether nobody trained the weights this run was made with."""
+        return bool(self.settings["random_weights"])
+
+    @property
+    def suite(self) -> str:
+        """Identity of the suite that was run, `name@version#hash`."""
+        return str(self.settings["suite"]["identity"])
+
+    @cached_property
+    def certificate(self) -> dict[str, Any]:
+        """What was loaded and checked."""
+        certificate: dict[str, Any] = json.loads(self.location.read(CERTIFICATE_FILE))
+        return certificate
+
+    @cached_property
+    def _commits(self) -> dict[int, Commit]:
+        return read_commits(self.location)
+
+    def commits(self) -> list[Commit]:
+        """The commit of every episode, in the order of `episodes`."""
+        return [self._commits[number] for number in self._numbers]
+
+    @cached_property
+    def _numbers(self) -> list[int]:
+        return [planned["episode"] for planned in self._plan if planned["episode"] in self._commits]
+
+    @cached_property
+    def stamp(self) -> str:
+        """Hash of all commits: what derived files were made from."""
+        return stamp_of(self._commits)
+
+    @cached_property
+    def failed(self) -> dict[str, str]:
+        """Episodes that were given up, with the reason."""
+        return read_failures(self.location)
+
+    @cached_property
+    def planned(self) -> int:
+        """Episodes the plan has, committed or not."""
+        return len(self._plan)
+
+    @cached_property
+    def _plan(self) -> list[dict[str, Any]]:
+        episodes: list[dict[str, Any]] = json.loads(self.location.read(PLAN_FILE))["episodes"]
+        return episodes
+
+    @cached_property
+    def episodes(self) -> pd.DataFrame:
+        """One row per committed episode: the plan's columns, then the outcome's."""
+        plan = {planned["episode"]: planned for planned in self._plan}
+        return pd.DataFrame([{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers])
+
+    # -- streams ---------------------------------------------------------------------------------------
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """The captured streams; empty for a scripted run."""
+        return {name: stored.stream for name, stored in self._streams.items()}
+
+    def stored(self, stream: str) -> StoredStream:
+        """How one stream lies in the store. Raises UnknownSiteError."""
+        if stream not in self._streams:
+            known = ", ".join(self._streams) or "none (a scripted run has no activations)"
+            raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {known}")
+        return self._streams[stream]
+
+    def views(self, stream: str) -> tuple[str, ...]:
+        """Pooled views of one stream."""
+        return self.stored(stream).views
+
+    def sites(self, stream: str) -> list[Site]:
+        """All sites of one stream."""
+        return self.stored(stream).stream.sites()
+
+    def _check(self, site: Site) -> StoredStream:
+        stored = self.stored(site.stream)
+        if site not in stored.stream.sites():
+            raise UnknownSiteError(
+                f"{self.location} has no site {site}; {site.stream} has {stored.layers} layers"
+                + (f" and {stored.iterations} iterations" if stored.iterations else "")
+            )
+        return stored
+
+    # -- pooled ----------------------------------------------------------------------------------------
+
+    def column(self, site: Site, view: str = "mean", call: int = 0) -> NDArray[np.float32]:
+        """(E, D) float32: one pooled view of one site at one captured inference, a row per episode.
+
+        Raises UnknownSiteError, or RunDamagedError if stored bytes are missing or fail their checksum.
+        """
+        stored = self._check(site)
+        if view not in stored.views:
+            raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
+        if self._columns is None:
+            self._note_slow_reading()
+            index: tuple[Any, ...] = (slice(None), call, *stored.at(site), stored.views.index(view))
+            return np.asarray(self._pooled(site.stream)[index])
+        return self._columns.column(stored, site, view, call)
+
+    @property
+    def sealed(self) -> bool:
+        """Whether columns were built from exactly the episodes that are committed."""
+        return self._columns is not None
+
+    @cached_property
+    def _columns(self) -> Columns | None:
+        return find_columns(self.location, self.stamp)
+
+    def _note_slow_reading(self) -> None:
+        warnings.warn(
+            f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the same "
+            f"numbers. `probe-kit run seal {self.location}` makes it fast",
+            NotSealedWarning,
+            stacklevel=3,
+        )
+
+    def rows(self, stream: str, kind: Literal["pooled", "tokens"] = "pooled") -> Rows:
+        """The stored rows of the committed episodes: all that was captured in one episode at a time."""
+        return Rows(open_array(self.location, DATA, f"{stream}/{kind}"), self._numbers)
+
+    def _pooled(self, stream: str) -> NDArray[np.float32]:
+        """(E, S, [I,] L, V, D) rows of the committed episodes, read once per stream."""
+        if stream not in self._kept_rows:
+            rows = self.rows(stream)
+            self._kept_rows[stream] = np.stack([rows[position] for position in range(len(rows))])
+        return self._kept_rows[stream]
+
+    @cached_property
+    def _kept_rows(self) -> dict[str, NDArray[np.float32]]:
+        return {}
+
+    def xarray(self) -> "xr.Dataset":
+        """The pooled arrays with labelled views and episodes; dimensions of a stream carry its name.
+
+        Values of a sealed run are read when they are used, not before.
+        """
+        import xarray as xr
+
+        arrays = {}
+        for name, stored in self._streams.items():
+            if self._columns is None:
+                dimensions = ["episode", "step", *stored.dimensions, "view", "feature"]
+                array = xr.DataArray(self._pooled(name), dims=dimensions)
+            else:
+                array = self._columns.xarray(name)
+            own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
+            array = array.rename({"step": "call", **own}).transpose("episode", "call", *own.values())
+            arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
+        labels = ("episode_id", "category", "layout", "side_correct", "outcome")
+        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in labels})
+
+    # -- tokens ----------------------------------------------------------------------------------------
+
+    def tokens(
+        self, site: Site, role: str | None = None, call: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(E, T, D) float32 values and (E, T) bool mask of one site; the mask chooses `role`, or all but padding.
+
+        Values outside the mask are zero. For large runs use `iter_token_blocks`, which holds one block.
+        Raises UnknownSiteError if the run was extracted without `--tokens all`, or never had that role.
+        """
+        mask = self._role_mask(site, role, call)
+        values = np.zeros((*mask.shape, self.stored(site.stream).width), np.float32)
+        for block in self.iter_token_blocks(site, role, call):
+            values[:, block.start : block.start + block.mask.shape[1]] = block.values
+        return values, mask
+
+    def token_mask(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.bool_]:
+        """(E, T) bool: the positions of `role` at one site, or of all tokens but padding; see `tokens`."""
+        return self._role_mask(site, role, call)
+
+    def iter_token_blocks(self, site: Site, role: str | None = None, call: int = 0) -> Iterator[TokenBlock]:
+        """The tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
+
+        Only blocks that hold a token of `role` are read.
+        """
+        mask = self._role_mask(site, role, call)
+        stored = self.stored(site.stream)
+        rows = self.rows(site.stream, "tokens")
+        return token_blocks(rows, (call, *stored.at(site)), mask, stored.token_block)
+
+    def gram(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.float64]:
+        """(E, E) float64 linear kernel: products of tokens at equal positions, summed, over sqrt(n_i n_j).
+
+        n is an episode's number of chosen tokens, so that longer instructions do not weigh more.
+        """
+        kernel = np.zeros((len(self._numbers), len(self._numbers)))
+        counts = np.zeros(len(self._numbers))
+        for block in self.iter_token_blocks(site, role, call):
+            flat = block.values.reshape(len(kernel), -1)
+            kernel += flat @ flat.T
+            counts += block.mask.sum(axis=1)
+        return np.asarray(kernel / np.sqrt(np.outer(counts, counts)))
+
+    def _role_mask(self, site: Site, role: str | None, call: int) -> NDArray[np.bool_]:
+        stored = self._check(site)
+        if self.settings["tokens"] != "all":
+            raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
+        spans = [commit["roles"][call][site.stream] for commit in self.commits()]
+        mask = role_mask(spans, stored.stored_tokens, role)
+        if not mask.any(axis=1).all():
+            known = sorted({name for episode in spans for name, _, _ in episode})
+            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {known}")
+        return mask

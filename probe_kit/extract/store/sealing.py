@@ -1,0 +1,98 @@
+"""Sealing: pooled rows turned into one block per site and view, and roles into a column."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from probe_kit.extract.store.layout import COLUMNS, codecs
+from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.rows import PADDING
+from probe_kit.extract.store.run import Run
+
+EPISODES_PER_CHUNK = 1024
+# What is held in memory at a time; all rows are read once more for every further slab.
+SLAB_BYTES = 1 << 30
+
+
+def seal(path: Path | str | Location) -> bool:
+    """Write the columns of the run at `path` unless they are up to date; True if this call wrote them.
+
+    Same commits give the same bytes. A crash leaves the old columns or none. Processes that seal one folder at
+    once take turns, and all but the first find it done.
+    """
+    location = Run(locate(path)).location
+    with location.turn():
+        return _seal(Run(location))
+
+
+def _seal(run: Run) -> bool:
+    if not run.streams or run.episodes.empty or run.sealed:
+        return False
+    with run.location.rebuilding(COLUMNS, run.stamp) as store:
+        group = zarr.open_group(store, mode="w", zarr_format=3)
+        for name in run.streams:
+            _write_pooled(run, name, group)
+            _write_roles(run, name, group)
+        group.attrs["stamp"] = run.stamp  # what makes them count, so last
+    return True
+
+
+def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:
+    stored = run.stored(name)
+    rows = run.rows(name)
+    calls, episodes = rows.array.shape[1], len(rows)
+    block = min(episodes, EPISODES_PER_CHUNK)
+    lead = (calls, len(stored.views), *stored.lead)
+    array = group.create_array(
+        f"{name}/pooled",
+        shape=(*lead, episodes, stored.width),
+        chunks=(*(1 for _ in lead), block, stored.width),
+        dtype="float32",
+        fill_value=np.nan,
+        compressors=codecs(run.settings["codec"], typesize=4),
+        dimension_names=("step", "view", *stored.dimensions, "episode", "feature"),
+        attributes={"views": list(stored.views)},
+        config={"write_empty_chunks": True},
+    )
+    cells = list(np.ndindex(*lead))
+    for start in range(0, episodes, block):
+        stop = min(start + block, episodes)
+        for slab in _slabs(cells, (stop - start) * stored.width * 4):
+            values = np.empty((len(slab), stop - start, stored.width), np.float32)
+            for position in range(start, stop):
+                row = np.moveaxis(rows[position], -2, 1)
+                values[:, position - start] = row[tuple(np.transpose(slab))]
+            for cell, column in zip(slab, values, strict=True):
+                index: tuple[Any, ...] = (*cell, slice(start, stop))
+                array[index] = column
+
+
+def _slabs(cells: list[tuple[int, ...]], bytes_per_cell: int) -> Iterator[list[tuple[int, ...]]]:
+    count = max(1, SLAB_BYTES // bytes_per_cell)
+    for start in range(0, len(cells), count):
+        yield cells[start : start + count]
+
+
+def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
+    spans = [[call[name] for call in commit["roles"]] for commit in run.commits()]
+    names = [PADDING, *sorted({role for calls in spans for call in calls for role, _, _ in call} - {PADDING})]
+    codes = np.zeros((run.settings["captured_calls"], len(spans), run.stored(name).stored_tokens), np.uint8)
+    for episode, calls in enumerate(spans):
+        for step, call in enumerate(calls):
+            for role, start, stop in call:
+                codes[step, episode, start:stop] = names.index(role)
+    array: zarr.Array[Any] = group.create_array(
+        f"{name}/role",
+        shape=codes.shape,
+        chunks=(1, min(len(spans), EPISODES_PER_CHUNK), codes.shape[2]),
+        dtype="uint8",
+        fill_value=0,
+        compressors=codecs(run.settings["codec"], typesize=1),
+        dimension_names=("step", "episode", "token"),
+        attributes={"roles": names},
+        config={"write_empty_chunks": True},
+    )
+    array[:] = codes

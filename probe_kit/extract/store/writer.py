@@ -1,0 +1,113 @@
+"""Writing a run: created once, then one committed episode at a time."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import zarr
+from zarr.core.array_spec import ArrayConfigLike
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore
+
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.settings import refuse_other_settings
+from probe_kit.extract.store.commits import RecordingStore, as_json, create_once, read_commits, write_commit
+from probe_kit.extract.store.layout import (
+    CERTIFICATE_FILE,
+    DATA,
+    FAILED,
+    PLAN_FILE,
+    RUN_FILE,
+    SCHEMA_VERSION,
+    create_arrays,
+)
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.run import read_card
+from probe_kit.identity import canonical_json, sha256_json
+
+if TYPE_CHECKING:
+    from probe_kit.extract.play.rollout import Rollout
+
+# Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
+# a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
+_WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
+
+
+class RunWriter:
+    """Creates a run or continues the one that is there; any number of processes may do so at once.
+
+    Raises SettingsMismatchError if the location holds a run with other settings, or anything else.
+    """
+
+    def __init__(self, location: Location, plan: Plan, settings: dict[str, Any]) -> None:
+        self.location, self.plan = location, plan
+        self.settings = json.loads(canonical_json(settings))
+        if not location.exists(RUN_FILE):
+            location.found(self._beginning(), last=RUN_FILE)
+        self._refuse_other_settings()
+
+    def _beginning(self) -> dict[str, bytes]:
+        """Every object a run has before its first episode."""
+        arrays: dict[str, Buffer] = {}
+        create_arrays(
+            MemoryStore(arrays),
+            list(self.plan.streams),
+            len(self.plan.episodes),
+            self.settings["captured_calls"],
+            self.settings["tokens"] == "all",
+            self.settings["codec"],
+        )
+        run = {
+            "schema_version": SCHEMA_VERSION,
+            "settings": self.settings,
+            "settings_sha256": sha256_json(self.settings),
+            "streams": [stream.to_json() for stream in self.plan.streams],
+        }
+        return {
+            PLAN_FILE: as_json({"episodes": [e.to_json() for e in self.plan.episodes]}),
+            **{f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()},
+            RUN_FILE: as_json(run),
+        }
+
+    def _refuse_other_settings(self) -> None:
+        stored = read_card(self.location)
+        asked = {"schema_version": SCHEMA_VERSION, **self.settings}
+        there = {"schema_version": stored["schema_version"], **stored["settings"]}
+        refuse_other_settings(there, asked, str(self.location))
+
+    def several_may_write(self) -> bool:
+        """Whether the location keeps the first of two objects of one key, which commits rely on."""
+        return not self.location.create(RUN_FILE, self.location.read(RUN_FILE))
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Work on the run while the body runs; failures of earlier attempts are forgotten."""
+        with self.location.held(lambda: self.location.remove(FAILED)):
+            yield
+
+    def remaining(self) -> list[int]:
+        """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
+        done = read_commits(self.location)
+        return [episode.index for episode in self.plan.episodes if episode.index not in done]
+
+    def write(self, rollout: "Rollout") -> None:
+        """Store one episode: first its arrays, then the commit that makes it count."""
+        planned, buffers = rollout.planned, rollout.buffers
+        store = RecordingStore(self.location.store(DATA))
+        for kind, arrays in (("pooled", buffers.pooled), ("tokens", buffers.tokens)):
+            for stream, values in arrays.items():
+                array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
+                array[planned.index] = values
+        commit = {
+            "episode_id": planned.episode.episode_id,
+            "outcome": rollout.outcome,
+            "roles": buffers.roles,
+            "objects": {key: list(record) for key, record in sorted(store.objects.items())},
+        }
+        write_commit(self.location, planned.index, commit)
+
+    def write_certificate(self, certificate: dict[str, Any]) -> None:
+        """Record what was loaded and checked; the first one stays."""
+        if not self.location.exists(CERTIFICATE_FILE):
+            create_once(self.location, CERTIFICATE_FILE, json.loads(json.dumps(certificate, default=list)))

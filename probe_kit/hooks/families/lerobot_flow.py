@@ -1,0 +1,317 @@
+"""What the adapters of lerobot's flow-matching policies share: loading, batches, noise, units, taps.
+
+Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError
+from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.hooks.families.lerobot_normaliser import Normaliser, read_normaliser
+from probe_kit.hooks.families.lerobot_window import PictureWindow, read_window
+from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
+from probe_kit.hooks.roles import PADDING
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.weights import Weights, load_weights, read_weights
+from probe_kit.models.initialisation import initialise
+
+IMAGES, STATE = "observation.images.", "observation.state"
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+
+
+@dataclass(frozen=True)
+class Stack:
+    """One transformer stack inside a policy; `entry` names the block's first submodule."""
+
+    layers: Sequence[nn.Module]
+    norm: nn.Module
+    width: int
+    iterations: int | None
+    entry: str = "input_layernorm"
+
+    def tap(self, site: Site) -> Tap:
+        """Where a site of this stack is read."""
+        fires = self.iterations or 1
+        if site.quantity == "final_norm":
+            return Tap(self.norm, fires, "output")
+        if site.layer == len(self.layers):
+            return Tap(self.norm, fires)
+        block: Any = self.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, fires, "output")
+        if site.quantity == "attention":
+            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.out_proj
+            return Tap(projection, fires, "output")
+        return Tap(getattr(block, self.entry), fires)
+
+
+def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int, cameras: int) -> dict[str, Stack]:
+    """The three stacks of a flow policy; the vision tower runs once per camera, masked ones included."""
+    return {
+        "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
+        "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
+        "vision": Stack(
+            vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, cameras, "layer_norm1"
+        ),
+    }
+
+
+class LerobotFlow(Policy):
+    """A lerobot flow-matching policy behind the Policy contract; subclasses say how it packs its sequence."""
+
+    family: ClassVar[str]
+    config_type: ClassVar[str]
+    unread: ClassVar[tuple[str, ...]]
+    """Parameters that inference never reads and a file may lack."""
+
+    def __init__(self, network: Any, folder: Path) -> None:
+        self.network, self.folder, self.config = network, folder, network.config
+        self.stacks = self._stacks()
+        self._vision = self.stacks.pop("vision")
+        self.streams = {name: _stream(name, stack) for name, stack in self.stacks.items()}
+        keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
+        self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
+
+    # -- what a family decides -------------------------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """The network with weights nobody should use yet."""
+
+    @classmethod
+    @abstractmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A file's tensors under the names the network has."""
+
+    @abstractmethod
+    def _stacks(self) -> dict[str, Stack]:
+        """The stacks `backbone`, `expert` and `vision`."""
+
+    @property
+    @abstractmethod
+    def iterations(self) -> int:
+        """Flow-matching steps per inference."""
+
+    @property
+    @abstractmethod
+    def tokens_per_camera(self) -> int:
+        """Positions one picture takes in the prefix."""
+
+    @cached_property
+    @abstractmethod
+    def tokenizer(self) -> Any:
+        """The checkpoint's tokenizer."""
+
+    # -- loading -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(
+        cls, checkpoint: str, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+    ) -> Self:
+        """Load a lerobot checkpoint from a folder or hub id.
+
+        dtype: float32 or bfloat16; default what the checkpoint's config says.
+        random_weights: same architecture, tokenizer and statistics, but seeded random weights.
+        Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
+        """
+        folder = checkpoint_folder(checkpoint)
+        config = cls._read_config(folder)
+        if dtype is not None:
+            config.dtype = dtype
+        network = cls.build(config, folder)
+        if random_weights:
+            initialise(network, seed=0)
+            weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+        else:
+            weights = read_weights(folder)
+        audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
+        config.device = device
+        policy = cls(network.to(device), folder)
+        policy.card = PolicyCard(
+            family=cls.family,
+            checkpoint=checkpoint,
+            weights_sha256=audit.sha256,
+            random_weights=audit.random,
+            parameters=audit.parameters,
+            dtype=str(getattr(config, "dtype", "float32")),
+            device=device,
+            embodiment="7-DoF end-effector delta, one third-person camera",
+            cameras=policy.cameras,
+            chunk=config.chunk_size,
+            execute=min(config.n_action_steps, config.chunk_size),
+            notes=policy._notes(),
+            audit=audit.to_json(),
+        )
+        return policy
+
+    @classmethod
+    def _read_config(cls, folder: Path) -> Any:
+        if not (folder / "config.json").is_file():
+            raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
+        config: Any = PreTrainedConfig.from_pretrained(folder)
+        if config.type != cls.config_type:
+            raise CheckpointError(
+                f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
+            )
+        # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
+        config.compile_model = False
+        config.rtc_config = None
+        return config
+
+    def _notes(self) -> tuple[str, ...]:
+        masked = self.cameras[1:]
+        cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
+        return (*cameras, f"units: {self._units()}")
+
+    def _units(self) -> str:
+        """Where the statistics come from that turn actions into metres, or why there are none."""
+        try:
+            action, state = self.action_units, self.state_units
+        except CheckpointError as error:
+            return f"cannot act in metres: {error}"
+        return f"action {action.mode} from {action.source}, state {state.mode} from {state.source}"
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation; see the contract."""
+        if len(seeds) != len(observations):
+            raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds")
+        dimensions = self.config.output_features["action"].shape[0]
+        if dimensions != 7:
+            raise CheckpointError(
+                f"{self.folder} acts in {dimensions} dimensions; Act2Answer needs a 7-DoF end-effector delta"
+            )
+        chunk = self.infer(self.batch(observations), self.noise(seeds))
+        return self.action_units.restore(chunk.float().cpu().numpy())
+
+    def infer(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
+        """(B, chunk, D) normalised actions for a batch in lerobot's keys.
+
+        noise: (B, chunk, max_action_dim) float32.
+        Raises ObservationError unless the cameras are the first ones of the configuration, in its order, with
+        pictures in [0, 1]: lerobot moves present cameras to the front and rescales nothing.
+        """
+        given = [key.removeprefix(IMAGES) for key in batch if key.startswith(IMAGES)]
+        if given != list(self.cameras[: len(given)]) or not given:
+            raise ObservationError(
+                f"cameras {given} given; this checkpoint expects {list(self.cameras)}, in order"
+            )
+        for camera in given:
+            picture = batch[f"{IMAGES}{camera}"]
+            if not picture.is_floating_point() or picture.min() < 0 or picture.max() > 1:
+                raise ObservationError(
+                    f"pictures of {camera} are {picture.dtype} outside [0, 1]; divide bytes by 255"
+                )
+        with torch.inference_mode():
+            chunk: Tensor = self.network.predict_action_chunk(batch, noise=noise)
+        return chunk
+
+    def batch(self, observations: Sequence[Observation]) -> dict[str, Tensor]:
+        """The observations in lerobot's keys; the environment's picture goes to the first camera."""
+        device = self.config.device
+        tokens, mask = self.tokenise([o.instruction for o in observations])
+        images = torch.from_numpy(np.stack([_checked_image(o.image) for o in observations]))
+        state = np.stack([np.asarray(o.state, np.float32) for o in observations])
+        expected = self.config.input_features[STATE].shape[0]
+        if state.shape[1] != expected:
+            raise ObservationError(f"the state has {state.shape[1]} numbers; this checkpoint reads {expected}")
+        return {
+            f"{IMAGES}{self.cameras[0]}": self.window(images.permute(0, 3, 1, 2).to(device).float() / 255),
+            STATE: torch.from_numpy(self.state_units.normalise(state)).to(device),
+            TOKENS: tokens.to(device),
+            MASK: mask.to(device),
+        }
+
+    def noise(self, seeds: Sequence[int]) -> Tensor:
+        """(B, chunk, max_action_dim) float32 flow noise, a row per seed, the same on every device."""
+        shape = (self.config.chunk_size, self.config.max_action_dim)
+        rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        return torch.stack(rows).to(self.config.device)
+
+    def tokenise(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
+        """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word."""
+        length = self.config.tokenizer_max_length
+        lines = [text if text.endswith("\n") else f"{text}\n" for text in instructions]
+        rows = [self.tokenizer(line)["input_ids"] for line in lines]
+        for text, row in zip(instructions, rows, strict=True):
+            if len(row) > length:
+                raise InstructionError(
+                    f"{text!r} is {len(row)} tokens; this checkpoint reads {length}. Shorten it"
+                )
+            if self.tokenizer.unk_token_id in row:
+                raise InstructionError(
+                    f"{text!r} has a word this checkpoint's tokenizer does not know; it would act without "
+                    f"reading it. Tokens: {self.tokenizer.convert_ids_to_tokens(row)}"
+                )
+        tokens = torch.full((len(rows), length), self.tokenizer.pad_token_id or 0)
+        mask = torch.zeros((len(rows), length), dtype=torch.bool)
+        for index, row in enumerate(rows):
+            tokens[index, : len(row)] = torch.tensor(row)
+            mask[index, : len(row)] = True
+        return tokens, mask
+
+    @cached_property
+    def window(self) -> PictureWindow:
+        """The part of the picture this checkpoint looks at."""
+        camera = f"{IMAGES}{self.cameras[0]}"
+        return read_window(self.folder, camera, tuple(self.config.image_features[camera].shape[-2:]))
+
+    @cached_property
+    def state_units(self) -> Normaliser:
+        """Metres and radians to what the network reads."""
+        return read_normaliser(self.folder, "policy_preprocessor", STATE, "STATE")
+
+    @cached_property
+    def action_units(self) -> Normaliser:
+        """What the network writes to metres and radians."""
+        return read_normaliser(self.folder, "policy_postprocessor", "action", "ACTION")
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the stack's final norm, or a block's output."""
+        stack = self._vision if site.stream == "vision" else self.stacks.get(site.stream)
+        if stack is None or site not in _stream(site.stream, stack).sites(site.quantity):
+            streams = ", ".join(map(str, self.streams.values()))
+            raise UnknownSiteError(f"{self.family} has no site {site}; it has {streams} and vision")
+        return stack.tap(site)
+
+    @property
+    def vision(self) -> Stream:
+        """The vision tower; it runs once per camera, masked ones included."""
+        return _stream("vision", self._vision)
+
+    def language_roles(self, instructions: Sequence[str]) -> list[list[str]]:
+        """Per row, the roles of the language positions."""
+        tokens, mask = self.tokenise(instructions)
+        special = torch.isin(tokens, torch.tensor(self.tokenizer.all_special_ids))
+        return [
+            [
+                PADDING if not valid else "special" if marker else "language"
+                for valid, marker in zip(row, markers, strict=True)
+            ]
+            for row, markers in zip(mask.tolist(), special.tolist(), strict=True)
+        ]
+
+
+def _stream(name: str, stack: Stack) -> Stream:
+    return Stream(name, len(stack.layers) + 1, stack.width, stack.iterations)
+
+
+def _checked_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
+    return image

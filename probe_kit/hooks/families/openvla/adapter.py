@@ -1,0 +1,165 @@
+"""The adapter for OpenVLA: its prompt, its actions as tokens, the units of the data it was trained on.
+
+Sequence: beginning, 256 patches, "In: What action should the robot take to …?\nOut:" and one empty token. Seven
+greedy tokens follow, one per dimension; iteration k of the stream `action` is the position that chooses the k-th.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
+from probe_kit.hooks.families.prismatic.adapter import Prismatic
+from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
+from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.policy import Observation
+from probe_kit.models.prismatic import CROP_AREA, centre_crop
+
+DEFAULT_CHECKPOINT = "openvla/openvla-7b"
+_SLOT = "{instruction}"
+PROMPTS = {
+    "openvla": "In: What action should the robot take to {instruction}?\nOut:",
+    "openvla-v01": "A chat between a curious user and an artificial intelligence assistant. The assistant gives "
+    "helpful, detailed, and polite answers to the user's questions. USER: What action should the robot take to "
+    "{instruction}? ASSISTANT:",
+}
+# How the Llama-2 tokenizer splits the beginning of the prompt, as recorded from the original software.
+_LLAMA_VOCABULARY = 32000
+_LLAMA_PROMPT = [1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304]
+_GRIPPER_OPEN = 0.5
+
+
+class OpenVLA(Prismatic):
+    """A loaded OpenVLA."""
+
+    family: ClassVar[str] = "openvla"
+    output: ClassVar[str] = "action"
+
+    def __init__(
+        self,
+        loaded: LoadedPrismatic,
+        statistics: ActionStatistics,
+        prompt: str,
+        crop: bool,
+        tokenizer: str | None = None,
+    ) -> None:
+        super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
+        self.statistics, self.template, self.crop = statistics, prompt, crop
+        self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)
+        self.card = replace(
+            self.card,
+            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {statistics.key}",
+            chunk=1,
+            execute=1,
+            notes=(*self.card.notes, *self._notes(tokenizer)),
+            settings=self._settings(tokenizer),
+        )
+
+    def _settings(self, tokenizer: str | None) -> dict[str, str]:
+        chosen = {} if tokenizer is None else {"tokenizer": tokenizer}
+        return {
+            "unnorm_key": self.statistics.key,
+            "action_statistics": self.statistics.sha256,
+            "prompt": self.template,
+            "centre_crop": str(self.crop),
+            **chosen,
+        }
+
+    def _notes(self, tokenizer: str | None) -> tuple[str, ...]:
+        notes = [f"actions in the units and at the rate of {self.statistics.key}", f"prompt: {self.template!r}"]
+        if self.crop:
+            notes.append(f"pictures: middle {CROP_AREA:.0%} of the area")
+        if tokenizer == BYTES:
+            notes.append("development tokenizer: bytes, which no model was trained with")
+        return tuple(notes)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One action per observation; decoding is greedy, so the seeds change nothing. See the contract."""
+        if len(seeds) != len(observations):
+            raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds")
+        if self.steps != 7:
+            raise CheckpointError(
+                f"{self.statistics.key} has actions of {self.steps} dimensions; Act2Answer needs a 7-DoF "
+                "end-effector delta. Choose another --unnorm-key"
+            )
+        rows = [self.prompt(observation.instruction) for observation in observations]
+        pixels = self.pixel_values(self._look(observation.image) for observation in observations)
+        ids = self.generate(pixels, rows).ids.cpu().numpy()
+        self._say_unknown(ids)
+        actions = self.statistics.restore(self.action_tokens.values(ids))
+        actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
+        return actions[:, None].astype(np.float32)
+
+    def _look(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return centre_crop(image, self.config.towers[0].image_size) if self.crop else image
+
+    def _say_unknown(self, ids: NDArray[np.int64]) -> None:
+        if not self.action_tokens.known(ids).all():
+            warnings.warn(
+                "the model put out tokens that name no action; they count as the nearest bin, as in the original "
+                "software. Random weights do this; if trained ones do, prompt or tokenizer are wrong",
+                stacklevel=3,
+            )
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""
+        ids = self.tokenizer.encode(self.template.replace(_SLOT, instruction.lower()))
+        self._refuse_other_ids(ids)
+        return self.with_empty_token(ids)
+
+    def with_empty_token(self, ids: list[int]) -> list[int]:
+        """The model was trained with this token between prompt and action."""
+        empty = self.config.empty_token
+        return ids if ids[-1] == empty else [*ids, empty]
+
+    def _refuse_other_ids(self, ids: list[int]) -> None:
+        """Of Llama's tokenizer it is known how it splits the prompt; another split would go unnoticed."""
+        llama = self.config.text.model_type == "llama" and self.config.action_vocabulary == _LLAMA_VOCABULARY
+        if llama and self.template == PROMPTS["openvla"] and ids[: len(_LLAMA_PROMPT)] != _LLAMA_PROMPT:
+            raise CheckpointError(
+                f"the tokenizer splits the prompt into {ids[: len(_LLAMA_PROMPT)]}…; OpenVLA was trained with "
+                f"{_LLAMA_PROMPT}…. Take tokenizer.json from {DEFAULT_CHECKPOINT}"
+            )
+
+
+def load_openvla(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    unnorm_key: str | None = None,
+    prompt: str | None = None,
+    centre_crop: bool = False,
+    tokenizer: str | None = None,
+    bits: int | None = None,
+) -> OpenVLA:
+    """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
+
+    unnorm_key: data set whose units the actions get; default bridge_orig, or the only one there is.
+    prompt: `openvla`, `openvla-v01` or a template with {instruction}; default the one of the checkpoint's
+    generation. centre_crop: show the middle 0.9 of the picture's area, as fine-tunes with augmentation expect.
+    tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
+    Raises UsageError, and what `load_checkpoint` raises.
+    """
+    loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits)
+    if loaded.config.model_type != "openvla":
+        raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
+    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)
+    return OpenVLA(loaded, statistics, _template(prompt, loaded), centre_crop, tokenizer)
+
+
+def _template(prompt: str | None, loaded: LoadedPrismatic) -> str:
+    """The first release (openvla-7b-v01) was made of Vicuna, and has Vicuna's prompt."""
+    name = prompt or ("openvla-v01" if loaded.config.language_id.startswith("vicuna") else "openvla")
+    template = PROMPTS.get(name, name)
+    if _SLOT not in template:
+        raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {_SLOT}")
+    return template

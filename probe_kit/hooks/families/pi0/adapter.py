@@ -1,0 +1,119 @@
+"""The adapter for pi0.
+
+Prefix: every camera's patches, then the language, one bidirectional block.
+Suffix: the state, then the action chunk.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+from transformers import AutoTokenizer
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.lerobot_flow import LerobotFlow, Stack, flow_stacks
+from probe_kit.hooks.policy import Observation
+from probe_kit.hooks.roles import PADDING, Roles
+from probe_kit.models.pi0 import Pi0Size, build_pi0
+from probe_kit.models.pi0_keys import current_pi0_keys
+from probe_kit.models.pi0_tiny import embedded_checkpoint
+
+_TOKENIZER = "google/paligemma-3b-pt-224"
+
+
+class Pi0(LerobotFlow):
+    """A loaded pi0."""
+
+    family = "pi0"
+    config_type = "pi0"
+    unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
+
+    def __init__(self, network: Any, folder: Path) -> None:
+        super().__init__(network, folder)
+        self.role_names = {
+            "backbone": (f"image.{self.cameras[0]}", "language", "special", PADDING),
+            "expert": ("state", "action"),
+        }
+
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """lerobot's policy at the size `dims.json` gives, or at the released size."""
+        sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
+        network: nn.Module = build_pi0(config, Pi0Size.from_file(sizes[0]) if sizes else None)
+        return network
+
+    @classmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Old layouts brought to today's."""
+        return current_pi0_keys(tensors)
+
+    def _stacks(self) -> dict[str, Stack]:
+        joint = self.network.model.paligemma_with_expert
+        backbone, expert = joint.paligemma.model.language_model, joint.gemma_expert.model
+        vision = joint.paligemma.model.vision_tower.vision_model
+        cameras = len(self.config.image_features)
+        return flow_stacks(backbone, expert, vision, self.iterations, cameras)
+
+    @property
+    def iterations(self) -> int:
+        """Flow-matching steps per inference."""
+        return int(self.config.num_inference_steps)
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """PaliGemma's, from the checkpoint folder or the hub."""
+        for place in (self.folder, self.folder.parent / "tokenizer"):
+            if (place / "tokenizer.json").is_file():
+                return AutoTokenizer.from_pretrained(place)
+        try:
+            return AutoTokenizer.from_pretrained(_TOKENIZER)
+        except OSError as error:
+            raise CheckpointError(
+                f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "
+                "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
+            ) from error
+
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Cameras without a picture are masked and lie behind the present one."""
+        images = [f"image.{self.cameras[0]}"] * self.tokens_per_camera
+        masked = [PADDING] * self.tokens_per_camera * (len(self.config.image_features) - 1)
+        language = self.language_roles([o.instruction for o in observations])
+        suffix = Roles.from_labels(["state", *["action"] * self.config.chunk_size])
+        return {
+            "backbone": [Roles.from_labels([*images, *masked, *row]) for row in language],
+            "expert": [suffix] * len(observations),
+        }
+
+    @property
+    def tokens_per_camera(self) -> int:
+        """Patches of one picture."""
+        vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
+        return int(vision.embeddings.num_patches)
+
+
+def load_pi0(checkpoint: str, device: str = "cpu", dtype: str | None = None, random_weights: bool = False) -> Pi0:
+    """Load a lerobot pi0 checkpoint; see `LerobotFlow.load`."""
+    return Pi0.load(checkpoint, device, dtype, random_weights)
+
+
+def load_pi0_tiny(
+    checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+) -> Pi0:
+    """The embedded default: pi0 at 0.82 million parameters, trained on Color and Shape."""
+    return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights)
+
+
+def load_pi0_tiny_early(
+    checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+) -> Pi0:
+    """The embedded default as it was early in its training."""
+    return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights)
+
+
+def _load_embedded(name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool) -> Pi0:
+    policy = Pi0.load(checkpoint or str(embedded_checkpoint(name)), device, dtype, random_weights)
+    policy.card = replace(policy.card, family=name, checkpoint=checkpoint or "embedded")
+    return policy

@@ -1,0 +1,1 @@
+"""Prismatic vision-language models, native."""

@@ -1,0 +1,223 @@
+"""The adapter for Prismatic vision-language models: packing, streams, taps, roles. OpenVLA builds on it.
+
+One stack serves two streams, told apart by position: `backbone` is the prompt without its last token, the other
+one the positions whose logits choose the output: the prompt's last token, then every token fed back but the last.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError, UsageError
+from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
+from probe_kit.hooks.families.prismatic.tokenizer import TextTokenizer, find_tokenizer
+from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
+from probe_kit.hooks.roles import PADDING, Roles
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
+
+CAMERA = "primary"
+_PROMPT, _LAST = slice(None, -1), slice(-1, None)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Prompts as one batch: ids (B, T) int64 and mask (B, T) bool, False at padding.
+
+    Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
+    is in the batch. Positions count tokens only, so the network computes the same numbers as without padding.
+    """
+
+    ids: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[int]], padding: int) -> "Packed":
+        """Pack one prompt per row."""
+        longest = max(map(len, rows))
+        ids = torch.full((len(rows), longest), padding)
+        mask = torch.zeros((len(rows), longest), dtype=torch.bool)
+        for index, row in enumerate(rows):
+            ids[index, : len(row) - 1], ids[index, -1] = torch.tensor(row[:-1]), row[-1]
+            mask[index, : len(row) - 1], mask[index, -1] = True, True
+        return cls(ids, mask)
+
+
+class Prismatic(Policy):
+    """A loaded Prismatic model: looks at a picture, reads a prompt, puts out `steps` greedy tokens."""
+
+    family: ClassVar[str] = "prismatic"
+    output: ClassVar[str] = "answer"
+    """The stream of the positions that choose the output."""
+
+    def __init__(self, loaded: LoadedPrismatic, steps: int, tokenizer: str | None = None) -> None:
+        self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
+        self.steps, self._chosen_tokenizer = steps, tokenizer
+        self.decoder: Any = self.network.language_model.model
+        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        self.streams = {
+            "backbone": Stream("backbone", layers, width),
+            self.output: Stream(self.output, layers, width, steps),
+        }
+        self.role_names = {
+            "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
+            self.output: (self.output,),
+        }
+        self.card = PolicyCard(
+            family=self.family,
+            checkpoint=loaded.checkpoint,
+            weights_sha256=loaded.audit.sha256,
+            random_weights=loaded.audit.random,
+            parameters=loaded.audit.parameters,
+            dtype=loaded.dtype,
+            device=loaded.device,
+            embodiment="",
+            cameras=(CAMERA,),
+            chunk=0,
+            execute=0,
+            notes=loaded.notes,
+            audit=loaded.audit.to_json(),
+            exact=loaded.exact,
+        )
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def pictures(self) -> PictureSettings:
+        """How pictures are resized and normalised."""
+        return PictureSettings.of(self.config, self.loaded.folders[-1])
+
+    def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3 per tower, S, S) float32 of (H, W, 3) uint8 pictures. Raises ObservationError."""
+        rows = [prepare_picture(_checked(image), self.pictures) for image in images]
+        return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
+
+    @cached_property
+    def tokenizer(self) -> TextTokenizer:
+        """The checkpoint's. Raises CheckpointError naming the files that are missing."""
+        text = self.config.text
+        return find_tokenizer(
+            self.loaded.folders, self._chosen_tokenizer, text.bos_token_id, self.config.action_vocabulary
+        )
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of a whole prompt; a vision-language model takes the text as it is."""
+        return self.tokenizer.encode(instruction)
+
+    def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
+        """Prompts of ids as a batch. Raises InstructionError for one that is too long, CheckpointError for ids
+        the model does not have.
+        """
+        limit = int(self.config.text.max_position_embeddings)
+        for row in rows:
+            if (length := self.network.patches + len(row) + self.steps) > limit:
+                raise InstructionError(f"a prompt makes {length} positions; this model has {limit}. Shorten it")
+            if max(row) >= self.config.text.vocab_size:
+                raise CheckpointError(
+                    f"the tokenizer gave id {max(row)}; this model has {self.config.text.vocab_size}. "
+                    "The tokenizer belongs to another checkpoint"
+                )
+        padding = self.config.text.pad_token_id
+        return Packed.of(rows, 0 if padding is None else int(padding))
+
+    # -- running -----------------------------------------------------------------------------------------
+
+    def generate(self, pixel_values: Tensor | None, rows: Sequence[Sequence[int]]) -> Decoded:
+        """`steps` greedy tokens behind every prompt; one inference, as `capture` counts it."""
+        packed = self.pack(rows)
+        device = self.loaded.device
+        with torch.inference_mode():
+            return self.network.decode(packed.ids.to(device), packed.mask.to(device), pixel_values, self.steps)
+
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """Refused: raises UsageError."""
+        raise UsageError(
+            f"asked for actions of {len(observations)} observations with {len(seeds)} seeds, but {self.family} is "
+            "a vision-language model and does not act; OpenVLA is the policy made of it"
+        )
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
+        rows = [self.prompt(observation.instruction) for observation in observations]
+        longest, special = max(map(len, rows)), self.tokenizer.special
+        image = [f"image.{CAMERA}"] * self.network.patches
+        backbone = []
+        for first, *text, _ in rows:
+            labels = ["special" if number in special else "language" for number in (first, *text)]
+            labels[1:1] = image
+            labels += [PADDING] * (self.network.patches + longest - 1 - len(labels))
+            backbone.append(Roles.from_labels(labels))
+        return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or a block's output."""
+        stream = self.streams.get(site.stream)
+        if stream is not None and site in stream.sites(site.quantity):
+            return self._language_tap(site)
+        if site.stream in self.vision and site in self.vision[site.stream].sites():
+            return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
+        streams = ", ".join(map(str, (*self.streams.values(), *self.vision.values())))
+        raise UnknownSiteError(f"{self.family} has no site {site}; it has {streams}")
+
+    def _language_tap(self, site: Site) -> Tap:
+        tokens = _PROMPT if site.stream == "backbone" else _LAST
+        norm: nn.Module = getattr(self.decoder, "norm", None) or self.decoder.final_layernorm
+        if site.quantity == "final_norm":
+            return Tap(norm, self.steps, "output", tokens)
+        if site.layer == len(self.decoder.layers):
+            return Tap(norm, self.steps, tokens=tokens)
+        block = self.decoder.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, self.steps, "output", tokens)
+        if site.quantity == "attention":
+            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.dense
+            return Tap(projection, self.steps, "output", tokens)
+        return Tap(block.input_layernorm, self.steps, tokens=tokens)
+
+    @property
+    def vision(self) -> dict[str, Stream]:
+        """The towers as streams of residual sites; the last one is what the projector reads, class and register
+        tokens in front. No part of `streams`: a tower is asked for by site.
+        """
+        return {
+            name: Stream(name, len(tower.blocks), int(tower.embed_dim)) for name, tower in self._towers.items()
+        }
+
+    @property
+    def _towers(self) -> dict[str, Any]:
+        return dict(zip(("vision", "vision_fused"), self.network.vision_backbone.towers, strict=False))
+
+
+def _checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
+    return image
+
+
+def load_prismatic(
+    checkpoint: str | None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    tokenizer: str | None = None,
+    bits: int | None = None,
+    steps: int = 1,
+) -> Prismatic:
+    """Load a Prismatic model in the layout of `PrismaticForConditionalGeneration`, from a folder or hub id.
+
+    tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4, see `load_checkpoint`. steps: greedy tokens
+    per inference. Raises UsageError without a checkpoint, and what `load_checkpoint` raises.
+    """
+    if checkpoint is None:
+        raise UsageError("prismatic has no default checkpoint; pass a folder or hub id as --checkpoint")
+    loaded = load_checkpoint(checkpoint, device, dtype, random_weights, bits)
+    return Prismatic(loaded, steps, tokenizer)

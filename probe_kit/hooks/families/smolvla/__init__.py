@@ -1,0 +1,1 @@
+"""SmolVLA through lerobot."""

@@ -1,0 +1,233 @@
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks.families.openvla.adapter import PROMPTS, OpenVLA, load_openvla
+from probe_kit.hooks.families.prismatic.checkpoint import STATISTICS_FILE
+from probe_kit.hooks.testing import AdapterContract
+from probe_kit.hooks.verify import verify_keys, verify_reference
+from tests.prismatic_checkpoints import SINGLE, config_values, write_checkpoint, write_tokenizer
+
+pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("openvla"))
+
+
+@pytest.fixture(scope="module")
+def fused(folder: Path) -> OpenVLA:
+    return load_openvla(str(folder), tokenizer="bytes")
+
+
+@pytest.fixture(scope="module")
+def mistral(tmp_path_factory: pytest.TempPathFactory) -> OpenVLA:
+    where = tmp_path_factory.mktemp("mistral")
+    write_checkpoint(where, vision=SINGLE, language="mistral-v0.1-7b-pure", image_resize_strategy="letterbox")
+    return load_openvla(str(write_tokenizer(where)))
+
+
+@pytest.fixture(scope="module")
+def golden(golden_openvla: Path) -> OpenVLA:
+    return load_openvla(str(golden_openvla / "checkpoint"), tokenizer="bytes")
+
+
+class TestFusedLlama(AdapterContract):
+    @pytest.fixture
+    def policy(self, fused: OpenVLA) -> OpenVLA:
+        return fused
+
+
+class TestSingleTowerMistralWithATokenizerFile(AdapterContract):
+    @pytest.fixture
+    def policy(self, mistral: OpenVLA) -> OpenVLA:
+        return mistral
+
+    @pytest.fixture
+    def observations(self, observation: Observation) -> list[Observation]:
+        return [
+            replace(observation, instruction=text)
+            for text in ("Put the cube on the star", "take the red cube to the star")
+        ]
+
+
+class TestGoldenOpenVLA(AdapterContract):
+    @pytest.fixture
+    def policy(self, golden: OpenVLA) -> OpenVLA:
+        return golden
+
+
+# -- the reference ---------------------------------------------------------------------------------------------
+
+
+def test_the_golden_reference_is_reproduced_in_every_output(golden_openvla: Path) -> None:
+    verification = verify_reference("openvla", golden_openvla)
+    assert verification.passed
+    assert {c.status for c in verification.comparisons} == {"ok"}
+    assert len(verification.comparisons) == 23
+
+
+def test_one_wrong_number_in_the_reference_is_noticed(golden_openvla: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(golden_openvla, tmp_path / "golden"))
+    with np.load(copy / "reference.npz") as arrays:
+        recorded = {name: arrays[name] for name in arrays.files}
+    recorded["generated_step_hidden"][6, 2, 0] += 0.001
+    recorded["something_else"] = np.zeros(1)
+    np.savez(copy / "reference.npz", **recorded)
+    status = {c.output: c.status for c in verify_reference("openvla", copy).comparisons}
+    assert [name for name, found in status.items() if found == "over"] == ["generated_step_hidden"]
+    assert status["something_else"] == "not compared"
+
+
+def test_full_size_keys_are_equal(golden_openvla: Path) -> None:
+    assert verify_keys("openvla", golden_openvla / "real_keys.json.gz").passed
+
+
+# -- prompt ----------------------------------------------------------------------------------------------------
+
+
+def test_the_prompt_is_lower_case_and_ends_with_one_empty_token(fused: OpenVLA) -> None:
+    text = "In: What action should the robot take to put the cube on the star?\nOut:"
+    expected = [1, *(3 + byte for byte in text.encode()), 29]
+    assert fused.prompt("Put the Cube on the star") == expected
+    assert fused.with_empty_token(expected) == expected
+
+
+def test_a_file_tokenizer_gets_the_beginning_of_the_sequence(mistral: OpenVLA) -> None:
+    """The file has no rule that adds it; then "in:" and "what", with which the prompt begins."""
+    assert mistral.prompt("put the cube")[:3] == [1, 6, 7]
+
+
+def test_a_word_the_tokenizer_does_not_know_is_an_error(mistral: OpenVLA, observation: Observation) -> None:
+    with pytest.raises(InstructionError, match="<unk>"):
+        mistral.act([replace(observation, instruction="put the cube on the zebra")], [0])
+
+
+def test_the_first_release_gets_vicunas_prompt(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, vision=SINGLE, language="vicuna-v15-7b")
+    assert load_openvla(str(folder)).template == PROMPTS["openvla-v01"]
+    assert load_openvla(str(folder), prompt="do {instruction} now").template == "do {instruction} now"
+    with pytest.raises(UsageError, match="instruction"):
+        load_openvla(str(folder), prompt="do something")
+
+
+def test_another_split_of_the_prompt_than_llamas_is_refused_at_full_vocabulary(tmp_path: Path) -> None:
+    text = config_values()["text_config"] | {"vocab_size": 32064, "pad_token_id": 32000}
+    folder = write_checkpoint(tmp_path, vision=SINGLE, text_config=text)
+    policy = load_openvla(str(folder), tokenizer="bytes")
+    with pytest.raises(CheckpointError, match="512, 29901, 1724"):
+        policy.prompt("put the cube on the star")
+
+
+def test_without_a_tokenizer_the_missing_files_are_named(folder: Path, observation: Observation) -> None:
+    policy = load_openvla(str(folder))
+    with pytest.raises(CheckpointError, match=r"tokenizer\.json and tokenizer_config\.json are missing") as caught:
+        policy.act([observation], [0])
+    assert str(folder) in str(caught.value)
+
+
+def test_picture_positions_cannot_know_the_instruction(fused: OpenVLA, observation: Observation) -> None:
+    """Attention is causal and the picture comes first; docs/openvla.md says what that means for probes."""
+    kept = []
+    for text in ("Put the cube on the star", "Take it away"):
+        with capture(fused, fused.sites()) as tape:
+            fused.act([replace(observation, instruction=text)], [0])
+        kept.append(tape[Site("backbone", 2)])
+    patches = 1 + fused.network.patches
+    torch.testing.assert_close(kept[0][:, :patches], kept[1][:, :patches], rtol=0, atol=1e-5)
+    assert (kept[0][:, -1] - kept[1][:, -1]).abs().max() > 1e-3
+
+
+# -- actions ---------------------------------------------------------------------------------------------------
+
+
+def test_the_gripper_is_open_or_closed_and_the_rest_in_units_of_the_data(
+    fused: OpenVLA, observation: Observation
+) -> None:
+    action = fused.act([observation], [0])[0, 0]
+    assert action[6] in (0, 1)
+    assert (np.abs(action[:6]) <= 0.1).all()
+
+
+def test_other_statistics_give_other_units_for_the_same_tokens(golden_openvla: Path) -> None:
+    checkpoint = str(golden_openvla / "checkpoint")
+    policies = [load_openvla(checkpoint, unnorm_key=key, tokenizer="bytes") for key in (None, "other_set")]
+    assert [policy.card.settings["unnorm_key"] for policy in policies] == ["bridge_orig", "other_set"]
+    assert policies[0].card.settings["action_statistics"] != policies[1].card.settings["action_statistics"]
+
+
+def test_statistics_that_fine_tuning_wrote_are_found_beside_the_weights(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "tuned"))
+    mine = {"my_arm": {"action": {"q01": [-1.0] * 7, "q99": [1.0] * 7}}}
+    (copy / STATISTICS_FILE).write_text(json.dumps(mine))
+    assert load_openvla(str(copy)).statistics.key == "bridge_orig"
+    assert load_openvla(str(copy), unnorm_key="my_arm").statistics.mask.all()
+    with pytest.raises(UsageError, match="Did you mean my_arm"):
+        load_openvla(str(copy), unnorm_key="my_arms")
+
+
+def test_actions_of_another_number_of_dimensions_are_refused(tmp_path: Path, observation: Observation) -> None:
+    two_arms = {"two_arms": {"action": {"q01": [0.0] * 14, "q99": [1.0] * 14}}}
+    policy = load_openvla(str(write_checkpoint(tmp_path, norm_stats=two_arms)), tokenizer="bytes")
+    assert policy.streams["action"].iterations == 14
+    with pytest.raises(CheckpointError, match="14 dimensions"):
+        policy.act([observation], [0])
+
+
+def test_tokens_that_name_no_action_are_said(fused: OpenVLA, observation: Observation) -> None:
+    head = fused.network.language_model.lm_head.weight
+    before = head.clone()
+    with torch.no_grad():
+        head.zero_()  # every logit equal: the first id wins, which is text
+    try:
+        with pytest.warns(UserWarning, match="name no action"):
+            fused.act([observation], [0])
+    finally:
+        with torch.no_grad():
+            head.copy_(before)
+
+
+def test_the_centre_crop_changes_what_the_model_sees_and_is_written_down(
+    folder: Path, observation: Observation
+) -> None:
+    whole, middle = (load_openvla(str(folder), centre_crop=crop, tokenizer="bytes") for crop in (False, True))
+    edge = observation.image.copy()
+    edge[:2] = 255 - edge[:2]
+    seen = [middle.pixel_values([middle._look(image)]) for image in (observation.image, edge)]
+    torch.testing.assert_close(seen[0][..., 4:, :], seen[1][..., 4:, :], rtol=0, atol=1e-5)
+    assert (whole.card.settings["centre_crop"], middle.card.settings["centre_crop"]) == ("False", "True")
+    assert any("90%" in note for note in middle.card.notes)
+
+
+# -- loading ---------------------------------------------------------------------------------------------------
+
+
+def test_a_prismatic_model_without_actions_is_refused(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, model_type="prismatic")
+    with pytest.raises(CheckpointError, match="--model prismatic"):
+        load_openvla(str(folder))
+
+
+def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path, observation: Observation) -> None:
+    policy = load_openvla(str(folder), dtype="bfloat16", tokenizer="bytes")
+    exact = load_openvla(str(folder))
+    assert policy.card.dtype == "bfloat16"
+    assert policy.card.exact
+    for name, tensor in exact.network.state_dict().items():
+        assert torch.equal(policy.network.state_dict()[name], tensor.to(torch.bfloat16))
+    assert np.isfinite(policy.act([observation], [0])).all()
+    with pytest.raises(UsageError, match="float16"):
+        load_openvla(str(folder), dtype="float16")
+
+
+def test_an_option_of_another_family_is_refused() -> None:
+    with pytest.raises(UsageError, match="pi0-tiny has no option unnorm_key"):
+        load_policy("pi0-tiny", unnorm_key="bridge_orig")

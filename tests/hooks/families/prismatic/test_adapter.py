@@ -1,0 +1,110 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
+from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks.families.prismatic.adapter import Packed, Prismatic, load_prismatic
+from probe_kit.hooks.verify import verify_reference
+from tests.prismatic_checkpoints import write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Prismatic:
+    folder = write_checkpoint(
+        tmp_path_factory.mktemp("phi"), vision="dinoclip-vit-l-336px", language="phi-2-3b", model_type="prismatic"
+    )
+    return load_prismatic(str(folder), tokenizer="bytes", steps=3)
+
+
+def test_the_golden_reference_is_reproduced(golden_prismatic: Path) -> None:
+    verification = verify_reference("prismatic", golden_prismatic)
+    ok = {c.output for c in verification.comparisons if c.status == "ok"}
+    assert verification.passed
+    assert ok == {
+        "pixel_values", "vision_patches", "projector_features", "hidden_states", "logits", "generated_ids",
+    }  # fmt: skip
+
+
+def test_padding_stands_before_the_last_token_so_that_no_other_token_moves() -> None:
+    packed = Packed.of([[1, 7, 8, 9, 10], [1, 7, 29]], padding=0)
+    assert packed.ids.tolist() == [[1, 7, 8, 9, 10], [1, 7, 0, 0, 29]]
+    assert packed.mask.tolist() == [[True] * 5, [True, True, False, False, True]]
+
+
+def test_both_streams_together_are_the_hidden_states_of_one_pass(
+    model: Prismatic, observation: Observation
+) -> None:
+    """Against transformers' own hidden states, for a language model whose block runs attention beside its MLP."""
+    prompt, pixels = model.prompt("What is this?"), model.pixel_values([observation.image])
+    with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
+        decoded = model.generate(pixels, [prompt])
+    fed = torch.tensor([[*prompt, *decoded.ids[0, :-1].tolist()]])
+    with torch.no_grad():
+        expected = model.network(fed, torch.ones_like(fed, dtype=torch.bool), pixels).hidden_states
+    last = len(expected) - 1
+    for layer, states in enumerate(expected):
+        quantity = "final_norm" if layer == last else "residual"
+        parts = [tape[Site("backbone", layer, quantity)]]
+        parts += [tape[Site("answer", layer, quantity, step)] for step in range(3)]
+        torch.testing.assert_close(torch.cat(parts, dim=1), states, rtol=0, atol=2e-5)
+
+
+def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, observation: Observation) -> None:
+    pixels = model.pixel_values([observation.image])
+    sites = {name: stream.sites()[-1] for name, stream in model.vision.items()}
+    with capture(model, sites.values()) as tape:
+        model.generate(pixels, [model.prompt("What is this?")])
+    towers = model.network.vision_backbone.towers
+    patches = [
+        tape[site][:, tower.num_prefix_tokens :] for site, tower in zip(sites.values(), towers, strict=True)
+    ]
+    with torch.no_grad():
+        expected = model.network.vision_backbone(pixels)
+    torch.testing.assert_close(torch.cat(patches, dim=2), expected, rtol=0, atol=0)
+
+
+def test_roles_name_what_every_position_is(model: Prismatic, observation: Observation) -> None:
+    """Beginning, patches, then a byte per letter; the last one belongs to the other stream."""
+    asked = replace(observation, instruction="Why?")
+    longer = replace(observation, instruction="Why not?")
+    short, long = model.roles([asked, longer])["backbone"]
+    patches = model.network.patches
+    assert short.spans == (
+        ("special", 0, 1),
+        ("image.primary", 1, 1 + patches),
+        ("language", 1 + patches, 4 + patches),
+        ("padding", 4 + patches, 8 + patches),
+    )
+    assert len(short) == len(long)
+
+
+def test_a_vision_language_model_refuses_to_act(model: Prismatic, observation: Observation) -> None:
+    with pytest.raises(UsageError, match="does not act"):
+        model.act([observation], [0])
+
+
+def test_there_is_no_default_checkpoint() -> None:
+    with pytest.raises(UsageError, match="--checkpoint"):
+        load_policy("prismatic")
+
+
+def test_a_prompt_that_does_not_fit_is_refused(model: Prismatic) -> None:
+    with pytest.raises(InstructionError, match="this model has 256"):
+        model.pack([model.prompt("word " * 60)])
+
+
+def test_a_picture_of_another_type_is_refused(model: Prismatic) -> None:
+    with pytest.raises(ObservationError, match="expected uint8"):
+        model.pixel_values([np.zeros((4, 4, 3), np.float32)])
+
+
+@pytest.mark.parametrize(
+    "site", [Site("expert", 0), Site("answer", 1), Site("vision", 3), Site("backbone", 1, "mlp", 0)]
+)
+def test_a_site_it_does_not_have_is_refused_with_those_it_has(model: Prismatic, site: Site) -> None:
+    with pytest.raises(UnknownSiteError, match="answer"):
+        model.tap(site)
