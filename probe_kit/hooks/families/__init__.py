@@ -1,1 +1,1 @@
-"""One folder per model family: where to listen in it, how to load it, how to verify it. What several share is here."""
+"""One folder per model family: where to listen in it, how to load and how to verify it; beside them what is shared."""
