@@ -1,1 +1,1 @@
-"""One folder per model family: where to listen in it, how to load and how to verify it; beside them what is shared."""
+"""One folder per model family: where to listen, how to load, how to verify; beside them what several share."""
