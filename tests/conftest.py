@@ -53,6 +53,11 @@ def golden_prismatic() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_magma() -> Path:
+    return _golden("magma")
+
+
+@pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
     from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 

@@ -1,0 +1,54 @@
+"""Magma, in plain torch, timm and transformers.
+
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
+listens or acts; its adapter in `probe_kit.hooks` does.
+"""
+
+from probe_kit.models.magma.config import MagmaConfig, VisionConfig
+from probe_kit.models.magma.network import (
+    UNUSED_WEIGHTS,
+    Choose,
+    Decoded,
+    Decoding,
+    MagmaNetwork,
+    build_magma,
+    full_size_magma,
+    greedy,
+)
+from probe_kit.models.magma.packing import PictureSpan
+from probe_kit.models.magma.pictures import (
+    Grid,
+    Picture,
+    PictureSettings,
+    choose_grid,
+    prepare_picture,
+    shrink_picture,
+)
+from probe_kit.models.magma.prompt import ACTION_QUESTION, Message, chat_text, conversation, picture_question
+from probe_kit.models.magma.statistics import shipped_statistics
+
+__all__ = [
+    "ACTION_QUESTION",
+    "UNUSED_WEIGHTS",
+    "Choose",
+    "Decoded",
+    "Decoding",
+    "Grid",
+    "MagmaConfig",
+    "MagmaNetwork",
+    "Message",
+    "Picture",
+    "PictureSettings",
+    "PictureSpan",
+    "VisionConfig",
+    "build_magma",
+    "chat_text",
+    "choose_grid",
+    "conversation",
+    "full_size_magma",
+    "greedy",
+    "picture_question",
+    "prepare_picture",
+    "shipped_statistics",
+    "shrink_picture",
+]

@@ -1,0 +1,203 @@
+"""The network: vision tower, projector, language model; a picture's tokens take the place of its placeholder.
+
+B batch, S positions, D width of the language model, V its vocabulary.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import DynamicCache, LlamaForCausalLM
+
+from probe_kit.models.magma.config import MagmaConfig
+from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
+from probe_kit.models.magma.pictures import Grid, Picture
+from probe_kit.models.magma.vision import Projector, VisionTower, map_size, stitched, whole_picture
+
+Choose = Callable[[Tensor], Tensor]
+"""Ids (B,) from logits (B, V)."""
+
+# In the released files and never read: the contrastive head that the trunk was trained with.
+UNUSED_WEIGHTS = (
+    "vision_tower.clip_vision_model.head.proj.weight",
+    "vision_tower.clip_vision_model.trunk.head.norm.bias",
+    "vision_tower.clip_vision_model.trunk.head.norm.weight",
+)
+
+
+def greedy(logits: Tensor) -> Tensor:
+    """(B,) the likeliest ids."""
+    return logits.argmax(dim=-1)
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What decoding put out: ids (B, N) int64, the logits (B, N, V) that chose them, and where to go on."""
+
+    ids: Tensor
+    logits: Tensor
+    decoding: "Decoding"
+
+
+class MagmaNetwork(nn.Module):
+    """Magma under the parameter names of its released files."""
+
+    def __init__(self, config: MagmaConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.vision_tower = VisionTower(config.vision)
+        self.multi_modal_projector = Projector(
+            config.vision, self.vision_tower.width, int(config.text.hidden_size)
+        )
+        self.language_model: Any = LlamaForCausalLM(config.text)
+
+    # -- pictures ----------------------------------------------------------------------------------------
+
+    def span(self, ids: Sequence[int], grid: Grid, side: int) -> PictureSpan:
+        """Where the tokens of a picture of `grid` crops of `side` pixels stand. Raises CheckpointError."""
+        rows, columns = map_size(grid, side, self.vision_tower.reduction, self.config.vision.strategy)
+        return PictureSpan(placeholder(ids, self.config.image_token), rows, columns)
+
+    def look(self, pictures: Sequence[Picture]) -> list[Tensor]:
+        """Per picture its tokens (h · (w + 1), D), separators at the end of every row of its map."""
+        reference = self.multi_modal_projector.row_seperator
+        if self.config.vision.strategy == "global":
+            maps = [self._projected(whole_picture(picture).to(reference))[0] for picture in pictures]
+        else:
+            crops = self._projected(torch.cat([picture.crops for picture in pictures]).to(reference))
+            parts = torch.split(crops, [len(picture.crops) for picture in pictures])
+            maps = [stitched(part, picture.grid) for part, picture in zip(parts, pictures, strict=True)]
+        return [self.multi_modal_projector.tokens(projected) for projected in maps]
+
+    def _projected(self, pixels: Tensor) -> Tensor:
+        """(N, a, b, D)."""
+        maps: Tensor = self.multi_modal_projector(self.vision_tower(pixels).permute(0, 2, 3, 1))
+        return maps
+
+    # -- text --------------------------------------------------------------------------------------------
+
+    def embed(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Packed:
+        """Prompts of ids, each with one placeholder where it has a picture. Raises CheckpointError."""
+        embedding = self.language_model.get_input_embeddings()
+        device = embedding.weight.device
+        if pictures is None:
+            return Packed.of([embedding(torch.tensor(ids, device=device)) for ids in prompts])
+        rows = []
+        for ids, tokens in zip(prompts, self.look(pictures), strict=True):
+            place = placeholder(ids, self.config.image_token)
+            before, behind = (torch.tensor(part, device=device) for part in (ids[:place], ids[place + 1 :]))
+            rows.append(torch.cat([embedding(before.long()), tokens, embedding(behind.long())]))
+        return Packed.of(rows)
+
+    def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Any:
+        """transformers' output of one pass, with logits (B, S, V) and all hidden states."""
+        packed = self.embed(prompts, pictures)
+        return self.language_model(
+            inputs_embeds=packed.embeddings,
+            position_ids=positions(packed.mask),
+            attention_mask=needed(packed.mask),
+            output_hidden_states=True,
+        )
+
+    def read(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> "Decoding":
+        """One pass over the prompts, to go on from token by token."""
+        return Decoding(self.language_model, self.embed(prompts, pictures))
+
+    def decode(
+        self,
+        prompts: Sequence[Sequence[int]],
+        pictures: Sequence[Picture] | None,
+        steps: int,
+        choose: Choose = greedy,
+    ) -> Decoded:
+        """Exactly `steps` tokens behind the prompts, whatever they are.
+
+        The language model is called once with the prompts and `steps - 1` times with one token.
+        """
+        decoding = self.read(prompts, pictures)
+        logits, ids = [decoding.logits], [choose(decoding.logits)]
+        while len(ids) < steps:
+            logits.append(decoding.feed(ids[-1]))
+            ids.append(choose(logits[-1]))
+        return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), decoding)
+
+
+class Decoding:
+    """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones."""
+
+    def __init__(self, language_model: Any, packed: Packed) -> None:
+        self.language_model, self._mask = language_model, packed.mask
+        self._cache = DynamicCache(config=language_model.config)
+        self._positions = positions(packed.mask)
+        self.logits = self._run(packed.embeddings)
+
+    def feed(self, ids: Tensor) -> Tensor:
+        """(B, V) logits behind one more token (B,) per row."""
+        self._positions = self._positions[:, -1:] + 1
+        self._mask = torch.cat([self._mask, torch.ones_like(self._mask[:, :1])], dim=1)
+        self.logits = self._run(self.language_model.get_input_embeddings()(ids[:, None]))
+        return self.logits
+
+    def _run(self, embeddings: Tensor) -> Tensor:
+        output = self.language_model(
+            inputs_embeds=embeddings,
+            position_ids=self._positions,
+            attention_mask=needed(self._mask),
+            past_key_values=self._cache,
+            use_cache=True,
+            logits_to_keep=1,
+        )
+        logits: Tensor = output.logits[:, -1]
+        return logits
+
+
+def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
+    """The network in eval mode.
+
+    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
+    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
+    Raises CheckpointError if the parts do not fit together.
+    """
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device(device):
+            network = MagmaNetwork(config)
+    finally:
+        torch.set_default_dtype(before)
+    # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
+    decoder = network.language_model.model
+    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
+    network.language_model.tie_weights()
+    for name, parameter in network.named_parameters():
+        if name.endswith(".bias") and not parameter.is_meta:
+            nn.init.zeros_(parameter)  # torch would draw them from the global generator
+    return network.eval()
+
+
+def full_size_magma() -> MagmaNetwork:
+    """Magma-8B on the meta device."""
+    config = MagmaConfig.from_json(
+        {
+            "model_type": "magma",
+            "image_token_index": 128257,
+            "text_config": {
+                "vocab_size": 128320,
+                "hidden_size": 4096,
+                "intermediate_size": 14336,
+                "num_hidden_layers": 32,
+                "num_attention_heads": 32,
+                "num_key_value_heads": 8,
+                "max_position_embeddings": 8192,
+                "rope_theta": 500000.0,
+                "rms_norm_eps": 1e-5,
+                "bos_token_id": 128000,
+                "eos_token_id": 128009,
+                "pad_token_id": 128256,
+            },
+            "vision_config": {"vision_backbone": "convnextxxlarge", "mm_projector_type": "mlp2x_gelu"},
+        }
+    )
+    return build_magma(config, torch.bfloat16)

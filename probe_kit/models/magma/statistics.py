@@ -1,0 +1,11 @@
+"""The units of Magma's actions, which its checkpoint does not hold: the evaluation client has them in its code."""
+
+import json
+from importlib.resources import files
+from typing import Any
+
+
+def shipped_statistics() -> dict[str, Any]:
+    """Per data set, the quantiles that un-normalise its actions; `statistics.json` names their source."""
+    text = (files("probe_kit.models.magma") / "statistics.json").read_text()
+    return dict(json.loads(text)["norm_stats"])
