@@ -1,20 +1,16 @@
-"""`probe-kit extract`, `probe-kit export` and `probe-kit run`."""
+"""`probe-kit extract`."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, err, out, print_json, progress, split
+from probe_kit.console import counter, err, out, progress, split
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.extract import Extraction, Run
     from probe_kit.extract.store.location import Location
-
-run_app = typer.Typer(help="Look after runs.", no_args_is_help=True)
-DAMAGED = 1
 
 SCENE = "Scene (recorded with the run)"
 FAMILY = "Model (only some families have these)"
@@ -223,55 +219,3 @@ def _print_outcomes(run: "Run") -> None:
     step = "retention" if not run.streams else "train"
     err.print(f"next: [bold]probe-kit {step} {run.location}[/]", highlight=False, soft_wrap=True)
     out.print(str(run.location), highlight=False, soft_wrap=True)
-
-
-# -- run -----------------------------------------------------------------------------------------------
-
-
-@run_app.command("verify")
-def verify(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Read every byte, not only sizes.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> None:
-    """Compare a run with what its commits promise; exit 1 if anything is missing or changed."""
-    from probe_kit.extract import verify_run
-
-    found = verify_run(run, deep)
-    if as_json:
-        print_json({**asdict(found), "ok": found.ok})
-    else:
-        checked = "every byte" if deep else "sizes"
-        sealed = "sealed" if found.sealed else "not sealed"
-        failed = f", {found.failed} failed" if found.failed else ""
-        out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
-        for problem in found.problems:
-            out.print(f"damaged: {problem}", highlight=False, markup=False, soft_wrap=True)
-    if not found.ok:
-        raise typer.Exit(DAMAGED)
-
-
-@run_app.command("seal")
-def seal_run(run: Annotated[str, typer.Argument(help="Run folder or URL.")]) -> None:
-    """Build the columns that make probing fast; `extract` does it by itself at the end."""
-    from probe_kit.extract import seal
-
-    out.print("sealed" if seal(run) else "nothing to do")
-
-
-def export(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    style: Annotated[str, typer.Option("--format", help="h5, safetensors or parquet.")],
-    out_file: Annotated[
-        Path | None, typer.Option("--out", help="File to write; default <run>.<format> beside the run.")
-    ] = None,
-    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
-) -> None:
-    """Write a run as one ordinary file, with its sha256 beside it."""
-    from probe_kit.extract import export_run
-    from probe_kit.extract.store.location import locate
-
-    location = locate(run)
-    target = out_file or location.beside(f"{location.name}.{style}")
-    with err.status("exporting"):
-        out.print(str(export_run(location, style, target, partial)), highlight=False, soft_wrap=True)

@@ -3,32 +3,37 @@
 Reads runs and probe results; needs no simulator and no model.
 """
 
-from probe_kit.retention.differences import Difference
-from probe_kit.retention.displays import (
-    FinalPositionsDisplay,
-    IterationMapDisplay,
-    KnowledgeActionDisplay,
-    LayerCurveDisplay,
-    ModelDepthDisplay,
-    PairedLayoutsDisplay,
-    RetentionTableDisplay,
-    RoleCurvesDisplay,
-    SideTableDisplay,
-    SuccessTableDisplay,
-    layer_curve,
-)
-from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
-from probe_kit.retention.rows import RetentionRow
-from probe_kit.retention.success import (
-    PairedItems,
-    Regime,
-    SuccessRate,
-    chance_margin,
-    normalised_score,
-    sensitivity,
-    success_rate,
-)
-from probe_kit.retention.table import RetentionTable, retention
+from typing import TYPE_CHECKING
+
+from probe_kit.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.retention.differences import Difference
+    from probe_kit.retention.displays import (
+        FinalPositionsDisplay,
+        IterationMapDisplay,
+        KnowledgeActionDisplay,
+        LayerCurveDisplay,
+        ModelDepthDisplay,
+        PairedLayoutsDisplay,
+        RetentionTableDisplay,
+        RoleCurvesDisplay,
+        SideTableDisplay,
+        SuccessTableDisplay,
+        layer_curve,
+    )
+    from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
+    from probe_kit.retention.rows import RetentionRow
+    from probe_kit.retention.success import (
+        PairedItems,
+        Regime,
+        SuccessRate,
+        chance_margin,
+        normalised_score,
+        sensitivity,
+        success_rate,
+    )
+    from probe_kit.retention.table import RetentionTable, retention
 
 __all__ = [
     "Difference",
@@ -58,3 +63,36 @@ __all__ = [
     "sensitivity",
     "success_rate",
 ]
+
+# `probe-kit --help` must load neither pandas nor matplotlib.
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Difference": "differences",
+        "FinalPositionsDisplay": "displays",
+        "IterationMapDisplay": "displays",
+        "KnowledgeActionDisplay": "displays",
+        "LayerCurveDisplay": "displays",
+        "ModelDepthDisplay": "displays",
+        "PairedItems": "success",
+        "PairedLayoutsDisplay": "displays",
+        "Peak": "measure",
+        "Regime": "success",
+        "Retention": "measure",
+        "RetentionRow": "rows",
+        "RetentionTable": "table",
+        "RetentionTableDisplay": "displays",
+        "RoleCurvesDisplay": "displays",
+        "SideTableDisplay": "displays",
+        "SuccessRate": "success",
+        "SuccessTableDisplay": "displays",
+        "best_site": "measure",
+        "chance_margin": "success",
+        "layer_curve": "displays",
+        "measure_retention": "measure",
+        "normalised_score": "success",
+        "retention": "table",
+        "sensitivity": "success",
+        "success_rate": "success",
+    },
+)

@@ -3,16 +3,21 @@
 Needs a run (anything that is a `RunReader`), no simulator and no model.
 """
 
-from probe_kit.train.array_run import ArrayRun
-from probe_kit.train.baselines import BASELINES, Baseline
-from probe_kit.train.controls import BaselineScore, Controls, TwinScore
-from probe_kit.train.curve import Curve
-from probe_kit.train.directions import Direction
-from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, ProbeSettings
-from probe_kit.train.store import load_results, save_results
-from probe_kit.train.sweep import Progress, train_probes
-from probe_kit.train.targets import TARGETS, Target
+from typing import TYPE_CHECKING
+
+from probe_kit.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.train.array_run import ArrayRun
+    from probe_kit.train.baselines import BASELINES, Baseline
+    from probe_kit.train.controls import BaselineScore, Controls, TwinScore
+    from probe_kit.train.curve import Curve
+    from probe_kit.train.directions import Direction
+    from probe_kit.train.reader import RunReader
+    from probe_kit.train.results import ProbeResults, ProbeSettings
+    from probe_kit.train.store import load_results, save_results
+    from probe_kit.train.sweep import Progress, train_probes
+    from probe_kit.train.targets import TARGETS, Target
 
 __all__ = [
     "BASELINES",
@@ -33,3 +38,27 @@ __all__ = [
     "save_results",
     "train_probes",
 ]
+
+# `probe-kit --help` must load neither pandas nor matplotlib.
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "ArrayRun": "array_run",
+        "BASELINES": "baselines",
+        "Baseline": "baselines",
+        "BaselineScore": "controls",
+        "Controls": "controls",
+        "Curve": "curve",
+        "Direction": "directions",
+        "ProbeResults": "results",
+        "ProbeSettings": "results",
+        "Progress": "sweep",
+        "RunReader": "reader",
+        "TARGETS": "targets",
+        "Target": "targets",
+        "TwinScore": "controls",
+        "load_results": "store",
+        "save_results": "store",
+        "train_probes": "sweep",
+    },
+)

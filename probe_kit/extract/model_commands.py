@@ -1,0 +1,58 @@
+"""`probe-kit models`: what `probe-kit extract --model` takes."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from probe_kit.console import out, print_json
+
+
+def models(
+    name: Annotated[str | None, typer.Argument(help="Show one model only.")] = None,
+    run: Annotated[str | None, typer.Option(help="Show the certificate of this run instead.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """List the models that can be run: checkpoints, streams, what this machine lacks for them."""
+    if run is not None:
+        from probe_kit.extract import open_run
+
+        print_json(open_run(run, allow_partial=True).certificate)
+        return
+    rows = _model_rows(name)
+    if as_json:
+        print_json(rows)
+        return
+    for row in rows:
+        out.print(f"[bold]{row['model']}[/]  {escape(row['description'])}", highlight=False)
+        for key in ("checkpoint", "streams", "embodiment", "ready", "notes"):
+            if row[key]:
+                out.print(f"  [dim]{key:10}[/] {escape(row[key])}", highlight=False, soft_wrap=True)
+
+
+def _model_rows(name: str | None) -> list[dict[str, str]]:
+    from probe_kit.extract.play.controllers import SCRIPTED
+    from probe_kit.hooks.registry import families, find_family
+
+    chosen = list(families().values())
+    if name is not None:
+        chosen = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
+    rows = [
+        {
+            "model": family.name,
+            "description": family.description,
+            "checkpoint": family.default_checkpoint or "embedded",
+            "streams": family.streams,
+            "embodiment": family.embodiment,
+            "ready": f"needs {family.missing()}" if family.missing() else "yes",
+            "notes": family.notes,
+        }
+        for family in chosen
+    ]
+    scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
+    rows += [
+        {"model": model, "description": text, **scripted}
+        for model, text in SCRIPTED.items()
+        if name in (None, model)
+    ]
+    return rows

@@ -1,0 +1,61 @@
+"""`probe-kit run` and `probe-kit export`: look after runs."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from probe_kit.console import err, out, print_json
+
+app = typer.Typer(help="Look after runs.", no_args_is_help=True)
+DAMAGED = 1
+
+
+@app.command("verify")
+def verify(
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Read every byte, not only sizes.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Compare a run with what its commits promise; exit 1 if anything is missing or changed."""
+    from probe_kit.extract import verify_run
+
+    found = verify_run(run, deep)
+    if as_json:
+        print_json({**asdict(found), "ok": found.ok})
+    else:
+        checked = "every byte" if deep else "sizes"
+        sealed = "sealed" if found.sealed else "not sealed"
+        failed = f", {found.failed} failed" if found.failed else ""
+        out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
+        for problem in found.problems:
+            out.print(f"damaged: {problem}", highlight=False, markup=False, soft_wrap=True)
+    if not found.ok:
+        raise typer.Exit(DAMAGED)
+
+
+@app.command("seal")
+def seal_run(run: Annotated[str, typer.Argument(help="Run folder or URL.")]) -> None:
+    """Build the columns that make probing fast; `extract` does it by itself at the end."""
+    from probe_kit.extract import seal
+
+    out.print("sealed" if seal(run) else "nothing to do")
+
+
+def export(
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    style: Annotated[str, typer.Option("--format", help="h5, safetensors or parquet.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", help="File to write; default <run>.<format> beside the run.")
+    ] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
+) -> None:
+    """Write a run as one ordinary file, with its sha256 beside it."""
+    from probe_kit.extract import export_run
+    from probe_kit.extract.store.location import locate
+
+    location = locate(run)
+    target = out_file or location.beside(f"{location.name}.{style}")
+    with err.status("exporting"):
+        out.print(str(export_run(location, style, target, partial)), highlight=False, soft_wrap=True)

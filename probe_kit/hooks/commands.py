@@ -1,0 +1,47 @@
+"""`probe-kit verify`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+from rich.markup import escape
+
+from probe_kit.console import out, print_json
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.verify import Verification
+
+
+def verify(
+    family: Annotated[str, typer.Argument(help="A family of `probe-kit models`.")],
+    folder: Annotated[Path | None, typer.Argument(help="Golden reference: checkpoint/ and reference.npz.")] = None,
+    keys: Annotated[Path | None, typer.Option(help="Recorded key list of the full-size model.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Compare an adapter with outputs recorded from the model's original implementation.
+
+    Exit code 1 if anything is over its tolerance. What the adapter cannot produce is listed, never passed.
+    """
+    from probe_kit.hooks.verify import verify_keys, verify_reference
+
+    if (folder is None) == (keys is None):
+        raise UsageError("give either a golden reference folder or --keys FILE")
+    verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))
+    if as_json:
+        print_json(verification.to_json())
+    else:
+        _print_verification(verification)
+    raise typer.Exit(0 if verification.passed else 1)
+
+
+def _print_verification(verification: "Verification") -> None:
+    from rich.table import Table
+
+    colours = {"ok": "green", "over": "red", "not compared": "yellow"}
+    table = Table("output", "max abs error", "tolerance", "", "note", title=f"{verification.family}")
+    for c in verification.comparisons:
+        error = "-" if c.error is None else f"{c.error:.2e}"
+        status = f"[{colours[c.status]}]{c.status}[/]"
+        table.add_row(c.output, error, f"{c.tolerance:.0e}", status, escape(c.note))
+    out.print(table)

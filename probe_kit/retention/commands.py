@@ -1,0 +1,113 @@
+"""`probe-kit retention`."""
+
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from probe_kit.console import err, out, split
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    from probe_kit.extract import Run
+    from probe_kit.retention import RetentionTable
+    from probe_kit.retention.measure import Iterations
+
+
+def retention(
+    runs: Annotated[list[str] | None, typer.Argument(help="One or more run folders or URLs.")] = None,
+    group: Annotated[
+        list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
+    ] = None,
+    style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
+    views: Annotated[str | None, typer.Option(help="Comma-separated; default all probed ones.")] = None,
+    iterations: Annotated[
+        str, typer.Option(help="Expert iterations or action tokens that count: all, last or a number.")
+    ] = "all",
+    epsilons: Annotated[
+        str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
+    ] = None,
+    html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
+) -> None:
+    """Print success rates and how much of the backbone's signal reaches the action expert."""
+    from probe_kit.env.outcome import SENSITIVITY_RADII
+    from probe_kit.extract import open_run
+    from probe_kit.retention import retention as make_table
+
+    if style not in _FORMATS:
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
+    if bool(runs) == bool(group):
+        raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
+    grouped = _groups(group) if group else {"": tuple(runs or ())}
+    _refuse_doubles([path for paths in grouped.values() for path in paths])
+    radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
+    opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
+    table = make_table(
+        opened if group else opened[""], split(views), iterations=_iterations(iterations), epsilons=radii
+    )
+    if style == "table":
+        out.print(table.to_rich())
+    else:
+        typer.echo(getattr(table, f"to_{style}")())
+    listed = [run for of_group in opened.values() for run in of_group]
+    if figures is not None:
+        _save_figures(listed, table, figures)
+    if html is not None:
+        from probe_kit.retention.report import write_report
+
+        with err.status("drawing the report"):
+            written = write_report(listed, html, table)
+        err.print(f"report: {written}", highlight=False, soft_wrap=True)
+
+
+def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
+    groups = {}
+    for text in texts:
+        name, separator, paths = text.partition("=")
+        if not (separator and name and split(paths)):
+            raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
+        if name in groups:
+            raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
+        groups[name] = split(paths) or ()
+    return groups
+
+
+def _refuse_doubles(paths: list[str]) -> None:
+    """A run that counts twice makes every interval too narrow."""
+    seen: set[str] = set()
+    for path in paths:
+        place = path.rstrip("/") if "://" in path else str(Path(path).resolve())
+        if place in seen:
+            raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
+        seen.add(place)
+
+
+def _radius(text: str) -> float:
+    try:
+        radius = float(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a number of metres") from None
+    if not 0 < radius < inf:
+        raise UsageError(f"a zone radius is {text} m; expected a positive number")
+    return radius
+
+
+def _iterations(text: str) -> "Iterations":
+    if text.isdigit():
+        return int(text)
+    if text not in ("all", "last"):
+        raise UsageError(f"iterations {text!r}; expected all, last or a number")
+    return cast("Iterations", text)
+
+
+_FORMATS = ("table", "json", "csv", "markdown", "latex")
+
+
+def _save_figures(runs: "list[Run]", table: "RetentionTable", folder: Path) -> None:
+    from probe_kit.retention.displays import gallery, save_figures
+
+    for path in save_figures(gallery(runs, table), folder):
+        err.print(f"figure: {path}", highlight=False, soft_wrap=True)
