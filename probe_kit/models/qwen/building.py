@@ -1,0 +1,42 @@
+"""Building networks that hold one of transformers' Qwen vision-language models."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def build_empty(make: Callable[[], Network], dtype: torch.dtype, device: str = "meta") -> Network:
+    """What `make` makes, in eval mode, with parameters of `dtype`.
+
+    device: `meta` for parameters that have names and shapes but no memory, to be filled with
+    `load_weights(…, assign=True)`; `cpu` for weights nobody should use yet. The rotary frequencies, which no
+    checkpoint holds, are then to be computed with `fill_rotary`.
+    """
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device(device):
+            network = make()
+    finally:
+        torch.set_default_dtype(before)
+    for name, parameter in network.named_parameters():
+        if name.endswith("bias") and not parameter.is_meta:
+            nn.init.zeros_(parameter)  # torch would draw them from the global generator
+    return network.eval()
+
+
+def fill_rotary(vlm: Any) -> None:
+    """Compute the rotary frequencies of a `Qwen…VLForConditionalGeneration` on the CPU, in float32.
+
+    They are buffers that no checkpoint holds, so a network built on the meta device has none; and they are float32
+    whatever the weights are. Tied output weights are tied again.
+    """
+    language, visual = vlm.model.language_model, vlm.model.visual
+    language.rotary_emb = type(language.rotary_emb)(config=vlm.config.text_config)
+    vision = vlm.config.vision_config
+    visual.rotary_pos_emb = type(visual.rotary_pos_emb)(vision.hidden_size // vision.num_heads // 2)
+    vlm.tie_weights()

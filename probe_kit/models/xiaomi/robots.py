@@ -1,0 +1,125 @@
+"""The robots a checkpoint knows: the statistics of their actions, and how each sees its scene and itself."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.identity import sha256_json
+
+DEFAULT_ROBOT = "bridge_delta"
+STATISTICS_FILE = "preprocessor_config.json"
+_UNUSED = 1e-5
+"""A number that varies less than this is none the robot has."""
+# A hand that points down, as turns of the base frame's axes.
+_POINTING_DOWN = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+
+
+@dataclass(frozen=True)
+class ActionUnits:
+    """Per step of a chunk and number of an action its mean and deviation, (A, D) float64 each, of one robot."""
+
+    robot: str
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    @property
+    def used(self) -> NDArray[np.float32]:
+        """(A, D) 1 where the robot has the number, 0 where it only fills up."""
+        return (self.deviation > _UNUSED).astype(np.float32)
+
+    @property
+    def sha256(self) -> str:
+        """Of the numbers."""
+        return sha256_json([self.mean.tolist(), self.deviation.tolist()])
+
+    def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(…, A, D) normalised actions in the robot's units."""
+        return np.asarray(actions * self.deviation + self.mean, np.float64)
+
+
+def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
+    """Statistics of one robot from `preprocessor_config.json`; without a name, of bridge_delta or the only one.
+
+    robot: a name of the file, or the beginning of just one. numbers: per action, as config.json has it.
+    Raises CheckpointError where there are none or they do not fit, UsageError for an unknown robot.
+    """
+    file = folder / STATISTICS_FILE
+    known: Mapping[str, Any] = (json.loads(file.read_text()) if file.is_file() else {}).get("action_config") or {}
+    if not known:
+        raise CheckpointError(
+            f"{file} has no action_config: the actions have no physical unit and no length. "
+            "Take the file that the checkpoint was released with"
+        )
+    name = _choose(robot, known)
+    mean, deviation = (np.asarray(known[name].get(part, []), np.float64) for part in ("mean", "std"))
+    mean, deviation = (part[0] if part.ndim == 3 and len(part) == 1 else part for part in (mean, deviation))
+    if mean.ndim != 2 or mean.shape != deviation.shape or mean.shape[1] != numbers:
+        raise CheckpointError(
+            f"{file}: {name} has mean {mean.shape} and std {deviation.shape}; expected (steps, {numbers}) each"
+        )
+    if not np.isfinite([mean, deviation]).all():
+        raise CheckpointError(f"{file}: the statistics of {name} are not finite")
+    return ActionUnits(name, mean, deviation)
+
+
+def _choose(robot: str | None, known: Mapping[str, Any]) -> str:
+    if robot in known:
+        return str(robot)
+    wanted = robot or (DEFAULT_ROBOT if DEFAULT_ROBOT in known or len(known) > 1 else next(iter(known)))
+    fitting = [name for name in known if name.startswith(wanted)]
+    if len(fitting) != 1:
+        raise UsageError(f"no robot {wanted!r} in this checkpoint; choose --robot among {', '.join(sorted(known))}")
+    return fitting[0]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """How a robot's scene is shown and its state written.
+
+    heading: what its camera is called in the prompt. width, height: of its picture, in pixels.
+    state: from the observation's eight numbers to its own.
+    """
+
+    name: str
+    heading: str
+    width: int
+    height: int
+    state: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+
+def _bridge_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Position, roll-pitch-yaw against a hand that points down, 0, openness: the observation's own layout."""
+    return np.asarray(state, np.float32)
+
+
+def _fractal_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Position, orientation of the hand as a quaternion x y z w, closedness."""
+    turned = Rotation.from_euler("xyz", state[3:6]) * _POINTING_DOWN
+    return np.concatenate([state[:3], turned.as_quat(), 1 - state[7:8]]).astype(np.float32)
+
+
+_ROBOTS = (
+    Robot("bridge", "Base View", 256, 256, _bridge_state),
+    Robot("fractal", "Ego View", 320, 256, _fractal_state),
+)
+
+
+def robot_of(name: str) -> Robot:
+    """What is known of the robot whose statistics are called `name`, such as bridge_delta.
+
+    Raises UsageError for robots with other cameras and other states than Act2Answer's arm can have.
+    """
+    for robot in _ROBOTS:
+        if name.startswith(robot.name):
+            return robot
+    raise UsageError(
+        f"robot {name!r} sees through other cameras and has another state than Act2Answer's arm; "
+        f"choose a robot of {' or '.join(robot.name for robot in _ROBOTS)}"
+    )
