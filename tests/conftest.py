@@ -58,6 +58,16 @@ def golden_magma() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_xiaomi() -> Path:
+    return _golden("xiaomi_r0")
+
+
+@pytest.fixture(scope="session")
+def golden_internvla() -> Path:
+    return _golden("internvla_m1")
+
+
+@pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
     from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 

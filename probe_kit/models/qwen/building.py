@@ -1,15 +1,15 @@
 """Building networks that hold one of transformers' Qwen vision-language models."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import nn
 
-Network = TypeVar("Network", bound=nn.Module)
 
-
-def build_empty(make: Callable[[], Network], dtype: torch.dtype, device: str = "meta") -> Network:
+def build_empty[Network: nn.Module](
+    make: Callable[[], Network], dtype: torch.dtype, device: str = "meta"
+) -> Network:
     """What `make` makes, in eval mode, with parameters of `dtype`.
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with

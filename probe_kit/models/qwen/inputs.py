@@ -15,9 +15,9 @@ from torch import Tensor
 class QwenInputs:
     """A batch of prompts with their pictures.
 
-    ids: (B, P) int64. mask: (B, P) int64, 0 at padding. pixel_values: (N, channels x time x patch x patch) float32.
-    grid: (I, 3) int64, per picture its patches over time, height and width. image_token: the id that stands for
-    a picture's tokens.
+    ids: (B, P) int64. mask: (B, P) int64, 0 at padding. pixel_values: (N, channels x time x patch x patch)
+    float32. grid: (I, 3) int64, per picture its patches over time, height and width.
+    image_token: the id that stands for a picture's tokens.
     """
 
     ids: Tensor

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil, smart_resize
+from transformers.models.qwen2_vl.image_processing_qwen2_vl import Qwen2VLImageProcessor
 
 from probe_kit.errors import CheckpointError, ObservationError
 
@@ -25,14 +25,19 @@ class QwenPictures:
 
     settings: the part of the checkpoint's file that transformers' Qwen image processor reads, with the smallest
     and the largest number of pixels as `size`. patch, merge: pixels per patch side, patches per token side.
+    fast: which of the two processors the model's authors ran: the one on torchvision, or the one on PIL and numpy.
+    They differ in a picture's last bits, and by a few grey levels where they resize.
     """
 
     settings: dict[str, Any]
     patch: int
     merge: int
+    fast: bool = False
 
     @classmethod
-    def from_folder(cls, folder: Path, patch: int, temporal: int, merge: int) -> "QwenPictures":
+    def from_folder(
+        cls, folder: Path, patch: int, temporal: int, merge: int, fast: bool = False
+    ) -> "QwenPictures":
         """Read `preprocessor_config.json`.
 
         patch, temporal, merge: what the network was built with. Raises CheckpointError if the file is missing,
@@ -54,7 +59,7 @@ class QwenPictures:
                 f"config.json expects {(patch, temporal, merge)}"
             )
         kept = {name: values[name] for name in (*_NEEDED, *_OPTIONAL) if name in values}
-        return cls({**kept, "size": _size(values, file)}, patch, merge)
+        return cls({**kept, "size": _size(values, file)}, patch, merge, fast)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of patches of a picture of that size."""
@@ -72,10 +77,9 @@ class QwenPictures:
         for picture in pictures:
             if max(picture.shape[:2]) > _LONGEST_RATIO * min(picture.shape[:2]):
                 raise ObservationError(f"the picture is {picture.shape}: too long for this model's patches")
-        # The class without torchvision: it does the arithmetic of the processor the models were trained with.
-        processor = Qwen2VLImageProcessorPil(**self.settings)
-        made = processor(images=pictures, input_data_format="channels_last", return_tensors="np")
-        return torch.from_numpy(made["pixel_values"].astype(np.float32)), torch.from_numpy(made["image_grid_thw"])
+        kind: Any = Qwen2VLImageProcessor if self.fast else Qwen2VLImageProcessorPil
+        made = kind(**self.settings)(images=pictures, input_data_format="channels_last", return_tensors="pt")
+        return made["pixel_values"].float(), made["image_grid_thw"]
 
 
 def merged_tokens(grid: tuple[int, int], merge: int) -> int:

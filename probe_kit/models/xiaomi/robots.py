@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.identity import sha256_json
@@ -75,7 +75,9 @@ def _choose(robot: str | None, known: Mapping[str, Any]) -> str:
     wanted = robot or (DEFAULT_ROBOT if DEFAULT_ROBOT in known or len(known) > 1 else next(iter(known)))
     fitting = [name for name in known if name.startswith(wanted)]
     if len(fitting) != 1:
-        raise UsageError(f"no robot {wanted!r} in this checkpoint; choose --robot among {', '.join(sorted(known))}")
+        raise UsageError(
+            f"no robot {wanted!r} in this checkpoint; choose --robot among {', '.join(sorted(known))}"
+        )
     return fitting[0]
 
 
@@ -102,7 +104,7 @@ def _bridge_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
 def _fractal_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
     """Position, orientation of the hand as a quaternion x y z w, closedness."""
     turned = Rotation.from_euler("xyz", state[3:6]) * _POINTING_DOWN
-    return np.concatenate([state[:3], turned.as_quat(), 1 - state[7:8]]).astype(np.float32)
+    return np.asarray(np.concatenate([state[:3], turned.as_quat(), 1 - state[7:8]]), np.float32)
 
 
 _ROBOTS = (

@@ -57,7 +57,8 @@ class TimeEmbedder(nn.Module):
         angles = moments[:, None].float() * frequencies
         sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
         # The released model rounds the sinusoid to the precision of its weights.
-        return cast(Tensor, self.mlp(sinusoid.to(self.mlp[0].weight.dtype)))
+        precision = next(self.mlp.parameters()).dtype
+        return cast(Tensor, self.mlp(sinusoid.to(precision)))
 
 
 class Attention(nn.Module):

@@ -1,0 +1,153 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.qwen import QwenInputs, pack_inputs
+from probe_kit.models.xiaomi import XiaomiConfig, XiaomiNetwork, build_xiaomi, full_size_xiaomi
+from tests.qwen_checkpoints import ID
+from tests.xiaomi_checkpoints import NUMBERS, config_values
+
+STEPS, ACTIONS = 3, 4
+
+
+@pytest.fixture(scope="module")
+def network() -> XiaomiNetwork:
+    built = build_xiaomi(XiaomiConfig.from_json(config_values()), torch.float32, device="cpu")
+    initialise(built, seed=1)
+    return built
+
+
+def inputs(lengths: tuple[int, ...] = (9, 6)) -> QwenInputs:
+    """Prompts of some text, one picture of two by two tokens, and more text."""
+    rng = torch.Generator().manual_seed(0)
+    picture = [ID["<|vision_start|>"], *[ID["<|image_pad|>"]] * 4, ID["<|vision_end|>"]]
+    words = [
+        [torch.randint(0, 250, (count,), generator=rng).tolist() for count in (2, length)] for length in lengths
+    ]
+    rows = [[*before, *picture, *behind] for before, behind in words]
+    pixels = torch.randn(16 * len(rows), 3 * 2 * 16 * 16, generator=rng)
+    return pack_inputs(
+        rows, pixels, torch.tensor([[1, 4, 4]] * len(rows)), ID["<|image_pad|>"], ID["<|endoftext|>"]
+    )
+
+
+def scene(batch: int = 2) -> tuple[Tensor, Tensor, Tensor]:
+    """State, which numbers are used, noise."""
+    rng = torch.Generator().manual_seed(1)
+    used = torch.zeros(batch, ACTIONS, NUMBERS)
+    used[..., :7] = 1
+    state = torch.randn(batch, 1, NUMBERS, generator=rng)
+    return state, used, torch.randn(batch, ACTIONS, NUMBERS, generator=rng)
+
+
+@torch.inference_mode()
+def test_a_batch_with_padding_equals_its_rows_one_by_one(network: XiaomiNetwork) -> None:
+    state, used, noise = scene()
+    together = network(inputs(), state, used, noise, STEPS)
+    both = inputs()
+    for row in range(2):
+        length = int(both.mask[row].sum())
+        alone = QwenInputs(
+            both.ids[row : row + 1, :length],
+            both.mask[row : row + 1, :length],
+            both.pixel_values[16 * row : 16 * row + 16],
+            both.grid[row : row + 1],
+            both.image_token,
+        )
+        one = slice(row, row + 1)
+        torch.testing.assert_close(
+            network(alone, state[one], used[one], noise[one], STEPS)[0], together[row], rtol=0, atol=1e-5
+        )
+
+
+@torch.inference_mode()
+def test_euler_steps_go_from_noise_at_nought_and_nothing_is_kept_between_calls(network: XiaomiNetwork) -> None:
+    state, used, noise = scene()
+    prompt = network.read(inputs())
+    path = noise
+    for moment in (0.0, 0.5):
+        path = path + network.velocity(prompt, state, path * used, torch.full((2,), moment)) / 2
+    network(inputs((20, 3)), state, used, noise, 1)
+    torch.testing.assert_close(network(inputs(), state, used, noise, 2), path, rtol=0, atol=1e-6)
+    assert network.vlm.model.rope_deltas is None
+
+
+@torch.inference_mode()
+def test_unused_numbers_are_not_read_but_are_put_out(network: XiaomiNetwork) -> None:
+    state, used, noise = scene()
+    other = noise.clone()
+    other[..., 7:] += 1
+    plain, changed = (network(inputs(), state, used, start, STEPS) for start in (noise, other))
+    torch.testing.assert_close(plain[..., :7], changed[..., :7], rtol=0, atol=1e-6)
+    torch.testing.assert_close(plain[..., 7:] + 1, changed[..., 7:], rtol=0, atol=1e-5)
+
+
+@torch.inference_mode()
+def test_an_action_sees_the_ones_before_it_and_no_later_one(network: XiaomiNetwork) -> None:
+    state, used, noise = scene()
+    prompt, moment = network.read(inputs()), torch.zeros(2)
+    plain = network.velocity(prompt, state, noise * used, moment)
+    changed = noise.clone()
+    changed[:, 2] += 1
+    other = network.velocity(prompt, state, changed * used, moment)
+    assert torch.equal(plain[:, :2], other[:, :2])
+    assert (plain[:, 3] - other[:, 3]).abs().max() > 1e-3
+
+
+@torch.inference_mode()
+def test_only_the_last_layers_of_the_prompt_are_read(network: XiaomiNetwork) -> None:
+    assert len(network.read(inputs()).caches) == 2
+    layers = network.vlm.model.language_model.layers
+    seen = network.read(inputs()).caches
+    assert len(layers) == 4
+    for kept, number in zip(seen, (2, 3), strict=True):
+        whole = network.vlm.model(**inputs().keywords(network.vlm.model), use_cache=True).past_key_values
+        assert torch.equal(kept[0], whole.layers[number].keys)
+
+
+def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
+    built = build_xiaomi(XiaomiConfig.from_json(config_values()), torch.bfloat16)
+    assert all(parameter.is_meta and parameter.dtype == torch.bfloat16 for parameter in built.parameters())
+    assert all(buffer.dtype == torch.float32 and not buffer.is_meta for buffer in built.buffers())
+    assert len(list(built.buffers())) == 3
+    assert torch.get_default_dtype() == torch.float32
+
+
+@torch.inference_mode()
+def test_bfloat16_runs_and_stays_near(network: XiaomiNetwork) -> None:
+    rounded = build_xiaomi(XiaomiConfig.from_json(config_values()), torch.bfloat16)
+    state = {name: tensor.to(torch.bfloat16) for name, tensor in network.state_dict().items()}
+    rounded.load_state_dict(state, assign=True)
+    exact, near = (net(inputs(), *scene(), STEPS) for net in (network, rounded))
+    assert near.dtype == torch.float32
+    assert 0 < (exact - near).abs().max() < 0.5
+
+
+def test_the_full_size_has_the_released_number_of_parameters() -> None:
+    assert sum(parameter.numel() for parameter in full_size_xiaomi().parameters()) == 4_716_274_176
+
+
+@torch.inference_mode()
+def test_the_golden_actions_are_reproduced(golden_xiaomi: Path) -> None:
+    with np.load(golden_xiaomi / "reference.npz") as arrays:
+        recorded = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
+    config = XiaomiConfig.from_folder(golden_xiaomi / "checkpoint")
+    built = build_xiaomi(config, torch.float32)
+    built.load_state_dict(load_file(golden_xiaomi / "checkpoint" / "model.safetensors"), strict=False, assign=True)
+    built.vlm.tie_weights()
+    read = QwenInputs(
+        recorded["in_input_ids"],
+        recorded["in_attention_mask"],
+        recorded["in_pixel_values"],
+        recorded["in_image_grid_thw"],
+        config.vlm.image_token_id,
+    )
+    given = (recorded["in_state"], recorded["in_action_mask"], recorded["in_noise"])
+    actions = built(read, *given, len(recorded["denoise_times"]))
+    torch.testing.assert_close(actions, recorded["actions"], rtol=0, atol=1e-5)
+    assert torch.equal(read.positions(built.vlm.model), recorded["position_ids"])
