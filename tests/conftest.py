@@ -68,6 +68,11 @@ def golden_internvla() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_spatialvla() -> Path:
+    return _golden("spatialvla")
+
+
+@pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
     from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 

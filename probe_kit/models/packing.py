@@ -1,0 +1,30 @@
+"""Prompts of different lengths as one batch, for models that decode behind their last token."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Prompts as one batch: ids (B, T) int64 and mask (B, T) bool, False at padding.
+
+    Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
+    is in the batch. Positions count tokens only, so the network computes the same numbers as without padding.
+    """
+
+    ids: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[int]], padding: int) -> "Packed":
+        """Pack one prompt per row."""
+        longest = max(map(len, rows))
+        ids = torch.full((len(rows), longest), padding)
+        mask = torch.zeros((len(rows), longest), dtype=torch.bool)
+        for index, row in enumerate(rows):
+            ids[index, : len(row) - 1], ids[index, -1] = torch.tensor(row[:-1]), row[-1]
+            mask[index, : len(row) - 1], mask[index, -1] = True, True
+        return cls(ids, mask)

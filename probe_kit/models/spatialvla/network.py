@@ -1,0 +1,226 @@
+"""The network: SigLIP, 3-D positions from ZoeDepth, a projection, Gemma-2 over picture, text and actions.
+
+B batch, P patches, T prompt tokens with the picture's, D width of the language model, V its vocabulary.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, ZoeDepthForDepthEstimation
+
+from probe_kit.errors import UsageError, WeightsError
+from probe_kit.models.spatialvla.config import SpatialVLAConfig
+from probe_kit.models.spatialvla.depth import Depth, estimate_depth, fill_depth_buffers
+from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project
+
+EAGER = "eager"
+"""The only attention of transformers that keeps Gemma-2's soft cap of attention logits."""
+
+
+class Projector(nn.Module):
+    """Patch features to the language model's width."""
+
+    def __init__(self, vision_width: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(vision_width, width)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """(B, P, D) from (B, P, vision width)."""
+        projected: Tensor = self.linear(patches)
+        return projected
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the model makes of pictures, step by step; depth and what follows from it is None without depth.
+
+    tower: (B, P, vision width) SigLIP's normed patches. points: (B, P, 3R²) metres in the camera's frame.
+    place: (B, P, vision width) their embedding. features: (B, P, D) as the language model reads them.
+    """
+
+    tower: Tensor
+    depth: Depth | None
+    points: Tensor | None
+    place: Tensor | None
+    features: Tensor
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them."""
+
+    ids: Tensor
+    logits: Tensor
+
+
+class SpatialVLANetwork(nn.Module):
+    """A SpatialVLA under the parameter names of its released files."""
+
+    def __init__(self, config: SpatialVLAConfig) -> None:
+        super().__init__()
+        self.config = config
+        config.text._attn_implementation = EAGER
+        width = int(config.vision.hidden_size)
+        self.vision_tower: Any = SiglipVisionModel(config.vision)
+        self.multi_modal_projector = Projector(width, int(config.text.hidden_size))
+        self.language_model: Any = Gemma2ForCausalLM(config.text)
+        if config.depth is not None:
+            config.depth.backbone_config._attn_implementation = EAGER
+            self.vision_zoe_model: Any = ZoeDepthForDepthEstimation(config.depth)
+            self.position_embedding_3d = PositionEmbedding3D(3 * config.points**2, width, config.frequencies)
+        if config.own_action_embeddings:
+            self.spatial_embed_tokens = nn.Embedding(config.actions, int(config.text.hidden_size))
+
+    @torch.no_grad()
+    def embed_actions(self) -> None:
+        """Give the action ids their own embeddings; to be called once weights are loaded.
+
+        The released files hold them in a table of their own. Their rows in the language model's table are left
+        from before training, and its output layer has rows of its own.
+        """
+        if self.config.own_action_embeddings:
+            table = self.language_model.get_input_embeddings().weight
+            table[self.config.first_action :] = self.spatial_embed_tokens.weight
+
+    def look(self, pictures: Tensor, intrinsics: Tensor, vote: bool = False) -> Seen:
+        """What the model sees in (B, 3, S, S) float32 pictures in [0, 1].
+
+        intrinsics: (3, 3) or (B, 3, 3) of cameras that take pictures of side S. vote: see `estimate_depth`.
+        Pictures, depth and points are float32 whatever the weights are.
+        """
+        dtype = self.multi_modal_projector.linear.weight.dtype
+        tower: Tensor = self.vision_tower(((pictures - 0.5) / 0.5).to(dtype)).last_hidden_state
+        if self.config.depth is None:
+            return Seen(tower, None, None, None, self.multi_modal_projector(tower))
+        depth = estimate_depth(self.vision_zoe_model, pictures, vote)
+        patch = int(self.config.vision.patch_size)
+        points = back_project(depth.metres, intrinsics, patch, self.config.points)
+        place = self.position_embedding_3d(points)
+        return Seen(tower, depth, points, place, self.multi_modal_projector(tower + place))
+
+    def embed(self, ids: Tensor, features: Tensor | None = None) -> Tensor:
+        """(B, T, D) embeddings of ids (B, T), with `features` (B, P, D) at the picture's positions.
+
+        Gemma-2 multiplies its embeddings by √D inside the table; the original divides features by as much before
+        it multiplies them, so they stay as they are. Raises UsageError if the ids have room for another number of
+        patches.
+        """
+        embeddings: Tensor = self.language_model.get_input_embeddings()(ids)
+        if features is None:
+            return embeddings
+        places = ids == self.config.image_token
+        if places.sum(dim=1).tolist() != [features.shape[1]] * len(ids):
+            raise UsageError(
+                f"the prompts have {places.sum(dim=1).tolist()} places for a picture; expected {features.shape[1]}"
+            )
+        return embeddings.masked_scatter(places.unsqueeze(-1), features.to(embeddings.dtype))
+
+    def forward(self, embeddings: Tensor, mask: Tensor, past: DynamicCache | None = None, keep: int = 0) -> Any:
+        """transformers' output of one pass, with all hidden states if there is no `past`.
+
+        embeddings: (B, T, D) of what is new; mask: (B, past + T) bool, False at padding. Everything given sees
+        everything given and everything past, in both directions; padding is seen by nothing. keep: for how many of
+        the last positions logits are made, 0 for all. Raises UsageError for an attention without the soft cap.
+        """
+        if (used := self.language_model.config._attn_implementation) != EAGER:
+            raise UsageError(
+                f"the language model's attention is {used!r}, which drops the soft cap of Gemma-2's attention "
+                f"logits: activations would be others. Set it back to {EAGER!r}"
+            )
+        seen = _additive(mask, embeddings)
+        return self.language_model(
+            inputs_embeds=embeddings,
+            position_ids=_positions(mask)[:, -embeddings.shape[1] :],
+            attention_mask={"full_attention": seen, "sliding_attention": seen},
+            past_key_values=past,
+            use_cache=past is not None,
+            logits_to_keep=keep,
+            output_hidden_states=past is None,
+        )
+
+    def decode(
+        self,
+        ids: Tensor,
+        mask: Tensor,
+        features: Tensor,
+        steps: int,
+        slots: Sequence[range] | None = None,
+        fed: Tensor | None = None,
+    ) -> Decoded:
+        """Exactly `steps` greedy tokens behind the prompt, whatever they are.
+
+        ids, mask: (B, T), with a token, not padding, at the end of every row. slots: per step the only ids that
+        may be chosen. fed: (B, steps - 1) ids to feed back instead of those chosen. The language model is called
+        once with the prompt and `steps - 1` times with one token.
+        """
+        cache = DynamicCache(config=self.language_model.config)
+        embeddings = self.embed(ids, features)
+        chosen: list[Tensor] = []
+        logits: list[Tensor] = []
+        for step in range(steps):
+            logits.append(self(embeddings, mask, cache, keep=1).logits[:, -1])
+            chosen.append(_best(logits[-1], None if slots is None else slots[step]))
+            following = chosen[-1] if fed is None or step == steps - 1 else fed[:, step]
+            embeddings = self.embed(following[:, None])
+            mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
+        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1))
+
+
+def _best(logits: Tensor, allowed: range | None) -> Tensor:
+    """(B,) the id of the largest logit of (B, V), among `allowed` ones."""
+    if allowed is None:
+        return logits.argmax(dim=-1)
+    return logits[:, allowed.start : allowed.stop].argmax(dim=-1) + allowed.start
+
+
+def _positions(mask: Tensor) -> Tensor:
+    """(B, T) positions from 1 that count tokens, not padding."""
+    return mask.long().cumsum(dim=1).clamp(min=1)
+
+
+def _additive(mask: Tensor, embeddings: Tensor) -> Tensor | None:
+    """(B, 1, T, S) to be added to attention logits; None where nothing is hidden."""
+    if bool(mask.all()):
+        return None
+    hidden = torch.zeros(mask.shape, dtype=embeddings.dtype, device=mask.device)
+    hidden = hidden.masked_fill(~mask, torch.finfo(embeddings.dtype).min)
+    return hidden[:, None, None].expand(-1, -1, embeddings.shape[1], -1)
+
+
+def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str = "meta") -> SpatialVLANetwork:
+    """The network in eval mode.
+
+    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
+    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet. `embed_actions` comes after
+    the weights. Raises WeightsError if a part of transformers has a constant that would stay without memory.
+    """
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device(device):
+            network = SpatialVLANetwork(config)
+    finally:
+        torch.set_default_dtype(before)
+    _fill_buffers(network)
+    for name, parameter in network.named_parameters():
+        if name.endswith(".bias") and not parameter.is_meta:
+            nn.init.zeros_(parameter)  # torch would draw them from the global generator
+    return network.eval()
+
+
+def _fill_buffers(network: SpatialVLANetwork) -> None:
+    """Constants that no file holds; the rotary frequencies are float32 whatever the weights are."""
+    decoder, tower = network.language_model.model, network.vision_tower.vision_model.embeddings
+    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.config.text)
+    decoder.embed_tokens.embed_scale = torch.tensor(decoder.embed_tokens.scalar_embed_scale)
+    tower.position_ids = torch.arange(tower.num_positions)[None]
+    if network.config.depth is not None:
+        fill_depth_buffers(network.vision_zoe_model)
+    if empty := [name for name, buffer in network.named_buffers() if buffer.is_meta]:
+        raise WeightsError(
+            f"this version of transformers has constants unknown here: {', '.join(empty[:8])}. "
+            "Use one that probe_kit names in its dependencies"
+        )
