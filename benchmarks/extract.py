@@ -23,7 +23,7 @@ from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.play.rollout import Rollout
 from probe_kit.extract.play.staging import EpisodeBuffers
 from probe_kit.extract.store.layout import CODECS, StoredStream
-from probe_kit.extract.store.location import locate
+from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Observation
 from probe_kit.hooks.sites import Site
@@ -79,7 +79,7 @@ def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw
     writer = RunWriter(
         locate(path), plan, {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic"}
     )
-    wall, cpu = seconds(lambda: [writer.write(rollout) for rollout in rollouts])
+    wall, cpu = seconds(lambda: [writer.write(rollout.record) for rollout in rollouts])
     size = sum(p.stat().st_size for p in (path / "data.zarr/backbone/tokens").rglob("*") if p.is_file())
     run = open_run(path, allow_partial=True)
     read, _ = seconds(lambda: run.tokens(SITE))
@@ -93,7 +93,7 @@ def bench_columns(suite: Suite, folder: Path, episodes: int, width: int) -> None
     settings = {"captured_calls": 1, "tokens": "pooled", "codec": "zstd", "model": "synthetic"}
     writer = RunWriter(locate(folder / "columns"), plan, settings)
     for number in range(episodes):
-        writer.write(synthetic(plan, stream, number, False))
+        writer.write(synthetic(plan, stream, number, False).record)
     rows = open_run(folder / "columns", allow_partial=True).rows("backbone")
     values = np.stack([rows[position] for position in range(episodes)])
     print(f"\none column of {episodes} episodes, {values.nbytes / 1e6:.0f} MB in all\nstore            ms")

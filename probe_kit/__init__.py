@@ -11,8 +11,7 @@ Data flows one way: suite → env → hooks → extract → train → retention.
 from typing import TYPE_CHECKING
 
 from probe_kit.lazy import lazy_names
-
-__version__ = "0.1.0"
+from probe_kit.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from probe_kit.env import Act2AnswerEnv, SceneSpec

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from probe_kit.extract import Run
 from probe_kit.extract.store.layout import VIDEOS
-from probe_kit.organisms import TRAINED, Finding, Stage, compare, probed
+from probe_kit.organisms import TRAINED, Finding, NamedProgress, compare, probed
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
@@ -42,16 +42,16 @@ class Demo:
         return "\n".join(lines)
 
 
-def compare_organisms(folder: Path, stage: Stage) -> list[Finding]:
+def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
     """The demo's questions put to policies of which the truth is known; see `probe_kit.organisms`."""
     return compare(_questions(folder, stage), folder, PERMUTATIONS, stage)
 
 
-def _questions(folder: Path, stage: Stage) -> Suite:
+def _questions(folder: Path, stage: NamedProgress) -> Suite:
     return build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
 
 
-def run_demo(folder: Path, stage: Stage) -> Demo:
+def run_demo(folder: Path, stage: NamedProgress) -> Demo:
     """Suite, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
 
     stage: gives a progress callback (done, total, …) for a stage of this name.

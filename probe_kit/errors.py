@@ -147,7 +147,7 @@ class StageDiedError(ProbeKitError):
 
 
 class WorkerDiedError(ProbeKitError):
-    """A worker process ended before it could begin its first episode."""
+    """A worker process ended before its first episode, or while it probed."""
 
 
 class MissingExtraError(ProbeKitError):

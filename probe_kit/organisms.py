@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Verdict = Literal["used", "encoded, unused", "absent", "acted on, not found"]
-Stage = Callable[[str], Callable[..., None]]
+NamedProgress = Callable[[str], Callable[..., None]]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def verdict(row: RetentionRow) -> Verdict:
 
 
 def probed(
-    organism: Organism, suite: Suite, folder: Path, permutations: int, stage: Stage
+    organism: Organism, suite: Suite, folder: Path, permutations: int, stage: NamedProgress
 ) -> tuple[Run, ProbeResults]:
     """The organism's run on `suite`, in `folder`, and its probes; what is finished is reused.
 
@@ -95,7 +95,7 @@ def probed(
     return run, train_probes(run, permutations=permutations, progress=progress)
 
 
-def compare(suite: Suite, folder: Path, permutations: int, stage: Stage) -> list[Finding]:
+def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
     """Judge every organism on `suite`; arguments as of `probed`."""
     runs = [(organism, probed(organism, suite, folder, permutations, stage)[0]) for organism in ORGANISMS]
     return [

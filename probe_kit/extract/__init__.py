@@ -7,18 +7,19 @@ from probe_kit.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, extract_run, prepare
     from probe_kit.extract.settings import ExtractSettings
-    from probe_kit.extract.store.audit import Verification, verify_run
+    from probe_kit.extract.store.audit import Audit, verify_run
     from probe_kit.extract.store.export import export_run
-    from probe_kit.extract.store.location import Location, locate
+    from probe_kit.extract.store.locate import locate
+    from probe_kit.extract.store.location import Location
     from probe_kit.extract.store.run import Run, open_run
     from probe_kit.extract.store.sealing import seal
 
 __all__ = [
+    "Audit",
     "ExtractSettings",
     "Extraction",
     "Location",
     "Run",
-    "Verification",
     "export_run",
     "extract_run",
     "locate",
@@ -37,11 +38,11 @@ __getattr__ = lazy_names(
         "extract_run": "extraction",
         "prepare": "extraction",
         "Location": "store.location",
-        "locate": "store.location",
+        "locate": "store.locate",
         "Run": "store.run",
         "open_run": "store.run",
         "seal": "store.sealing",
-        "Verification": "store.audit",
+        "Audit": "store.audit",
         "verify_run": "store.audit",
     },
 )

@@ -119,7 +119,7 @@ def extract(
     """
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, prepare
-    from probe_kit.extract.store.location import locate
+    from probe_kit.extract.store.locate import locate
 
     options = {
         "unnorm_key": unnorm_key,

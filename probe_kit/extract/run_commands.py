@@ -53,7 +53,7 @@ def export(
 ) -> None:
     """Write a run as one ordinary file, with its sha256 beside it."""
     from probe_kit.extract import export_run
-    from probe_kit.extract.store.location import locate
+    from probe_kit.extract.store.locate import locate
 
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")

@@ -8,9 +8,9 @@ import numpy as np
 import PIL
 from PIL import features
 
-import probe_kit
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite, content_sha256, count_by_category, missing_categories
+from probe_kit.version import __version__
 
 
 def new_suite(
@@ -28,7 +28,7 @@ def new_suite(
         "name": name,
         "version": version,
         "schema_version": "1.0",
-        "tool": {"probe_kit": probe_kit.__version__},
+        "tool": {"probe_kit": __version__},
         "options": dict(options),
         "counts": count_by_category(items),
         "missing": missing_categories(items),

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.identity import sha256_json
 

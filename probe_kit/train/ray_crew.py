@@ -1,11 +1,12 @@
 """Probing on a Ray cluster."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any, Self
 
-from probe_kit.extras import require
+from probe_kit.cluster import ray_cluster
+from probe_kit.train.crew import Probed, Problems, probe_column
 from probe_kit.train.samples import Samples
-from probe_kit.train.workers import Probed, Problems, probe_column
 
 
 class RayCrew:
@@ -13,28 +14,24 @@ class RayCrew:
 
     address: of the cluster, whose nodes have probe_kit installed; `auto` for the one this process belongs to, or
     else a new one on this machine. size: columns at once, by default as many as the cluster has cores.
-    Raises MissingExtraError without Ray, and ConnectionError if nothing answers at the address.
+    Raises MissingExtraError without Ray, and UsageError if nothing answers at the address.
     """
 
     def __init__(self, problems: Problems, address: str, size: int | None = None) -> None:
-        self._ray = require("ray", "ray")
         self._problems, self._address = problems, address
         self._size = size
 
     def __enter__(self) -> Self:
-        ray = self._ray
-        self._started = not ray.is_initialized()
-        if self._started:
-            address = None if self._address == "auto" else self._address
-            ray.init(address=address, include_dashboard=False, log_to_driver=False)
-        self.size = self._size or max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._probe = ray.remote(num_cpus=1)(_probe_alone)
-        self._shared = ray.put(self._problems)  # once, not with every column
+        with ExitStack() as stack:
+            self._ray = ray = stack.enter_context(ray_cluster(self._address, log_to_driver=False))
+            self.size = self._size or max(1, int(ray.cluster_resources().get("CPU", 1)))
+            self._probe = ray.remote(num_cpus=1)(_probe_alone)
+            self._shared = ray.put(self._problems)  # once, not with every column
+            self._opened = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._started:
-            self._ray.shutdown()
+        self._opened.close()
 
     def submit(self, samples: Samples) -> Any:
         """A task that probes one column."""

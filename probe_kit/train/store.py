@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from probe_kit.errors import NoProbesError, UsageError
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve

@@ -9,6 +9,7 @@ from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
 from probe_kit.train.add_controls import add_baselines, add_twin
 from probe_kit.train.arrays import check_device
 from probe_kit.train.baselines import Baseline
+from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction
 from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
@@ -17,7 +18,7 @@ from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.store import Unfinished, is_stored, load_results, save_results
 from probe_kit.train.targets import Target
-from probe_kit.train.workers import CrewSettings, Key, Probed, probe_columns
+from probe_kit.train.workers import probe_columns
 
 Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""

@@ -15,12 +15,13 @@ import numpy as np
 from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
-from probe_kit.extract import commits, sealing, writer
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.play.rollout import Rollout
 from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.extract.store import commits, sealing, writer
 from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.suite import load_suite
 
 STREAMS = [
@@ -50,7 +51,7 @@ def extract(run: str, plan: Plan) -> None:
     writing = writer.RunWriter(locate(run), plan, SETTINGS)
     with writing.owned(), writing.location.in_words():
         for number in writing.remaining():
-            writing.write(rollout(plan, number))
+            writing.write(rollout(plan, number).record)
         sealing.seal(run)
 
 

@@ -14,7 +14,8 @@ from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatch
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal, verify_run
 from probe_kit.extract.extraction import SingleWriterWarning
 from probe_kit.extract.store.layout import COLUMNS
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes

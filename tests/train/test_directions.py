@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.extract.store.location import locate
+from probe_kit.extract.store.locate import locate
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, Direction, load_results, train_probes
 from probe_kit.train.directions import StoredDirections, save_directions

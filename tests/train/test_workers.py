@@ -8,11 +8,12 @@ import pytest
 
 from probe_kit.errors import MissingExtraError, TooFewGroupsError
 from probe_kit.hooks import Site
+from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import nested_folds
 from probe_kit.train.problem import CategoryProblem
 from probe_kit.train.samples import Samples
-from probe_kit.train.workers import CrewSettings, Key, Probed, probe_columns
+from probe_kit.train.workers import probe_columns
 
 ITEMS = np.repeat(np.arange(10), 2)
 LABELS = np.tile([True, False], 10)

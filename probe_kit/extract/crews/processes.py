@@ -1,37 +1,23 @@
-"""Ways of working: in this process, or in several. Only episode numbers and outcomes travel between processes."""
+"""Workers in processes of their own. Only episode numbers and outcomes travel between processes."""
 
 import os
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING
 
 from probe_kit.child import Child
 from probe_kit.errors import ProbeKitError, WorkerDiedError
-from probe_kit.extract.crews.scheduler import Event, Scheduler
-from probe_kit.extract.play.worker import Worker
+from probe_kit.extract.crews.loading import load_worker
+from probe_kit.extract.crews.scheduler import Scheduler
+from probe_kit.extract.play.events import Event
 from probe_kit.extract.settings import ExtractSettings
 
-if TYPE_CHECKING:
-    from probe_kit.extract.extraction import Extraction
-    from probe_kit.extract.store.writer import RunWriter
-
-Listener = Callable[[Event], None]
 MORE = "more"
 
 
-def run_here(extraction: "Extraction", writer: "RunWriter", scheduler: Scheduler, heard: Listener) -> None:
-    """Play every episode in this process, with the model that is loaded."""
-    assert extraction.controller is not None
-    episodes = len(writer.remaining())
-    with Worker(writer, extraction.settings, extraction.controller, episodes) as worker:
-        while not scheduler.finished:
-            for event in worker.run(lambda: scheduler.take(0)):
-                scheduler.hear(0, event)
-                heard(event)
-
-
-def run_in_processes(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
+def run_in_processes(
+    settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]
+) -> None:
     """Play the episodes in `settings.workers` processes; one that dies is replaced.
 
     Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
@@ -85,7 +71,7 @@ class _Hand:
         return self._child.close()
 
 
-def _hear(hand: _Hand, scheduler: Scheduler, heard: Listener) -> None:
+def _hear(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
     try:
         message = hand.connection.recv()
     except (EOFError, ConnectionResetError):
@@ -100,7 +86,7 @@ def _hear(hand: _Hand, scheduler: Scheduler, heard: Listener) -> None:
         heard(message)
 
 
-def _replace(hand: _Hand, scheduler: Scheduler, heard: Listener) -> None:
+def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
     code = hand.close()
     if not hand.began:
         raise WorkerDiedError(
@@ -123,25 +109,8 @@ def _environment(slot: int, settings: ExtractSettings) -> dict[str, str]:
     return environment
 
 
-def run_on_ray(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Listener) -> None:
-    """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
-
-    An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
-    Raises MissingExtraError without Ray, and what an actor raises.
-    """
-    from probe_kit.extract.crews.ray import RayCrew
-
-    with RayCrew(settings, run) as crew:
-        while not scheduler.finished:
-            crew.hand_out(scheduler)
-            for event in crew.collect(scheduler):
-                heard(event)
-
-
 def serve(connection: Connection) -> None:
     """A worker's side: load the model, then play what the driver hands out until it hangs up."""
-    from probe_kit.extract.extraction import load_worker
-
     settings, run = connection.recv()
 
     def ask() -> int | None:

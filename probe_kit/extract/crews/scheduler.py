@@ -2,29 +2,10 @@
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+
+from probe_kit.extract.play.events import Done, Event, Failed
 
 TRIES = 2
-
-
-@dataclass(frozen=True)
-class Done:
-    """Episode `number` is committed."""
-
-    number: int
-    outcome: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Failed:
-    """Episode `number` went wrong."""
-
-    number: int
-    reason: str
-
-
-Event = Done | Failed
 
 
 class Scheduler:

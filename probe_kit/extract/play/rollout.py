@@ -13,6 +13,7 @@ from probe_kit.extract.play.controllers import Controller, Turn
 from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Seen
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
 from probe_kit.extract.store.thumbnails import Ends
+from probe_kit.extract.store.writer import EpisodeRecord
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,13 @@ class Rollout:
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
     ends: Ends | None = None
+
+    @property
+    def record(self) -> EpisodeRecord:
+        """What of it the run stores."""
+        buffers = self.buffers
+        arrays: dict[str, dict[str, NDArray[Any]]] = {"pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}}
+        return EpisodeRecord(self.planned, self.outcome, arrays, buffers.roles)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.env import save_gif
-from probe_kit.extract.crews.scheduler import Done, Event, Failed
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.play.controllers import Controller
+from probe_kit.extract.play.events import Done, Event, Failed
 from probe_kit.extract.play.rollout import Failure, Play, Rollout
 from probe_kit.extract.play.stage import AskableStage, LocalStage
 from probe_kit.extract.play.stage_process import ProcessStage
@@ -103,7 +103,7 @@ class Worker:
                 self._writer.write_certificate({**self._controller.certificate(), **_versions()})
                 if rollout.ends:
                     write_thumbnail(self._writer.location, rollout.planned.index, rollout.ends)
-                self._writer.write(rollout)
+                self._writer.write(rollout.record)
                 if rollout.frames:
                     _save_film(self._writer.location, rollout)
         finally:

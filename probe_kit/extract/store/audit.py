@@ -19,13 +19,14 @@ from probe_kit.extract.store.commits import (
     wrong_size,
 )
 from probe_kit.extract.store.layout import COMMITS, DATA, PLAN_FILE, RUN_FILE
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.run import Run, read_card
 from probe_kit.identity import sha256_json
 
 
 @dataclass(frozen=True)
-class Verification:
+class Audit:
     """What was found.
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
@@ -46,7 +47,7 @@ class Verification:
         return not self.problems
 
 
-def verify_run(path: Path | str | Location, deep: bool = False) -> Verification:
+def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     """Compare a run with its commits: presence and sizes, and with `deep` the checksum of every object.
 
     Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
@@ -68,9 +69,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Verification:
     if deep and columns is not None and not problems:
         problems += _column_problems(Run(location))
     failed = len(read_failures(location))
-    return Verification(
-        str(location), len(commits), len(planned), failed, columns is not None, deep, tuple(problems)
-    )
+    return Audit(str(location), len(commits), len(planned), failed, columns is not None, deep, tuple(problems))
 
 
 def _settings_problems(card: Commit) -> Iterator[str]:

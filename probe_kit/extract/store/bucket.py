@@ -210,7 +210,7 @@ class Bucket(Location):
         yield
 
     @contextmanager
-    def turn(self) -> Iterator[None]:
+    def one_at_a_time(self) -> Iterator[None]:
         """Nobody waits: whoever is second writes the same bytes once more."""
         yield
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.layout import COLUMNS, StoredStream, open_array
+from probe_kit.extract.store.arrays import open_array
+from probe_kit.extract.store.layout import COLUMNS, StoredStream
 from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site
 

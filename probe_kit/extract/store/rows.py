@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.layout import decode_bfloat16
+from probe_kit.extract.store.arrays import decode_bfloat16
 
 Spans = Sequence[tuple[str, int, int]]
 PADDING = "padding"

@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe_kit.errors import RunDamagedError, RunIncompleteError, RunNotFoundError, UnknownSiteError
+from probe_kit.extract.store.arrays import open_array
 from probe_kit.extract.store.columns import Columns, find_columns
 from probe_kit.extract.store.commits import Commit, read_commits, read_failures, stamp_of
 from probe_kit.extract.store.layout import (
@@ -21,9 +22,9 @@ from probe_kit.extract.store.layout import (
     RUN_FILE,
     SCHEMA_VERSION,
     StoredStream,
-    open_array,
 )
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.hooks.sites import Site, Stream
 

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import zarr
 
-from probe_kit.extract.store.layout import COLUMNS, codecs
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.arrays import codecs
+from probe_kit.extract.store.layout import COLUMNS
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.rows import PADDING
 from probe_kit.extract.store.run import Run
 
@@ -24,7 +26,7 @@ def seal(path: Path | str | Location) -> bool:
     once take turns, and all but the first find it done.
     """
     location = Run(locate(path)).location
-    with location.turn():
+    with location.one_at_a_time():
         return _seal(Run(location))
 
 

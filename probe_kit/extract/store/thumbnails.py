@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit.extract.store.layout import FRAMES
-from probe_kit.extract.store.location import Location, locate
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 
 HEIGHT = 120
 """Pixels; a pair of 4:3 frames is 320 wide and takes about 2 kB."""

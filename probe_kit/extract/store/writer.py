@@ -1,37 +1,43 @@
 """Writing a run: created once, then one committed episode at a time."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import zarr
+from numpy.typing import NDArray
 from zarr.core.array_spec import ArrayConfigLike
 from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
-from probe_kit.extract.plan import Plan
+from probe_kit.extract.plan import Plan, PlannedEpisode
 from probe_kit.extract.settings import refuse_other_settings
+from probe_kit.extract.store.arrays import create_arrays
 from probe_kit.extract.store.commits import RecordingStore, as_json, create_once, read_commits, write_commit
-from probe_kit.extract.store.layout import (
-    CERTIFICATE_FILE,
-    DATA,
-    FAILED,
-    PLAN_FILE,
-    RUN_FILE,
-    SCHEMA_VERSION,
-    create_arrays,
-)
+from probe_kit.extract.store.layout import CERTIFICATE_FILE, DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.run import read_card
 from probe_kit.identity import canonical_json, sha256_json
 
-if TYPE_CHECKING:
-    from probe_kit.extract.play.rollout import Rollout
-
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
 # a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
 _WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """All that is stored of one episode.
+
+    arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
+    roles: per captured inference and stream, the spans of roles.
+    """
+
+    planned: PlannedEpisode
+    outcome: Mapping[str, Any]
+    arrays: Mapping[str, Mapping[str, NDArray[Any]]]
+    roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
 
 
 class RunWriter:
@@ -91,18 +97,18 @@ class RunWriter:
         done = read_commits(self.location)
         return [episode.index for episode in self.plan.episodes if episode.index not in done]
 
-    def write(self, rollout: "Rollout") -> None:
+    def write(self, episode: EpisodeRecord) -> None:
         """Store one episode: first its arrays, then the commit that makes it count."""
-        planned, buffers = rollout.planned, rollout.buffers
+        planned = episode.planned
         store = RecordingStore(self.location.store(DATA))
-        for kind, arrays in (("pooled", buffers.pooled), ("tokens", buffers.tokens)):
-            for stream, values in arrays.items():
+        for kind, by_stream in episode.arrays.items():
+            for stream, values in by_stream.items():
                 array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
                 array[planned.index] = values
         commit = {
             "episode_id": planned.episode.episode_id,
-            "outcome": rollout.outcome,
-            "roles": buffers.roles,
+            "outcome": episode.outcome,
+            "roles": episode.roles,
             "objects": {key: list(record) for key, record in sorted(store.objects.items())},
         }
         write_commit(self.location, planned.index, commit)

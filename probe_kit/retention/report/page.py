@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from probe_kit import __version__
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.gallery import Exhibit, gallery, run_names
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
@@ -23,6 +22,7 @@ from probe_kit.retention.report.tables import (
 )
 from probe_kit.retention.table import RetentionTable, retention
 from probe_kit.train.reader import RunReader
+from probe_kit.version import __version__
 
 _HERE = Path(__file__).parent
 

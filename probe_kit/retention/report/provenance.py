@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit import __version__
 from probe_kit.errors import NoProbesError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
+from probe_kit.version import __version__
 
 PAPER = "arXiv:2606.19297"
 

@@ -7,7 +7,9 @@ import pytest
 import zarr
 
 from probe_kit.errors import MissingExtraError, SettingsMismatchError, StoreError, UsageError
-from probe_kit.extract.store.location import Folder, Location, locate
+from probe_kit.extract.store.folder import Folder
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
 
 BEGINNING = {"plan.json": b"plan", "data.zarr/zarr.json": b"{}", "run.json": b"run"}
 

@@ -9,7 +9,7 @@ import zarr
 
 from probe_kit.errors import RunDamagedError, RunNotFoundError, UnknownSiteError
 from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.layout import decode_bfloat16
+from probe_kit.extract.store.arrays import decode_bfloat16
 from probe_kit.hooks.sites import Site
 
 

@@ -8,7 +8,7 @@ from probe_kit.extract.plan import make_plan
 from probe_kit.extract.play.rollout import Rollout
 from probe_kit.extract.play.staging import EpisodeBuffers
 from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.location import locate
+from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks.sites import Site
 from probe_kit.suite import Suite
@@ -36,8 +36,8 @@ def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(w
     full, empty = rollout(writer, 0, 20), rollout(writer, 1, 20)
     empty.buffers.clear()
     empty.buffers.roles.append(full.buffers.roles[0])
-    writer.write(full)
-    writer.write(empty)
+    writer.write(full.record)
+    writer.write(empty.record)
     seal(writer.location)
     run = open_run(writer.location, allow_partial=True)
     column = run.column(Site("backbone", 1))
@@ -49,7 +49,7 @@ def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(w
 
 def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
     for number, language in enumerate((20, 140)):
-        writer.write(rollout(writer, number, language))
+        writer.write(rollout(writer, number, language).record)
     run = open_run(writer.location, allow_partial=True)
     blocks = list(run.iter_token_blocks(Site("backbone", 0), "language"))
     assert [block.start for block in blocks] == [0, 128]
@@ -60,8 +60,8 @@ def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
 
 
 def test_a_second_commit_of_the_same_episode_changes_nothing(writer: RunWriter) -> None:
-    writer.write(rollout(writer, 0, 20))
+    writer.write(rollout(writer, 0, 20).record)
     commit = writer.location.read("commits/00000000.json")
-    writer.write(rollout(writer, 0, 20))
+    writer.write(rollout(writer, 0, 20).record)
     assert writer.location.read("commits/00000000.json") == commit
     assert verify_run(writer.location, deep=True).ok

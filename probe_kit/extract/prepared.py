@@ -1,0 +1,85 @@
+"""Preparing an extraction: find the suite, load the model, plan the episodes. Nothing is written."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.identity import sha256_json
+from probe_kit.suite import Suite, default_suite, load_suite
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What an extraction starts from: the model was loaded and the plan is made.
+
+    controller: None if the model is loaded again by workers elsewhere.
+    """
+
+    settings: ExtractSettings
+    plan: Plan
+    card: dict[str, Any]
+    controller: Controller | None
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that names the stored numbers; two runs with equal identity are interchangeable."""
+        suite = self.plan.suite
+        return {
+            **self.settings.choices(),
+            **self.card,
+            "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
+            "categories": list(suite.categories),
+            "items": len(suite.items),
+            "scene": self.settings.scene.to_json(),
+        }
+
+    def default_name(self) -> str:
+        """Folder name that repeats for the same settings, so that the same command finds its run again."""
+        return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
+
+
+def load(settings: ExtractSettings) -> Prepared:
+    """Find the suite, load the model and plan the episodes.
+
+    Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
+    """
+    if settings.model not in SCRIPTED:
+        _find_family(settings.model)
+    suite = _suite(settings)
+    controller = _controller(settings, suite)
+    with_tokens = settings.tokens == "all"
+    plan = make_plan(suite, controller.streams, settings.seed, settings.captured_calls, with_tokens)
+    return Prepared(settings, plan, controller.identity, controller)
+
+
+def _find_family(name: str) -> None:
+    """Refuse an unknown model before the suite is built."""
+    from probe_kit.hooks.registry import find_family
+
+    find_family(name, tuple(SCRIPTED))
+
+
+def _suite(settings: ExtractSettings) -> Suite:
+    if settings.suite is None:
+        return default_suite().select(settings.categories, settings.items)
+    return load_suite(settings.suite).select(settings.categories, settings.items)
+
+
+def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
+    if settings.model in SCRIPTED:
+        return ScriptedController(settings.model)
+    from probe_kit.hooks import load_policy
+
+    policy = load_policy(
+        settings.model,
+        settings.checkpoint,
+        settings.device,
+        settings.dtype,
+        settings.random_weights,
+        **settings.options,
+    )
+    instructions = sorted({item.instruction for item in suite.items})
+    return PolicyController(
+        policy, settings.model, instructions, settings.execute, settings.captured_calls, settings.tokens == "all"
+    )

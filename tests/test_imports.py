@@ -1,0 +1,86 @@
+"""Data flows one way, and so do imports: no circle, and nothing imports what comes after it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.import_graph import circles, import_graph, upward
+
+PACKAGE = Path(__file__).parents[1] / "probe_kit"
+GRAPH = import_graph(PACKAGE)
+
+BASE = {"child", "cluster", "console", "errors", "extras", "identity", "lazy", "version"}
+ROOMS = {
+    **dict.fromkeys(BASE, BASE),
+    "statistics": BASE,
+    "suite": BASE | {"statistics"},
+    "env": BASE | {"suite"},
+    "models": BASE | {"suite"},
+    "hooks": BASE | {"models"},
+    "extract": BASE | {"suite", "env", "hooks"},
+    "train": BASE | {"suite", "hooks", "extract", "statistics"},
+    "intervene": BASE | {"suite", "env", "hooks", "extract", "train", "statistics"},
+    "retention": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "statistics"},
+    "study": BASE | {"suite", "extract", "train", "intervene", "retention", "statistics"},
+}
+"""What a room may import; what is not named here, such as `cli` and `demo`, stands on top."""
+
+EXTRACT = {
+    "store": {"plan", "settings"},
+    "plan": {"store"},
+    "settings": {"store"},
+    "play": {"store", "plan", "settings"},
+    "prepared": {"store", "plan", "settings", "play"},
+    "crews": {"store", "plan", "settings", "play", "prepared"},
+    "extraction": {"store", "plan", "settings", "play", "prepared", "crews"},
+}
+
+READS_ONLY = ("probe_kit.extract", "probe_kit.extract.store", "probe_kit.hooks.sites", "probe_kit.env.outcome")
+"""All that probes and tables may know of the rooms that hold models and simulators."""
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    assert circles(GRAPH) == []
+
+
+def test_no_room_imports_one_that_comes_after_it() -> None:
+    assert upward(GRAPH, ROOMS, "probe_kit") == []
+
+
+def test_inside_extract_the_store_knows_nothing_of_playing_and_playing_nothing_of_crews() -> None:
+    assert upward(GRAPH, EXTRACT, "probe_kit.extract") == []
+
+
+@pytest.mark.parametrize("room", ["train", "retention"])
+def test_what_reads_runs_knows_neither_models_nor_simulators(room: str) -> None:
+    seen = {
+        other
+        for module, imported in GRAPH.items()
+        if module.startswith(f"probe_kit.{room}")
+        for other in imported
+        if other.startswith(("probe_kit.extract", "probe_kit.hooks", "probe_kit.env", "probe_kit.models"))
+    }
+    assert seen
+    strange = {other for other in seen if other not in READS_ONLY and not other.startswith(READS_ONLY[1] + ".")}
+    assert not strange
+
+
+def test_a_circle_is_found_wherever_its_imports_stand(tmp_path: Path) -> None:
+    write(tmp_path, "a", "import house.b")
+    write(tmp_path, "b", "def late():\n    from house.c import name")
+    write(tmp_path, "c", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from house import a")
+    write(tmp_path, "d", "import house.a")
+    assert circles(import_graph(tmp_path / "house")) == [["house.a", "house.b", "house.c"]]
+
+
+def test_an_import_upwards_is_found(tmp_path: Path) -> None:
+    write(tmp_path, "cellar", "from house.attic import box")
+    write(tmp_path, "attic", "import house.cellar")
+    graph = import_graph(tmp_path / "house")
+    assert upward(graph, {"cellar": set(), "attic": {"cellar"}}, "house") == ["house.cellar -> house.attic"]
+
+
+def write(folder: Path, name: str, text: str) -> None:
+    (folder / "house").mkdir(exist_ok=True)
+    (folder / "house" / "__init__.py").touch()
+    (folder / "house" / f"{name}.py").write_text(text)
