@@ -21,7 +21,7 @@ from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import verify
 from probe_kit.retention.commands import retention
 from probe_kit.suite.commands import app as suite_app
-from probe_kit.train.commands import train
+from probe_kit.train.commands import show, train
 
 INTERRUPTED = 130
 
@@ -73,6 +73,7 @@ app = typer.Typer(
 )
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
+run_app.command()(show)
 for command in (extract, export, demo, models, verify, train, retention, doctor):
     app.command()(command)
 

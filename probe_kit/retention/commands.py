@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
+from rich.markup import escape
 
 from probe_kit.console import err, out, split
 from probe_kit.errors import UsageError
@@ -21,9 +22,19 @@ def retention(
         list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
     ] = None,
     style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
+    probes: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="RUN=KEY: which probes of a run, as `run show` lists them; default those asked for last."
+        ),
+    ] = None,
     views: Annotated[str | None, typer.Option(help="Comma-separated; default all probed ones.")] = None,
     iterations: Annotated[
-        str, typer.Option(help="Expert iterations or action tokens that count: all, last or a number.")
+        str,
+        typer.Option(
+            help="Expert iterations or action tokens that count: all, last or a number. best: all, and layer "
+            "curves show the best of each layer only."
+        ),
     ] = "all",
     epsilons: Annotated[
         str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
@@ -42,17 +53,19 @@ def retention(
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
-    _refuse_doubles([path for paths in grouped.values() for path in paths])
+    steps = _iterations(iterations)
     radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
+    _check_places(html, figures)
     opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
-    table = make_table(
-        opened if group else opened[""], split(views), iterations=_iterations(iterations), epsilons=radii
-    )
+    listed = [run for of_group in opened.values() for run in of_group]
+    keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
+    table = make_table(opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii)
     if style == "table":
         out.print(table.to_rich())
     else:
         typer.echo(getattr(table, f"to_{style}")())
-    listed = [run for of_group in opened.values() for run in of_group]
+        for note in table.notes:
+            err.print(f"[yellow]note:[/] {escape(note)}", highlight=False, soft_wrap=True)
     if figures is not None:
         _save_figures(listed, table, figures)
     if html is not None:
@@ -61,6 +74,37 @@ def retention(
         with err.status("drawing the report"):
             written = write_report(listed, html, table)
         err.print(f"report: {written}", highlight=False, soft_wrap=True)
+
+
+def _check_places(html: Path | None, figures: Path | None) -> None:
+    """Refuse places that cannot be written to before anything is computed."""
+    if html is not None and html.is_dir():
+        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
+    if figures is not None and figures.exists() and not figures.is_dir():
+        raise UsageError(f"--figures {figures} is a file; give a folder")
+
+
+def _keys(paths: list[str], chosen: list[str]) -> list[str | None]:
+    """The key of every run in order, None where none was chosen; a run goes by its path or its folder's name."""
+    keys: list[str | None] = [None] * len(paths)
+    for text in chosen:
+        name, separator, key = text.rpartition("=")
+        if not (separator and name and key):
+            raise UsageError(f"--probes {text!r} is not RUN=KEY; `probe-kit run show RUN` lists the keys")
+        found = [at for at, path in enumerate(paths) if _place(path) == _place(name)]
+        found = found or [at for at, path in enumerate(paths) if _place(path).rpartition("/")[2] == name]
+        if len(found) != 1:
+            raise UsageError(
+                f"--probes {text!r}: {name} is {'several' if found else 'none'} of the runs {', '.join(paths)}"
+            )
+        if keys[found[0]] is not None:
+            raise UsageError(f"--probes chooses probes of {name} twice; choose one")
+        keys[found[0]] = key
+    return keys
+
+
+def _place(path: str) -> str:
+    return path.rstrip("/") if "://" in path else str(Path(path).resolve())
 
 
 def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
@@ -73,16 +117,6 @@ def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
             raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = split(paths) or ()
     return groups
-
-
-def _refuse_doubles(paths: list[str]) -> None:
-    """A run that counts twice makes every interval too narrow."""
-    seen: set[str] = set()
-    for path in paths:
-        place = path.rstrip("/") if "://" in path else str(Path(path).resolve())
-        if place in seen:
-            raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
-        seen.add(place)
 
 
 def _radius(text: str) -> float:
@@ -98,8 +132,8 @@ def _radius(text: str) -> float:
 def _iterations(text: str) -> "Iterations":
     if text.isdigit():
         return int(text)
-    if text not in ("all", "last"):
-        raise UsageError(f"iterations {text!r}; expected all, last or a number")
+    if text not in ("all", "best", "last"):
+        raise UsageError(f"iterations {text!r}; expected all, best, last or a number")
     return cast("Iterations", text)
 
 

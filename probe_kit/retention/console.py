@@ -37,9 +37,12 @@ _REGIMES: dict[str | None, str] = {
 }
 
 
-def rich_tables(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> "Group":
-    """Success rates of every run, then its retention and controls per view; differences between groups last."""
+def rich_tables(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()
+) -> "Group":
+    """Success rates of every run, its retention and controls per view, differences between groups, notes."""
     from rich.console import Group
+    from rich.text import Text
 
     tables: list[Table] = []
     for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
@@ -47,14 +50,14 @@ def rich_tables(rows: Sequence[RetentionRow], differences: Sequence[Difference] 
         tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, [_OUTCOME_LEGEND]))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
-            notes = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
-            legend = ["@ depth of the best layer/iteration", *notes]
+            reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
+            legend = ["@ depth of the best layer/iteration", *reasons]
             tables.append(_table(f"Retention, view {view}", shown, _RETENTION_COLUMNS, legend))
             if controlled(shown):
                 tables.append(_table(f"Controls, view {view}", shown, CONTROL_COLUMNS, [_control_legend(shown)]))
     for title, of_pair in groupby(differences, key=difference_title):
         tables.append(_difference_table(title, list(of_pair)))
-    return Group(*tables)
+    return Group(*tables, *(Text(note, style="yellow") for note in notes))
 
 
 def _whole(value: float | None) -> str:

@@ -41,9 +41,10 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
 }
 
 
-def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> str:
+def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()) -> str:
     """Complete `table` environments: retention, then controls and differences between groups where there are any.
 
+    notes: sentences for the author, as comments.
     Needs the packages booktabs and xcolor with its option `table`.
     """
     parts = [_retention_table(rows)]
@@ -54,7 +55,7 @@ def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) 
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
         parts.append(_plain_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
-    return "\n".join(parts)
+    return "\n".join([*parts, *(f"% {note}" for note in notes)])
 
 
 def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

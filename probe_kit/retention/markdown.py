@@ -56,8 +56,10 @@ RETENTION_COLUMNS: list[Column] = [
 ]
 
 
-def markdown(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> str:
-    """Success rates and, where there are any, retention, controls and differences between groups."""
+def markdown(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()
+) -> str:
+    """Success rates and, where there are any, retention, controls, differences between groups and notes."""
     parts = [_rows_table("Success rate", once_per_category(rows), SUCCESS_COLUMNS)]
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
@@ -68,7 +70,7 @@ def markdown(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
         parts.append(_markdown_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
-    return "\n".join(parts)
+    return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 
 def _rows_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:

@@ -18,8 +18,12 @@ from probe_kit.retention.fieller import Interval, fieller_interval
 from probe_kit.train.controls import SIGNIFICANCE
 from probe_kit.train.curve import Curve
 
-Iterations = Literal["all", "last"] | int
-"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number."""
+Iterations = Literal["all", "best", "last"] | int
+"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
+
+Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
+curve draws a line for each of `all`, and one line for the `best` of every layer.
+"""
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ def retention_interval(fit: Crossfit) -> Interval:
 def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
     rows = curve.stream(stream)
     steps = {curve.sites[row].iteration for row in rows} - {None}
-    if iterations == "all" or not steps:
+    if iterations in ("all", "best") or not steps:
         return rows
     step = max(filter(None, steps), default=0) if iterations == "last" else iterations
     if step not in steps:

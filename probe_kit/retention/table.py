@@ -10,11 +10,12 @@ from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.mixtures import mixed_settings
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
-from probe_kit.train.store import load_results
+from probe_kit.train.store import is_current, load_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,11 +27,17 @@ class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
     Runs are never averaged with each other, so no mean mixes suites. differences: between groups of runs, if any.
+    results: the probes that the rows were made of, by `row.run`; figures and reports of the table draw these.
+    iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
+    which runs have no probes, and which settings the rows mix.
     """
 
     rows: list[RetentionRow]
     means: list[RetentionRow]
     differences: list[Difference] = field(default_factory=list)
+    results: Mapping[str, ProbeResults] = field(default_factory=dict, repr=False)
+    iterations: Iterations = "all"
+    notes: tuple[str, ...] = ()
 
     @property
     def all_rows(self) -> list[RetentionRow]:
@@ -78,19 +85,19 @@ class RetentionTable:
         """Success rates, retention, controls and differences as Markdown tables."""
         from probe_kit.retention.markdown import markdown
 
-        return markdown(self.all_rows, self.differences)
+        return markdown(self.all_rows, self.differences, self.notes)
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
         from probe_kit.retention.latex import latex
 
-        return latex(self.all_rows, self.differences)
+        return latex(self.all_rows, self.differences, self.notes)
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.console import rich_tables
 
-        return rich_tables(self.all_rows, self.differences)
+        return rich_tables(self.all_rows, self.differences, self.notes)
 
 
 def retention(
@@ -109,29 +116,56 @@ def retention(
     keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
     metres at which SR is scored again. A run without activations or probes shows success rates only.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
-    is not that of the runs, SceneError for overlapping zones.
+    is not that of the runs, or for a run that is given twice, SceneError for overlapping zones.
     """
     groups = runs if isinstance(runs, Mapping) else {None: runs}
     listed = [(name, run) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
+    _refuse_doubles([run for _, run in listed])
+    results, notes = _read_probes([run for _, run in listed], keys or [None] * len(listed))
     settings = RowSettings(views, iterations, epsilons, seed)
     drawn: list[Drawn] = []
     means: list[RetentionRow] = []
-    for (name, run), key in zip(listed, keys or [None] * len(listed), strict=True):
-        found = run_rows(run, _results(run, key), settings, name)
+    for name, run in listed:
+        found = run_rows(run, results.get(str(run.location)), settings, name)
         drawn += found
         shown = dict.fromkeys(one.row.view for one in found)
         means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
-    return RetentionTable([one.row for one in drawn], means, group_differences(by_group))
+    differences = group_differences(by_group)
+    notes += mixed_settings(results, views)
+    return RetentionTable([one.row for one in drawn], means, differences, results, iterations, tuple(notes))
 
 
-def _results(run: RunReader, key: str | None) -> ProbeResults | None:
-    try:
-        return load_results(run, key)
-    except NoProbesError:
-        return None
+def _refuse_doubles(runs: Sequence[RunReader]) -> None:
+    """A run that counts twice makes every interval too narrow."""
+    seen: set[str] = set()
+    for run in runs:
+        if run.location.address in seen:
+            raise UsageError(f"{run.location} is given twice; its episodes would count twice. Leave one out")
+        seen.add(run.location.address)
+
+
+def _read_probes(
+    runs: Sequence[RunReader], keys: Sequence[str | None]
+) -> tuple[dict[str, ProbeResults], list[str]]:
+    """Probes by run, and a sentence for every run that has none."""
+    results: dict[str, ProbeResults] = {}
+    missing = []
+    for run, key in zip(runs, keys, strict=True):
+        try:
+            found = load_results(run, key)
+        except NoProbesError as error:
+            missing.append(f"Success rates only: {error}")
+            continue
+        results[str(run.location)] = found
+        if not is_current(found.settings, run):
+            missing.append(
+                f"The probes {found.key} of {run.location} are of other episodes than the run has now: accuracies "
+                f"and success rates do not belong together. `probe-kit train {run.location}` fits new ones."
+            )
+    return results, missing
 
 
 def _flat(row: dict[str, object]) -> dict[str, object]:

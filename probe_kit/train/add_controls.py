@@ -1,10 +1,11 @@
-"""Fitting the controls of stored probe results, and storing them beside."""
+"""Fitting the controls of probe results: what can be wrong with them is found before anything is fitted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.identity import derive_seed
@@ -12,28 +13,33 @@ from probe_kit.train.baselines import Baseline, baseline_features
 from probe_kit.train.controls import BaselineScore, TwinScore
 from probe_kit.train.curve import Curve
 from probe_kit.train.permutation import site_p
-from probe_kit.train.problem import category_problem
+from probe_kit.train.problem import POOLED, category_problem
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results import ProbeResults, ProbeSettings
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import chance_level, correctness, group_bootstrap
-from probe_kit.train.store import save_controls
+from probe_kit.train.targets import target_labels
+
+Prepared = Mapping[Baseline, NDArray[np.float32]]
+"""Features of baselines that are still to be probed, (E, D) each."""
 
 
-def add_baselines(
-    results: ProbeResults, run: RunReader, names: Sequence[Baseline], suite: Path | None
-) -> ProbeResults:
-    """`results` with these baselines for every category, fitted where they are not stored yet.
+def prepare_baselines(
+    run: RunReader, names: Sequence[Baseline], suite: Path | None, stored: ProbeResults | None
+) -> Prepared:
+    """Features of the baselines `names` that `stored` does not have yet.
 
-    Raises what `baseline_features` raises.
+    Before anything is probed, so that what is wrong with them is said first. Raises what `baseline_features`
+    raises.
     """
-    missing = [name for name in names if not _has(results, name)]
-    if not missing:
-        return results
-    scores = [score for name in missing for score in _baseline_scores(results, run, name, suite)]
-    found = replace(results, controls=results.controls.with_baselines(scores))
-    save_controls(found, run.location)
-    return found
+    missing = [name for name in names if stored is None or not _has(stored, name)]
+    return {name: baseline_features(run, name, suite) for name in missing}
+
+
+def add_baselines(results: ProbeResults, run: RunReader, prepared: Prepared) -> ProbeResults:
+    """`results` with these baselines for every category."""
+    scores = [score for name, found in prepared.items() for score in _baseline_scores(results, run, name, found)]
+    return replace(results, controls=results.controls.with_baselines(scores))
 
 
 def _has(results: ProbeResults, name: str) -> bool:
@@ -42,9 +48,9 @@ def _has(results: ProbeResults, name: str) -> bool:
 
 
 def _baseline_scores(
-    results: ProbeResults, run: RunReader, name: Baseline, suite: Path | None
+    results: ProbeResults, run: RunReader, name: Baseline, features: NDArray[np.float32]
 ) -> Iterator[BaselineScore]:
-    settings, samples = results.settings, Samples.pooled(baseline_features(run, name, suite))
+    settings, samples = results.settings, Samples.pooled(features)
     for category in settings.categories:
         problem = category_problem(run.episodes, category, settings)
         probe = problem.probe(samples)
@@ -64,14 +70,35 @@ def _baseline_scores(
         )
 
 
-def add_twin(results: ProbeResults, run: RunReader, twin: ProbeResults) -> ProbeResults:
+def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
+    """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
+    if run.location.address == twin.location.address:
+        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
+    here, there = (_labels_by_episode(one, settings) for one in (run, twin))
+    if here != there:
+        raise UsageError(
+            f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
+            "are not the same. Extract both from the same suite."
+        )
+
+
+def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[str, int]]:
+    labels = target_labels(run.episodes, settings.target, settings.seed)
+    chosen = run.episodes["category"].isin(settings.categories) | (POOLED in settings.categories)
+    names = run.episodes["episode_id"].astype(str)
+    return [
+        (name, label)
+        for name, label, kept in zip(names, labels.tolist(), chosen, strict=True)
+        if kept and label >= 0
+    ]
+
+
+def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
     """`results` held against the same probes of a twin. Raises UsageError if the twin saw other episodes."""
     scores = [
         score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
     ]
-    found = replace(results, controls=results.controls.with_twin(scores))
-    save_controls(found, run.location)
-    return found
+    return replace(results, controls=results.controls.with_twin(scores))
 
 
 def _twin_scores(

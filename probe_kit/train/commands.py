@@ -1,15 +1,20 @@
-"""`probe-kit train`."""
+"""`probe-kit train`, and `probe-kit run show`, which lists what it stored."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
+from rich.text import Text
 
-from probe_kit.console import counter, err, out, progress, split
+from probe_kit.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from probe_kit.train import Baseline, ProbeResults, Target
+    from probe_kit.train.inventory import Inventory, StoredProbes
 
 
 def train(
@@ -48,18 +53,20 @@ def train(
     from probe_kit.extract import open_run
     from probe_kit.train import train_probes
 
+    asked, baselines = _target(target), _baselines(controls)
     opened = open_run(run, allow_partial=partial)
+    beside = None if twin is None else open_run(twin, allow_partial=partial)
     with progress() as bar:
         results = train_probes(
             opened,
             split(categories),
-            split(views) or ("mean",),
+            split(views) or (),
             permutations=permutations,
             token_permutations=token_permutations,
-            target=_target(target),
-            controls=_baselines(controls),
+            target=asked,
+            controls=baselines,
             suite=suite,
-            twin=None if twin is None else open_run(twin, allow_partial=partial),
+            twin=beside,
             seed=seed,
             jobs=jobs,
             device=device,
@@ -68,6 +75,76 @@ def train(
         )
     _print_peaks(results, opened.random_weights)
     err.print(f"next: [bold]probe-kit retention {run}[/]", highlight=False, soft_wrap=True)
+
+
+def show(
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """List what a run holds: episodes, streams, and every set of probes by its key."""
+    from probe_kit.extract import open_run
+    from probe_kit.train.inventory import inventory
+
+    found = inventory(open_run(run, allow_partial=True))
+    if as_json:
+        print_json(asdict(found))
+        return
+    out.print(_facts(found))
+    if not found.probes:
+        step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
+        out.print(f"no probes: {step}", highlight=False, soft_wrap=True)
+
+
+def _facts(found: "Inventory") -> "Table":
+    from rich.table import Table
+
+    missing = found.planned - found.episodes
+    outcomes = ", ".join(f"{name} {count}" for name, count in found.outcomes.items())
+    facts = {
+        "run": found.run,
+        "model": found.model + (" (random weights)" if found.random_weights else ""),
+        "weights": (found.weights_sha256 or "none (scripted)")[:12],
+        "suite": found.suite,
+        "settings": found.settings_sha256[:12],
+        "episodes": f"{found.episodes} of {found.planned}" * (missing > 0) or str(found.episodes),
+        "failed": str(found.failed or ""),
+        "outcomes": outcomes,
+        "categories": ", ".join(found.categories),
+        **found.streams,
+        **{f"probes {probes.key}": _probes_in_words(probes, found) for probes in found.probes},
+        **{
+            f"unfinished {key}": f"a sweep of {sites} sites so far; the same `probe-kit train` continues it"
+            for key, sites in found.unfinished.items()
+        },
+    }
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        if value:
+            table.add_row(name, Text(value))
+    return table
+
+
+_STATES = {
+    "used": "what `probe-kit retention` reads: the probes asked for last",
+    "other": "read with --probes RUN=KEY",
+    "other episodes": "of other episodes than the run has now",
+    "other version": "written by another version of probe_kit, which this one cannot read",
+}
+
+
+def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
+    state, fitted = _STATES[probes.state], f"fitted {probes.created[:16].replace('T', ' ')} UTC"
+    if not probes.views:
+        return f"{state}; {fitted}"
+    parts = [f"{state}; views {', '.join(probes.views)}", f"target {probes.target}"]
+    parts += [f"{probes.permutations} relabellings"]
+    parts += [f"{probes.token_permutations} for tokens"] * (probes.token_permutations > 0)
+    parts += [f"seed {probes.seed}"]
+    parts += [f"only {', '.join(probes.categories)}"] * (probes.categories != found.categories)
+    parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
+    return "; ".join([*parts, fitted])
 
 
 def _baselines(names: str | None) -> "tuple[Baseline, ...]":

@@ -1,12 +1,13 @@
 """Probe every site of a run: `train_probes`."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
-from probe_kit.train.add_controls import add_baselines, add_twin
+from probe_kit.train.add_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.arrays import check_device
 from probe_kit.train.baselines import Baseline
 from probe_kit.train.crew import CrewSettings, Key, Probed
@@ -16,8 +17,9 @@ from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
-from probe_kit.train.store import Unfinished, is_stored, load_results, save_results
+from probe_kit.train.store import is_stored, load_results, save_results
 from probe_kit.train.targets import Target
+from probe_kit.train.unfinished import Unfinished
 from probe_kit.train.workers import probe_columns
 
 Progress = Callable[[int, int, str], None]
@@ -54,29 +56,86 @@ def train_probes(
     machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
     The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
-    interrupted sweep continues after the last finished site; controls are added to what is stored.
+    interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
+    stored before all of it is fitted: where this raises, `load_results` finds what it found before.
     Raises NoProbesError for a run without activations, UnknownCategoryError, UnknownSiteError for a view no
     stream has, TooFewGroupsError, ProbeNotConvergedError, UsageError, and SuiteError for another suite.
     """
+    _check_options(views, permutations, token_permutations, jobs, device, ray)
+    crew = CrewSettings(jobs, device, ray)
+    sweep = _Sweep.of(
+        run, _settings(run, categories, views, target, permutations, token_permutations, seed), crew, progress
+    )
+    prepared = prepare_baselines(run, controls, suite, sweep.stored)
+    beside = None
+    if twin is not None:
+        other = _settings(twin, sweep.settings.categories, views, target, permutations, token_permutations, seed)
+        check_twin(run, twin, other)
+        beside = _Sweep.of(twin, other, crew, progress)
+    results = add_baselines(sweep.results(), run, prepared)
+    if beside is not None:
+        others = beside.results()
+        results = add_twin(results, others)
+        beside.keep(others, asked=False)
+    return sweep.keep(results, asked=True)
+
+
+def _check_options(
+    views: Sequence[str],
+    permutations: int,
+    token_permutations: int,
+    jobs: int | None,
+    device: str | None,
+    ray: str | None,
+) -> None:
+    """Raise UsageError for what can be seen to be wrong without looking at the run."""
     check_device(device)
     if device is not None and ((jobs or 1) > 1 or ray is not None):
         raise UsageError(
             f"device {device!r} is used by one process, got jobs={jobs}, ray={ray!r}. Leave `jobs` and `ray` out."
         )
-    crew = CrewSettings(jobs, device, ray)
-    settings = _settings(run, categories, views, target, permutations, token_permutations, seed)
-    if is_stored(run.location, settings.key):
-        results = load_results(run, settings.key)
-    else:
-        results = _fit(run, settings, crew, progress)
-    results = add_baselines(results, run, controls, suite)
-    if twin is not None:
-        others = train_probes(
-            twin, settings.categories, views, permutations=permutations, token_permutations=token_permutations,
-            target=target, seed=seed, jobs=jobs, device=device, ray=ray, progress=progress,
-        )  # fmt: skip
-        results = add_twin(results, run, others)
-    return results
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"jobs={jobs}; expected at least 1 process, or None")
+    if min(permutations, token_permutations) < 0:
+        raise UsageError(
+            f"permutations={permutations}, token_permutations={token_permutations}; expected 0 or more (0: no p)"
+        )
+    if not views or len(set(views)) < len(views):
+        raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """What is to be probed in one run. stored: its results, if the same was probed before."""
+
+    run: RunReader
+    settings: ProbeSettings
+    stored: ProbeResults | None
+    problems: Mapping[str, CategoryProblem]
+    keys: tuple[Key, ...]
+    crew: CrewSettings
+    progress: Progress | None
+
+    @classmethod
+    def of(
+        cls, run: RunReader, settings: ProbeSettings, crew: CrewSettings, progress: Progress | None
+    ) -> "_Sweep":
+        """Nothing is probed yet, but what can be wrong is found."""
+        if is_stored(run.location, settings.key):
+            return cls(run, settings, load_results(run, settings.key), {}, (), crew, progress)
+        problems = {name: category_problem(run.episodes, name, settings) for name in settings.categories}
+        keys = tuple((view, site) for view in settings.views for site in sites_of(run, view))
+        return cls(run, settings, None, problems, keys, crew, progress)
+
+    def results(self) -> ProbeResults:
+        """Those that are stored, or new ones that are not stored yet."""
+        return _fit(self) if self.stored is None else self.stored
+
+    def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
+        """Store `results` and give them as they are read back."""
+        save_results(results, self.run.location, asked=asked)
+        Unfinished.of(self.run.location, self.settings.key).discard()
+        return load_results(self.run, self.settings.key)
 
 
 def _settings(
@@ -110,42 +169,31 @@ def _settings(
     )
 
 
-def _fit(run: RunReader, settings: ProbeSettings, crew: CrewSettings, progress: Progress | None) -> ProbeResults:
-    problems = {category: category_problem(run.episodes, category, settings) for category in settings.categories}
-    probes = _probe_all(run, problems, settings, crew, progress)
+def _fit(sweep: _Sweep) -> ProbeResults:
+    probes = _probe_all(sweep)
     curves = {
         (category, view): _curve(problem, category, view, probes)
-        for category, problem in problems.items()
-        for view in settings.views
+        for category, problem in sweep.problems.items()
+        for view in sweep.settings.views
     }
     directions = {
         (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
         for (view, site), found in probes.items()
         for category, probe in found.items()
     }
-    results = ProbeResults(settings, curves, directions)
-    save_results(results, run.location)
-    Unfinished.of(run.location, settings.key).discard()
-    return load_results(run, settings.key)
+    return ProbeResults(sweep.settings, curves, directions)
 
 
-def _probe_all(
-    run: RunReader,
-    problems: Mapping[str, CategoryProblem],
-    settings: ProbeSettings,
-    crew: CrewSettings,
-    progress: Progress | None,
-) -> dict[Key, Probed]:
+def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
-    keys = [(view, site) for view in settings.views for site in sites_of(run, view)]
-    unfinished = Unfinished.of(run.location, settings.key)
+    keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key)
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
-    columns = ((key, read_samples(run, *key)) for key in keys if key not in probes)
-    for key, found in probe_columns(columns, problems, crew):
+    columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)
+    for key, found in probe_columns(columns, sweep.problems, sweep.crew):
         unfinished.keep(*key, found)
         probes[key] = found
-        if progress is not None:
-            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
+        if sweep.progress is not None:
+            sweep.progress(len(probes), len(keys), f"{key[1]} {key[0]}")
     return {key: probes[key] for key in keys}
 
 

@@ -7,8 +7,7 @@ import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention
-from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results
-from probe_kit.train.store import save_controls
+from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results, save_results
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
             for site, gain in zip(sites, (0.3, 0.2), strict=True)
         ),
     )
-    save_controls(replace(load_results(run), controls=controls), run.path)
+    save_results(replace(load_results(run), controls=controls), run.path)
     return retention([run])
 
 

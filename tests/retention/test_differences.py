@@ -60,11 +60,12 @@ def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> Non
 
 def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
-    table = retention({"both": [strong, weak], "strong": [strong]})
+    alone = probed_run({"color": SIGNAL}, "alone")
+    table = retention({"both": [strong, weak], "strong": [alone]})
     assert table.differences[0].prefix_accuracy == pytest.approx((0.9 + 0.8) / 2 - 0.9)
     assert table.differences[0].paired
     assert [(mean.group, mean.model) for mean in table.means] == [
-        ("both", "strong"), ("both", "weak"), ("strong", "strong"),
+        ("both", "strong"), ("both", "weak"), ("strong", "alone"),
     ]  # fmt: skip
     assert len(table.all_rows) == 2 * 3
 

@@ -6,6 +6,7 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, load_results, train_probes
+from probe_kit.train.inventory import inventory
 
 PlantedRun = Callable[..., ArrayRun]
 PLANTED = Site("backbone", 3)
@@ -67,3 +68,87 @@ def test_a_twin_of_other_episodes_is_refused(planted_run: PlantedRun) -> None:
     episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
     with pytest.raises(UsageError, match="not the same"):
         train_probes(run, permutations=0, twin=named(run, "twin", episodes=episodes))
+
+
+def test_a_twin_of_other_episodes_costs_no_work(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
+    done: list[int] = []
+    with pytest.raises(UsageError, match="not the same"):
+        train_probes(
+            run,
+            permutations=0,
+            twin=named(run, "twin", episodes=episodes),
+            progress=lambda *at: done.append(at[0]),
+        )
+    assert not done
+
+
+def test_a_run_is_not_its_own_twin(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    with pytest.raises(UsageError, match="its own twin"):
+        train_probes(run, permutations=0, twin=run)
+
+
+def test_the_probes_of_a_twin_are_read_only_where_nobody_asked_for_others(planted_run: PlantedRun) -> None:
+    run, twin = planted_run({PLANTED: 2.0}), named(planted_run(), "twin", random_weights=True)
+    own = train_probes(twin, permutations=3)
+    with_twin = train_probes(run, permutations=2, twin=twin)
+    assert load_results(twin).key == own.key
+    assert with_twin.settings.permutations == 2
+    assert {probes.state for probes in inventory(twin).probes} == {"used", "other"}
+    other = named(planted_run(), "other twin", random_weights=True)
+    train_probes(run, permutations=2, twin=other)
+    assert load_results(other).settings.permutations == 2
+
+
+FAILURES = {
+    "a control that needs a suite": {"controls": ("pixels",)},
+    "an unknown control": {"controls": ("position", "smell")},
+    "an unknown view": {"views": ("mean", "median")},
+    "no view": {"views": ()},
+    "a view twice": {"views": ("mean", "mean")},
+    "an unknown category": {"categories": ("smell",)},
+    "an unknown target": {"target": "wished"},
+    "no process": {"jobs": 0},
+    "negative relabellings": {"permutations": -1},
+}
+
+
+@pytest.mark.parametrize("options", FAILURES.values(), ids=FAILURES)
+def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
+    planted_run: PlantedRun, options: dict[str, object]
+) -> None:
+    run = planted_run()
+    before = train_probes(run, permutations=1, views=("mean",))
+    files = sorted(run.path.rglob("*"))
+    done: list[int] = []
+    asked: dict[str, object] = {"permutations": 2, **options}
+    with pytest.raises(UsageError):
+        train_probes(run, **asked, progress=lambda *at: done.append(at[0]))  # type: ignore[arg-type]
+    assert not done
+    assert load_results(run).key == before.key
+    assert sorted(run.path.rglob("*")) == files
+
+
+def test_a_sweep_that_fails_late_leaves_finished_sites_and_no_probes(
+    planted_run: PlantedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a full disk would: the sites are there, the controls fail."""
+    run = planted_run()
+    before = train_probes(run, permutations=1)
+
+    def fail(*_: object) -> None:
+        raise OSError("no space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("probe_kit.train.sweep.add_baselines", fail)
+        with pytest.raises(OSError, match="no space"):
+            train_probes(run, permutations=2, controls=("position",))
+    assert load_results(run).key == before.key
+    (unfinished,) = inventory(run).unfinished.items()
+    fitted: list[int] = []
+    after = train_probes(run, permutations=2, controls=("position",), progress=lambda *at: fitted.append(at[0]))
+    assert (not fitted, unfinished) == (True, (after.key, 9))
+    assert load_results(run).key == after.key
+    assert not inventory(run).unfinished

@@ -86,3 +86,20 @@ def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> N
         load_results(run)
     newer = train_probes(run, permutations=2)
     assert load_results(run).key == newer.key
+
+
+def test_probes_that_are_asked_for_again_are_the_newest(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    first = train_probes(run, permutations=1)
+    train_probes(run, permutations=2)
+    again = train_probes(run, permutations=1)
+    assert again.created == first.created
+    assert load_results(run).key == first.key
+
+
+def test_the_beginning_of_a_key_will_do(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    key = train_probes(run, permutations=1).key
+    assert load_results(run, key[:6]).key == key
+    with pytest.raises(UsageError, match="no probe results ''"):
+        load_results(run, "")

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import NoProbesError
+from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import ACTION_STREAMS
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -25,7 +25,6 @@ from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
-from probe_kit.train.store import load_results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,8 +64,14 @@ class Exhibit:
 
 
 def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
-    """Every figure that the runs and their newest probes allow. Nothing is drawn yet."""
-    results = [_results(run) for run in runs]
+    """Every figure that the runs and the probes of their table allow. Nothing is drawn yet.
+
+    Raises UsageError for a run that the table was not made of.
+    """
+    known = {row.run for row in table.rows}
+    if strangers := [str(run.location) for run in runs if str(run.location) not in known]:
+        raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
+    results = [table.results.get(str(run.location)) for run in runs]
     exhibits = _of_table(table, [one for one in results if one is not None])
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
         exhibits += _of_run(name, position, run)
@@ -202,10 +207,3 @@ def _figure(display: "HeatTableDisplay | KnowledgeActionDisplay | PairedLayoutsD
     figure = axes.figure
     assert isinstance(figure, Figure)
     return figure
-
-
-def _results(run: RunReader) -> ProbeResults | None:
-    try:
-        return load_results(run)
-    except NoProbesError:
-        return None

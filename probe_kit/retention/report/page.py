@@ -77,6 +77,7 @@ def report_html(
         version=__version__,
         random_weights=any(run.random_weights for run in runs),
         summaries=_summaries(table),
+        notes=table.notes,
         behaviour=behaviour_table(rows),
         more_behaviour=more_behaviour_table(rows),
         retention=retention_table(rows),
@@ -87,7 +88,10 @@ def report_html(
         },
         grid=episode_grid(runs, names, pictures),
         several=len(runs) > 1,
-        provenance=[provenance(name, run) for name, run in zip(names, runs, strict=True)],
+        provenance=[
+            provenance(name, run, table.results.get(str(run.location)))
+            for name, run in zip(names, runs, strict=True)
+        ],
         glossary=GLOSSARY,
         sentence=sentence,
         bibtex=bibtex,

@@ -2,13 +2,12 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from probe_kit.errors import NoProbesError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.train.reader import RunReader
-from probe_kit.train.store import load_results
+from probe_kit.train.results import ProbeResults
 from probe_kit.version import __version__
 
 PAPER = "arXiv:2606.19297"
@@ -24,11 +23,11 @@ class Provenance:
     documents: tuple[tuple[str, str], ...]
 
 
-def provenance(name: str, run: RunReader) -> Provenance:
-    """What a run says about itself; runs that were not made by probe_kit say less."""
+def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Provenance:
+    """What a run says about itself and its probes; runs that were not made by probe_kit say less."""
     settings: dict[str, Any] = getattr(run, "settings", {})
     certificate: dict[str, Any] = getattr(run, "certificate", {})
-    probes = _probe_settings(run)
+    probes = _probe_settings(results)
     facts = {
         "model": run.model,
         "weights": "random: nobody trained them" if run.random_weights else "",
@@ -77,11 +76,7 @@ def _stream(run: RunReader, name: str) -> str:
     return f"{name} {stream.layers} layers{steps}, width {stream.width}"
 
 
-def _probe_settings(run: RunReader) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    try:
-        results = load_results(run)
-    except NoProbesError:
+def _probe_settings(results: ProbeResults | None) -> dict[str, Any]:
+    if results is None:
         return {}
     return {"key": results.key, "created": results.created, **asdict(results.settings)}

@@ -1,0 +1,42 @@
+"""What rows of one table should have in common and do not."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from probe_kit.train.results import ProbeResults, ProbeSettings
+from probe_kit.train.targets import TARGETS
+
+_COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
+    "targets": lambda settings: settings.target,
+    "views": lambda settings: ", ".join(settings.views),
+    "relabellings": lambda settings: str(settings.permutations),
+    "relabellings of token views": lambda settings: str(settings.token_permutations),
+    "seeds": lambda settings: str(settings.seed),
+    "categories": lambda settings: ", ".join(settings.categories),
+}
+
+
+def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | None = None) -> list[str]:
+    """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
+
+    views: those that are shown, if not all are; then it does not matter which others there are.
+    """
+    found = []
+    for name, value in _COMPARED.items():
+        if name == "views" and views is not None:
+            continue
+        runs: dict[str, list[str]] = {}
+        for run, one in results.items():
+            runs.setdefault(value(one.settings), []).append(Path(run).name)
+        if len(runs) > 1:
+            parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
+            found.append(f"{name} {' against '.join(parts)}")
+    labels = {one.settings.target for one in results.values()} - {"correct"}
+    notes = [f"Probes were asked for the target {label!r}: {TARGETS[label]}." for label in sorted(labels)]
+    if not found:
+        return notes
+    return [
+        *notes,
+        f"The rows mix probe settings: {'; '.join(found)}. Compare them with care, or fit all runs alike; "
+        "`probe-kit run show RUN` lists what a run has, --probes RUN=KEY chooses.",
+    ]

@@ -1,0 +1,130 @@
+"""What a run holds: `probe-kit run show`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.errors import NoProbesError
+from probe_kit.extract.store.location import Location
+from probe_kit.train.reader import RunReader
+from probe_kit.train.results import FORMAT
+from probe_kit.train.store import is_current, load_results, read_controls, read_headers, settings_of
+from probe_kit.train.unfinished import unfinished_sweeps
+
+
+@dataclass(frozen=True)
+class StoredProbes:
+    """One set of probe results, or what is known of a set written by another version.
+
+    created: when they were fitted. controls: baselines and, last, `twin: NAME`. state: `used` if `retention` reads
+    them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others by now,
+    `other version` if this version cannot read them.
+    """
+
+    key: str
+    state: str
+    created: str
+    target: str = ""
+    views: tuple[str, ...] = ()
+    categories: tuple[str, ...] = ()
+    permutations: int = 0
+    token_permutations: int = 0
+    seed: int = 0
+    controls: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """A run and what is stored with it.
+
+    episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
+    in words. probes: oldest first. unfinished: finished sites of interrupted sweeps, by key.
+    """
+
+    run: str
+    model: str
+    random_weights: bool
+    weights_sha256: str | None
+    suite: str
+    settings_sha256: str
+    categories: tuple[str, ...]
+    episodes: int
+    planned: int
+    failed: int
+    outcomes: Mapping[str, int]
+    streams: Mapping[str, str]
+    probes: tuple[StoredProbes, ...]
+    unfinished: Mapping[str, int]
+
+
+def inventory(run: RunReader) -> Inventory:
+    """List what `run` holds; runs that were not made by probe_kit say less."""
+    episodes = run.episodes
+    return Inventory(
+        run=str(run.location),
+        model=run.model,
+        random_weights=run.random_weights,
+        weights_sha256=run.weights_sha256,
+        suite=run.suite,
+        settings_sha256=run.settings_sha256,
+        categories=tuple(dict.fromkeys(episodes["category"].astype(str))),
+        episodes=len(episodes),
+        planned=getattr(run, "planned", len(episodes)),
+        failed=len(getattr(run, "failed", ())),
+        outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
+        streams={name: _words(run, name) for name in run.streams},
+        probes=tuple(stored_probes(run)),
+        unfinished=unfinished_sweeps(run.location),
+    )
+
+
+def stored_probes(run: RunReader) -> list[StoredProbes]:
+    """Every set of probe results of a run, oldest first."""
+    used = _used(run)
+    found = [_probes(run, key, header, used) for key, header in read_headers(run.location).items()]
+    return sorted(found, key=lambda probes: (probes.created, probes.key))
+
+
+def _used(run: RunReader) -> str | None:
+    try:
+        return load_results(run).key
+    except NoProbesError:
+        return None
+
+
+def _probes(run: RunReader, key: str, header: Mapping[str, Any], used: str | None) -> StoredProbes:
+    created = str(header.get("created", ""))
+    if not _readable(header):
+        return StoredProbes(key, "other version", created)
+    settings = settings_of(header)
+    state = "used" if key == used else "other" if is_current(settings, run) else "other episodes"
+    return StoredProbes(
+        key=key,
+        state=state,
+        created=created,
+        target=settings.target,
+        views=settings.views,
+        categories=settings.categories,
+        permutations=settings.permutations,
+        token_permutations=settings.token_permutations,
+        seed=settings.seed,
+        controls=_controls(run.location, key),
+    )
+
+
+def _readable(header: Mapping[str, Any]) -> bool:
+    settings = header.get("settings")
+    return isinstance(settings, Mapping) and settings.get("format") == FORMAT
+
+
+def _controls(run: Location, key: str) -> tuple[str, ...]:
+    controls = read_controls(run, key)
+    names = dict.fromkeys(score.name for score in controls.baselines)
+    twins = dict.fromkeys(f"twin: {score.twin}" for score in controls.twin)
+    return (*names, *twins)
+
+
+def _words(run: RunReader, name: str) -> str:
+    stream = run.streams[name]
+    steps = f" × {stream.iterations} iterations" if stream.iterations else ""
+    return f"{stream.layers} layers{steps}, width {stream.width}; views {', '.join(run.views(name))}"
