@@ -29,8 +29,9 @@ from torch import Tensor, nn
 from probe_kit.hooks.capture_context import capture
 from probe_kit.hooks.families.lerobot_flow import IMAGES, MASK, STATE, TOKENS
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.roles import Roles, pool, view_names
+from probe_kit.hooks.roles import Roles, pool
 from probe_kit.hooks.sites import Site
+from probe_kit.hooks.views import view_names
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import typer
 import typer.core
+from click import NoSuchOption
 from rich.markup import escape
 
 from probe_kit.commands import demo, doctor
 from probe_kit.console import err
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.extract.commands import extract
+from probe_kit.extract.commands import MOVED, extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
@@ -33,6 +34,10 @@ class Commands(typer.core.TyperGroup):
         """Run the chosen command."""
         try:
             return super().invoke(ctx)
+        except NoSuchOption as error:
+            if error.option_name in MOVED:
+                raise UsageError(f"{error.option_name} is now {MOVED[error.option_name]}") from None
+            raise
         except KeyboardInterrupt:
             err.print("[yellow]interrupted[/]; everything finished so far is kept, the same command continues")
             raise typer.Exit(INTERRUPTED) from None

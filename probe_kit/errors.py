@@ -109,6 +109,10 @@ class EmptyRoleError(CaptureError):
     """A pooled view was asked for, but a row has no token of that role."""
 
 
+class RolesMismatchError(CaptureError):
+    """An adapter's `roles()` names another number of positions than its stream has."""
+
+
 # -- runs --------------------------------------------------------------------------------------------
 
 

@@ -50,8 +50,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self.action_space = spaces.Box(
             np.array([*np.negative(largest), 0.0], np.float32), np.array([*largest, 1.0], np.float32)
         )
-        width, height = spec.picture_size or (spec.camera.width, spec.camera.height)
-        image = spaces.Box(0, 255, (height, width, 3), np.uint8)
+        image = spaces.Box(0, 255, (*spec.picture_shape, 3), np.uint8)
         self.observation_space = spaces.Dict(
             {"pixels": spaces.Dict({"image": image}), "agent_pos": spaces.Box(-10.0, 10.0, (8,), np.float32)}
         )

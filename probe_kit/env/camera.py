@@ -40,22 +40,17 @@ class Camera:
         right /= np.linalg.norm(right)
         return np.array([right, np.cross(right, forward), forward])
 
-    @property
-    def focal_length(self) -> float:
-        """Focal length in pixels, the same in both directions."""
-        return float(self.spec.height / 2 / np.tan(np.radians(self.spec.fov) / 2))
-
     def project(self, points: ArrayLike) -> Array:
         """Pixel places (..., 2) as x, y of world points (..., 3) in front of the camera."""
         x, y, z = np.moveaxis((np.asarray(points) - self.spec.eye) @ self.axes.T, -1, 0)
         centre = np.array([self.spec.width, self.spec.height]) / 2
-        return np.asarray(centre + self.focal_length * np.stack([x, -y], -1) / z[..., None])
+        return np.asarray(centre + self.spec.focal_length * np.stack([x, -y], -1) / z[..., None])
 
     def rays(self) -> Array:
         """Viewing direction (H, W, 3) in the world through the middle of every pixel, not normalised."""
         v, u = np.mgrid[: self.spec.height, : self.spec.width] + 0.5
-        across = (u - self.spec.width / 2) / self.focal_length
-        down = (v - self.spec.height / 2) / self.focal_length
+        across = (u - self.spec.width / 2) / self.spec.focal_length
+        down = (v - self.spec.height / 2) / self.spec.focal_length
         return np.asarray(np.stack([across, -down, np.ones_like(across)], -1) @ self.axes)
 
     def magnified(self, factor: int) -> "Camera":

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import SceneError
 from probe_kit.suite.items import Side
@@ -41,6 +42,11 @@ class CameraSpec:
     fov: float = 42.1004
     near: float = 0.01
     far: float = 10.0
+
+    @property
+    def focal_length(self) -> float:
+        """Focal length in rendered pixels, the same in both directions."""
+        return float(self.height / 2 / np.tan(np.radians(self.fov) / 2))
 
 
 @dataclass(frozen=True)
@@ -164,6 +170,21 @@ class SceneSpec:
     def zone_radius(self) -> float:
         """Radius of the outcome zones in metres: `epsilon`, or the rule when it is None."""
         return self.tile_side / 2 + EPSILON_MARGIN if self.epsilon is None else self.epsilon
+
+    @property
+    def picture_shape(self) -> tuple[int, int]:
+        """Height and width in pixels of what the policy is handed."""
+        width, height = self.picture_size or (self.camera.width, self.camera.height)
+        return height, width
+
+    @property
+    def intrinsics(self) -> NDArray[np.float32]:
+        """(3, 3) pinhole matrix of that picture, in its pixels: x right, y down, (0, 0) the upper left corner."""
+        (height, width), camera = self.picture_shape, self.camera
+        across, down = width / camera.width, height / camera.height
+        focal = camera.focal_length
+        matrix = [[focal * across, 0, width / 2], [0, focal * down, height / 2], [0, 0, 1]]
+        return np.array(matrix, np.float32)
 
     def tile_xy(self, side: Side) -> XY:
         """Centre of the tile on `side`."""

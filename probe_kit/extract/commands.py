@@ -13,7 +13,14 @@ if TYPE_CHECKING:
     from probe_kit.extract.store.location import Location
 
 SCENE = "Scene (recorded with the run)"
-FAMILY = "Model (only some families have these)"
+MOVED = {
+    "--unnorm-key": "-M unnorm_key=KEY",
+    "--prompt": "-M prompt=NAME",
+    "--centre-crop": "-M centre_crop=true",
+    "--tokenizer": "-M tokenizer=DIR",
+    "--bits": "-M bits=8",
+}
+"""Options of 0.2 and what they are called now."""
 
 
 def extract(
@@ -26,27 +33,20 @@ def extract(
     random_weights: Annotated[
         bool, typer.Option("--random-weights", help="Untrained twin of the same architecture, as a control.")
     ] = False,
-    unnorm_key: Annotated[
-        str | None,
-        typer.Option(help="Data set whose units actions get; default bridge_orig.", rich_help_panel=FAMILY),
-    ] = None,
-    prompt: Annotated[
-        str | None,
-        typer.Option(help="openvla, openvla-v01 or a template with {instruction}.", rich_help_panel=FAMILY),
-    ] = None,
-    centre_crop: Annotated[
-        bool,
+    weights_seed: Annotated[
+        int, typer.Option(help="Seed of --random-weights; other seeds are other untrained twins.")
+    ] = 0,
+    model_option: Annotated[
+        list[str] | None,
         typer.Option(
-            "--centre-crop", help="Show 0.9 of the area: fine-tunes with augmentation.", rich_help_panel=FAMILY
+            "--model-option",
+            "-M",
+            metavar="KEY=VALUE",
+            help="An option of this model; `probe-kit models NAME` lists them. May be repeated.",
         ),
-    ] = False,
-    tokenizer: Annotated[
-        str | None,
-        typer.Option(help="Folder of a tokenizer; bytes: for development checkpoints.", rich_help_panel=FAMILY),
     ] = None,
-    bits: Annotated[
-        int | None,
-        typer.Option(help="8 or 4: quantised, not exact (extra quantized, GPU).", rich_help_panel=FAMILY),
+    label: Annotated[
+        str | None, typer.Option(help="What tables call this run; default the model and what sets it apart.")
     ] = None,
     suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
@@ -120,14 +120,8 @@ def extract(
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, prepare
     from probe_kit.extract.store.locate import locate
+    from probe_kit.hooks.options import read_pairs
 
-    options = {
-        "unnorm_key": unnorm_key,
-        "prompt": prompt,
-        "centre_crop": centre_crop or None,
-        "tokenizer": tokenizer,
-        "bits": bits,
-    }
     asked = {
         "max_steps": max_steps,
         "tile_side": tile_side,
@@ -146,7 +140,9 @@ def extract(
         model=model,
         checkpoint=checkpoint,
         random_weights=random_weights,
-        options={name: value for name, value in options.items() if value is not None},
+        weights_seed=weights_seed,
+        options=read_pairs(model_option or []),
+        label=label,
         suite=suite,
         categories=split(categories),
         items=items,

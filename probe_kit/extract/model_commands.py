@@ -1,6 +1,6 @@
 """`probe-kit models`: what `probe-kit extract --model` takes."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -25,16 +25,20 @@ def models(
         return
     for row in rows:
         out.print(f"[bold]{row['model']}[/]  {escape(row['description'])}", highlight=False)
-        for key in ("checkpoint", "streams", "embodiment", "ready", "notes"):
+        for key in ("checkpoint", "streams", "embodiment", "does", "ready", "notes"):
             if row[key]:
                 out.print(f"  [dim]{key:10}[/] {escape(row[key])}", highlight=False, soft_wrap=True)
+        for option in row["options"]:
+            default = f" Default {option['default']}." if option["default"] else ""
+            line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
+            out.print(f"  [dim]option    [/] {escape(line)}", highlight=False, soft_wrap=True)
 
 
-def _model_rows(name: str | None) -> list[dict[str, str]]:
+def _model_rows(name: str | None) -> list[dict[str, Any]]:
     from probe_kit.extract.play.controllers import SCRIPTED
-    from probe_kit.hooks.registry import families, find_family
+    from probe_kit.hooks.registry import find_family, known_families
 
-    chosen = list(families().values())
+    chosen = list(known_families().values())
     if name is not None:
         chosen = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
     rows = [
@@ -46,12 +50,17 @@ def _model_rows(name: str | None) -> list[dict[str, str]]:
             "embodiment": family.embodiment,
             "ready": f"needs {family.missing()}" if family.missing() else "yes",
             "notes": family.notes,
+            "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
+            "options": [
+                {"name": option.name, "kind": option.kind.__name__, "help": option.help, "default": option.default}
+                for option in family.options
+            ],
         }
         for family in chosen
     ]
     scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
     rows += [
-        {"model": model, "description": text, **scripted}
+        {"model": model, "description": text, **scripted, "does": "acts", "options": []}
         for model, text in SCRIPTED.items()
         if name in (None, model)
     ]

@@ -5,7 +5,8 @@ from typing import Any
 
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.play.examples import example_observations, refuse_unfit
+from probe_kit.extract.settings import ExtractSettings, run_label
 from probe_kit.identity import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
@@ -27,6 +28,7 @@ class Prepared:
         suite = self.plan.suite
         return {
             **self.settings.choices(),
+            "label": run_label(self.settings),
             **self.card,
             "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
             "categories": list(suite.categories),
@@ -77,9 +79,11 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
         settings.device,
         settings.dtype,
         settings.random_weights,
+        settings.weights_seed,
         **settings.options,
     )
-    instructions = sorted({item.instruction for item in suite.items})
+    examples = example_observations(settings.scene, suite)
+    refuse_unfit(policy.card, settings.batch, examples[0])
     return PolicyController(
-        policy, settings.model, instructions, settings.execute, settings.captured_calls, settings.tokens == "all"
+        policy, settings.model, examples, settings.execute, settings.captured_calls, settings.tokens == "all"
     )

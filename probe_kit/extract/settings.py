@@ -13,7 +13,7 @@ TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
 FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
-_ELSEWHERE = {"checkpoint", "options", "suite", "categories", "items", "scene"}
+_ELSEWHERE = {"checkpoint", "options", "label", "weights_seed", "suite", "categories", "items", "scene"}
 _MACHINE = {"device", "video", "frames", "batch", "env_workers", "workers", "ray"}
 
 
@@ -23,7 +23,9 @@ class ExtractSettings:
 
     model: a family of `probe-kit models`, or `expert` / `expert-mirrored` (scripted, no activations).
     checkpoint: folder or hub id; None for the family's default.
+    weights_seed: of a random twin's weights.
     options: what only some families have, such as `unnorm_key`; what they lead to is in the policy's card.
+    label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
     tokens: `pooled` stores pooled views only, `all` also every token.
@@ -41,6 +43,7 @@ class ExtractSettings:
     model: str
     checkpoint: str | None = None
     random_weights: bool = False
+    weights_seed: int = 0
     options: Mapping[str, Any] = field(default_factory=dict)
     suite: Path | None = None
     categories: tuple[str, ...] | None = None
@@ -50,6 +53,7 @@ class ExtractSettings:
     tokens: str = "pooled"
     captured_calls: int = 1
     execute: int | None = None
+    label: str | None = None
     codec: str = "zstd"
     device: str = "cpu"
     dtype: str | None = None
@@ -73,6 +77,19 @@ class ExtractSettings:
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
+
+
+def run_label(settings: ExtractSettings) -> str:
+    """What tables call the run: base, fine-tune, random twins and other options of one family differ in it."""
+    if settings.label is not None:
+        return settings.label
+    parts = [settings.model]
+    if settings.checkpoint is not None:
+        parts.append(Path(settings.checkpoint).name)
+    parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
+    if settings.random_weights:
+        parts.append(f"random {settings.weights_seed}" if settings.weights_seed else "random")
+    return " · ".join(parts)
 
 
 def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:

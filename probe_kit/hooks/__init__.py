@@ -1,45 +1,60 @@
-"""Policies and how to listen to them: sites, taps, capture, weights audit, one adapter per family."""
+"""Models and how to listen to them: sites, taps, capture, weights audit, one folder per family."""
 
 from typing import TYPE_CHECKING
 
-from probe_kit.hooks.registry import Family, families, load_policy
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.options import Option
+from probe_kit.hooks.registry import known_families, load_model, load_policy
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capture_context import Tape, capture, edit
-    from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
+    from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading, Rows, Tap
     from probe_kit.hooks.roles import Roles, pool
 
 __all__ = [
+    "Card",
     "Family",
+    "Model",
     "Observation",
+    "Option",
     "Policy",
-    "PolicyCard",
+    "Question",
+    "Reader",
+    "Reading",
     "Roles",
+    "Rows",
     "Site",
     "Stream",
     "Tap",
     "Tape",
     "capture",
     "edit",
-    "families",
+    "known_families",
+    "load_model",
     "load_policy",
     "pool",
 ]
 
-# These import torch, which takes seconds; reading a run needs only sites.
+# These import torch, which takes seconds; reading a run needs only sites. `PolicyCard` is Card's old name.
 __getattr__ = lazy_names(
     __name__,
     {
-        "Observation": "policy",
-        "Policy": "policy",
-        "PolicyCard": "policy",
-        "Tap": "policy",
+        "Model": "model",
+        "Policy": "model",
+        "Question": "model",
+        "Reader": "model",
+        "Reading": "model",
+        "Rows": "model",
+        "Tap": "model",
         "Tape": "capture_context",
         "capture": "capture_context",
         "edit": "capture_context",
         "Roles": "roles",
         "pool": "roles",
+        "PolicyCard": "card:Card",
     },
 )

@@ -1,4 +1,4 @@
-"""Listening and writing: contexts that read chosen sites while a policy acts, or replace them.
+"""Listening and writing: contexts that read chosen sites while a model runs, or replace them.
 
 Both leave the model exactly as found, also when the body raises.
 """
@@ -19,12 +19,12 @@ from probe_kit.errors import (
     SiteFiredTooOftenError,
     SiteNeverFiredError,
 )
-from probe_kit.hooks.policy import Policy, Tap
+from probe_kit.hooks.model import Model, Tap
 from probe_kit.hooks.sites import Site
 
 Reduce = Callable[[Site, Tensor], Tensor]
 Edit = Callable[[Tensor], Tensor]
-_listening: WeakSet[Policy] = WeakSet()
+_listening: WeakSet[Model] = WeakSet()
 
 
 class Tape:
@@ -42,26 +42,26 @@ class Tape:
 
 
 @contextmanager
-def capture(policy: Policy, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[Tape]:
-    """Listen to `sites` while the policy acts once.
+def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[Tape]:
+    """Listen to `sites` while the model runs once.
 
     reduce: what to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as a
     pooled view; it must return a new tensor. None keeps a copy.
     Raises SiteNeverFiredError or SiteFiredTooOftenError if a site fired another number of times than its
-    tap promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this policy
+    tap promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this model
     is being captured already or a tapped module is compiled.
     """
-    if policy in _listening:
-        raise CaptureError("this policy is being captured already; leave the first capture before the next")
+    if model in _listening:
+        raise CaptureError("this model is being captured already; leave the first capture before the next")
     tape = Tape()
 
     def keep(site: Site, activation: Tensor) -> None:
         tape._kept[site] = activation.detach().clone() if reduce is None else reduce(site, activation.detach())
 
     with ExitStack() as stack:
-        _listening.add(policy)
-        stack.callback(_listening.discard, policy)
-        listeners = _attach(policy, sites, keep, stack)
+        _listening.add(model)
+        stack.callback(_listening.discard, model)
+        listeners = _attach(model, sites, keep, stack)
         yield tape
     for listener in listeners:
         listener.check_count()
@@ -70,8 +70,8 @@ def capture(policy: Policy, sites: Iterable[Site], reduce: Reduce | None = None)
 
 
 @contextmanager
-def edit(policy: Policy, edits: Mapping[Site, Edit]) -> Iterator[None]:
-    """Replace activations while the policy acts once, at exactly the place where `capture` reads them.
+def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
+    """Replace activations while the model runs once, at exactly the place where `capture` reads them.
 
     edits: per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype.
     A capture entered inside this context reads the replacements.
@@ -88,20 +88,20 @@ def edit(policy: Policy, edits: Mapping[Site, Edit]) -> Iterator[None]:
         activation.copy_(new)
 
     with ExitStack() as stack:
-        listeners = _attach(policy, edits, write, stack)
+        listeners = _attach(model, edits, write, stack)
         yield
     for listener in listeners:
         listener.check_count()
 
 
 def _attach(
-    policy: Policy, sites: Iterable[Site], handle: Callable[[Site, Tensor], None], stack: ExitStack
+    model: Model, sites: Iterable[Site], handle: Callable[[Site, Tensor], None], stack: ExitStack
 ) -> "list[_Listener]":
     """One listener per module; sites that differ only in the iteration share it."""
     groups: dict[Site, list[Site]] = defaultdict(list)
     for site in dict.fromkeys(sites):
         groups[Site(site.stream, site.layer, site.quantity)].append(site)
-    listeners = [_Listener(policy.tap(group[0]), group, handle) for group in groups.values()]
+    listeners = [_Listener(model.tap(group[0]), group, handle) for group in groups.values()]
     for listener in listeners:
         stack.callback(listener.attach().remove)
     return listeners
@@ -123,26 +123,37 @@ class _Listener:
         if isinstance(self.tap.module, torch._dynamo.OptimizedModule):
             raise CaptureError(
                 f"{self.first} lies in a module compiled by torch.compile, which drops hooks; "
-                "load the policy uncompiled to capture it"
+                "load the model uncompiled to capture it"
             )
-        if self.tap.end == "input":
+        if self.tap.end == "output":
+            return self.tap.module.register_forward_hook(lambda _, __, output: self._hear(output))
+        if self.tap.argument is None:
             return self.tap.module.register_forward_pre_hook(lambda _, inputs: self._hear(inputs))
-        return self.tap.module.register_forward_hook(lambda _, __, output: self._hear(output))
+        return self.tap.module.register_forward_pre_hook(self._hear_keyword, with_kwargs=True)
+
+    def _hear_keyword(self, _module: torch.nn.Module, _inputs: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+        if self.tap.argument not in keywords:
+            raise CaptureError(
+                f"{self.first}: the module is called without the keyword {self.tap.argument!r} the tap names; it "
+                f"gets {', '.join(keywords) or 'none'}. Correct the tap"
+            )
+        self._hear(keywords[self.tap.argument])
 
     def _hear(self, passing: Any) -> None:
-        site = self.at_fire.get(self.count)
+        site = self.at_fire.get(self.count - self.tap.first)
         self.count += 1
         if site is not None:
             activation = passing[0] if isinstance(passing, tuple) else passing
-            self.handle(site, activation[:, self.tap.tokens])
+            self.handle(site, self.tap.select(activation))
 
     def check_count(self) -> None:
-        if self.count == self.tap.fires:
+        expected = self.tap.first + self.tap.fires
+        if self.count == expected:
             return
-        wrong = SiteNeverFiredError if self.count < self.tap.fires else SiteFiredTooOftenError
+        wrong = SiteNeverFiredError if self.count < expected else SiteFiredTooOftenError
         raise wrong(
-            f"{self.first} fired {self.count} times in one inference; expected {self.tap.fires}. The model does "
-            "not call this module the way the adapter declares: correct the tap, or act once per context"
+            f"{self.first} fired {self.count} times in one inference; expected {expected}. The model does "
+            "not call this module the way the adapter declares: correct the tap, or run the model once per context"
         )
 
 

@@ -1,9 +1,14 @@
 """Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first."""
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError
 
+# What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
+_READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
+_WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
 _PATTERNS = ["*.json", "*.safetensors", "*.model", "*.txt", "*.jinja"]
 
 
@@ -28,3 +33,20 @@ def checkpoint_folder(checkpoint: str) -> Path:
             f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
             "models, `hf auth login`; or pass a local folder as --checkpoint"
         ) from error
+
+
+def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
+    """The files of `folder` besides weights and documents, by name: all that a loader may read there.
+
+    prefix: put before every name, to tell folders apart.
+    """
+    return {
+        f"{prefix}{path.name}": path
+        for path in sorted(folder.iterdir())
+        if path.suffix in _READ and path.is_file() and not path.name.startswith(_WEIGHTS)
+    }
+
+
+def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
+    """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
+    return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}

@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import EmptyRoleError, UnknownSiteError
-
-PADDING = "padding"
+from probe_kit.errors import EmptyRoleError, RolesMismatchError, UnknownSiteError
+from probe_kit.hooks.views import PADDING, plays
 
 
 class Span(NamedTuple):
@@ -27,7 +26,8 @@ class Span(NamedTuple):
 class Roles:
     """The roles of one sequence: spans that cover every position once, in order.
 
-    Roles are `image.<camera>`, `language`, `state`, `action`, `special` and `padding`.
+    Roles are `image.<camera>`, `language`, `state`, `action`, `special` and `padding`; `image` names the positions
+    of all cameras, so that poolings compare across families.
     """
 
     spans: tuple[Span, ...]
@@ -54,10 +54,10 @@ class Roles:
         return self.spans[-1].stop if self.spans else 0
 
     def mask(self, role: str) -> NDArray[np.bool_]:
-        """(T,) bool: positions of one role."""
+        """(T,) bool: positions of one role, or of all `<role>.<…>`."""
         mask = np.zeros(len(self), dtype=bool)
         for span in self.spans:
-            if span.role == role:
+            if plays(span.role, role):
                 mask[span.start : span.stop] = True
         return mask
 
@@ -67,21 +67,17 @@ class Roles:
         return ~self.mask(PADDING)
 
 
-def view_names(roles: Sequence[str]) -> tuple[str, ...]:
-    """The pooled views of a stream whose tokens play `roles`: mean, last, and one mean per role."""
-    return ("mean", "last", *(f"mean:{role}" for role in roles if role not in (PADDING, "special")))
-
-
 def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
     """Pooled views of one sequence, reduced in float32 on the device of `tokens`.
 
     tokens: (..., T, D), any float dtype. views: as in `view_names`.
     Returns (..., V, D) float32. Padding enters no view.
-    Raises EmptyRoleError for a view without a token, UnknownSiteError for an unknown view.
+    Raises EmptyRoleError for a view without a token, RolesMismatchError for roles of another length,
+    UnknownSiteError for an unknown view.
     """
     if tokens.shape[-2] != len(roles):
-        raise EmptyRoleError(
-            f"the stream has {tokens.shape[-2]} tokens but the policy names roles for {len(roles)}; "
+        raise RolesMismatchError(
+            f"the stream has {tokens.shape[-2]} tokens but the model names roles for {len(roles)}; "
             "the adapter's roles() does not describe this model's packing"
         )
     return _matrix(roles, tuple(views), tokens.device) @ tokens.float()

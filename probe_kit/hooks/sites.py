@@ -1,26 +1,41 @@
-"""Sites: the names under which activations are captured, stored, probed and plotted."""
+"""Sites: the names under which activations are captured, stored, probed and plotted. Imports no torch."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
-from probe_kit.errors import UnknownSiteError
+from probe_kit.errors import UnknownSiteError, UsageError
 
-_PATTERN = re.compile(r"(?P<stream>[a-z_]+)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?")
+Part = Literal["backbone", "action", "vision", "bridge"]
+PARTS: tuple[Part, ...] = get_args(Part)
+QUANTITIES = ("residual", "attention", "mlp", "final_norm")
+"""What the streams of today's families have; a family may declare others."""
 
-
-ACTION_STREAMS = ("expert", "action")
-"""Where the action is made: the expert or, in a policy without one, the positions that choose action tokens."""
+_PATTERN = re.compile(
+    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
+)
+# Streams of runs and adapters from before streams declared their part.
+_KNOWN_PARTS: dict[str, Part] = {
+    "backbone": "backbone",
+    "expert": "action",
+    "action": "action",
+    "answer": "action",
+    "vision": "vision",
+    "vision_fused": "vision",
+}
+_LABELS = {"expert": "action expert", "action": "action tokens", "answer": "answer tokens"}
 
 
 @dataclass(frozen=True, order=True)
 class Site:
     """One named tensor: `backbone.07.residual`, `expert.03.residual@4`.
 
-    stream: `backbone` (VLM), `expert` (action part) or, in a policy without one, `action`; where a family offers
-    it, `vision`.
+    stream: a stream of the model, such as `backbone` (VLM) or `expert` (action part); see `Stream.part`.
     layer, quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters
-    the final norm. `attention` and `mlp` are what block `layer` adds to it. `final_norm` is its normed end.
-    iteration: flow-matching step, counted from 0 (pure noise); for `action`, the action token; the camera, for
+    the final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm, gate or
+    scale, where the family has one. `final_norm` is its normed end. A family may declare further quantities.
+    iteration: flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
     `vision` with several of them; None where the stream runs once.
     """
 
@@ -50,31 +65,59 @@ class Site:
 
 @dataclass(frozen=True)
 class Stream:
-    """The shape of one residual stream.
+    """The shape and meaning of one residual stream.
 
     layers: number of residual sites, one more than the number of blocks.
     width: features per token.
     iterations: flow-matching steps or action tokens per inference, or None where the stream runs once.
+    part: of the model it belongs to: `backbone` (VLM), `action` (where the action is made: an expert, or the
+    positions that choose action tokens), `vision`, or `bridge` between them.
+    label: what people read; default the name in plain words.
+    quantities: what can be captured of it; `residual` always.
+    probed: whether peaks, retention and default probes use it; False for the unconditional half of guidance.
+    Raises UsageError for an unknown part, or none where the name does not tell it.
     """
 
     name: str
     layers: int
     width: int
     iterations: int | None = None
+    part: Part | None = None
+    label: str = ""
+    quantities: tuple[str, ...] = QUANTITIES
+    probed: bool = True
+
+    def __post_init__(self) -> None:
+        part = self.part or _KNOWN_PARTS.get(self.name)
+        if part not in PARTS:
+            raise UsageError(
+                f"stream {self.name!r} declares part {self.part!r}; expected one of {', '.join(PARTS)}. Say it in "
+                f"the adapter: Stream({self.name!r}, …, part='action')"
+            )
+        object.__setattr__(self, "part", part)
+        object.__setattr__(self, "label", self.label or _LABELS.get(self.name, self.name.replace("_", " ")))
 
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity, ordered by iteration, then layer.
 
-        `attention` and `mlp` exist per block, `final_norm` once, behind the last block.
-        Raises UnknownSiteError for another quantity.
+        `final_norm` exists once, behind the last block; `residual` per layer; every other quantity per block.
+        Raises UnknownSiteError for a quantity that this stream does not have.
         """
-        layers = {
-            "residual": range(self.layers),
-            "attention": range(self.layers - 1),
-            "mlp": range(self.layers - 1),
-            "final_norm": range(self.layers - 1, self.layers),
-        }
-        if quantity not in layers:
-            raise UnknownSiteError(f"no quantity {quantity!r}; expected one of {', '.join(layers)}")
+        if quantity not in self.quantities:
+            raise UnknownSiteError(
+                f"the stream {self.name} has no quantity {quantity!r}; it has {', '.join(self.quantities)}"
+            )
+        once = {"residual": range(self.layers), "final_norm": range(self.layers - 1, self.layers)}
+        layers = once.get(quantity, range(self.layers - 1))
         steps: list[int | None] = [None] if self.iterations is None else list(range(self.iterations))
-        return [Site(self.name, layer, quantity, step) for step in steps for layer in layers[quantity]]
+        return [Site(self.name, layer, quantity, step) for step in steps for layer in layers]
+
+
+def part_of(stream: str) -> Part:
+    """The part of a stream known by name only, as in results of 0.2; `backbone` if the name tells nothing."""
+    return _KNOWN_PARTS.get(stream, "backbone")
+
+
+def first_of(part: Part, streams: Iterable[Stream]) -> str | None:
+    """Name of the first probed stream of `part`, the one peaks and retention are about; None if there is none."""
+    return next((stream.name for stream in streams if stream.part == part and stream.probed), None)

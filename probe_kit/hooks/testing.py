@@ -21,9 +21,11 @@ import torch
 
 from probe_kit.errors import CaptureError, ObservationError, SiteNeverFiredError, UnknownSiteError
 from probe_kit.hooks.capture_context import capture, edit
-from probe_kit.hooks.policy import Observation, Policy
-from probe_kit.hooks.roles import PADDING, Roles, pool, view_names
+from probe_kit.hooks.model import Policy
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.roles import Roles, pool
 from probe_kit.hooks.sites import Site
+from probe_kit.hooks.views import PADDING, view_names
 
 
 def example_observations(instructions: Sequence[str]) -> list[Observation]:

@@ -56,6 +56,7 @@ def compare(
 ) -> tuple[Comparison, ...]:
     """Compare every recorded output but the inputs (`in_…`).
 
+    tolerance: of an output whose values are below one; larger values may differ by as much of the largest one.
     produced: how to make each output we can make. valid: per output a mask over its leading axes behind the
     first, where only some positions mean anything.
     """
@@ -73,9 +74,17 @@ def compare(
             note = f"shape {ours.shape}, recorded {theirs.shape}"
             comparisons.append(Comparison(name, "over", None, tolerance, note))
             continue
-        error = _largest_error(ours, theirs, valid.get(name))
-        comparisons.append(Comparison(name, "ok" if error <= tolerance else "over", error, tolerance))
+        error, allowed = _largest_error(ours, theirs, valid.get(name)), _allowed(theirs, tolerance)
+        comparisons.append(Comparison(name, "ok" if error <= allowed else "over", error, allowed))
     return tuple(comparisons)
+
+
+def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
+    """Absolute plus relative to the largest recorded value; ids, masks and counts must be equal."""
+    if not np.issubdtype(theirs.dtype, np.floating):
+        return 0.0
+    size = np.abs(theirs.astype(np.float64))
+    return tolerance * (1 + float(size[np.isfinite(size)].max(initial=0.0)))
 
 
 def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.bool_] | None) -> float:

@@ -6,7 +6,7 @@ from math import isnan
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks.sites import ACTION_STREAMS
+from probe_kit.hooks.sites import first_of
 from probe_kit.identity import derive_seed
 from probe_kit.retention.estimates import Estimates, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
@@ -86,7 +86,7 @@ def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
         "random_weights": run.random_weights,
         "weights_sha256": run.weights_sha256,
         "suite": run.suite,
-        "action_stream": next((name for name in ACTION_STREAMS if name in run.streams), None),
+        "action_stream": first_of("action", run.streams.values()),
         "run_settings": run.settings_sha256,
         "probe_settings": None if results is None else results.key,
     }

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hooks.sites import ACTION_STREAMS, Site
+from probe_kit.hooks.sites import Site, part_of
 from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import family_p
 from probe_kit.train.scores import chance_level, correctness
@@ -16,6 +16,7 @@ class Curve:
     """All sites of one category in one view, on the same episodes (E), folds (F) and relabellings (P).
 
     sites: S of them. labels: (E,) bool. episodes, items, groups: (E,) identities. fold_of: (E,) outer fold.
+    parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
     decisions: (S, E) out-of-fold. strengths: (S, F) chosen C. null: (S, P) accuracies under relabelling.
     """
 
@@ -28,6 +29,11 @@ class Curve:
     decisions: NDArray[np.float64]
     strengths: NDArray[np.float64]
     null: NDArray[np.float64]
+    parts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            object.__setattr__(self, "parts", tuple(part_of(site.stream) for site in self.sites))
 
     @property
     def correct(self) -> NDArray[np.bool_]:
@@ -51,7 +57,15 @@ class Curve:
     @property
     def action_stream(self) -> str | None:
         """The stream the action is made in, None if none was probed."""
-        return next((name for name in ACTION_STREAMS if self.stream(name).size), None)
+        return self._first("action")
+
+    @property
+    def backbone_stream(self) -> str | None:
+        """The stream of the vision-language model, None if none was probed."""
+        return self._first("backbone")
+
+    def _first(self, part: str) -> str | None:
+        return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
 
     def best(self, stream: str) -> int:
         """Position of the most accurate site of a stream, the first one on ties."""

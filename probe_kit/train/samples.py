@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.sites import Site
+from probe_kit.hooks.views import resolve_view
 from probe_kit.train.arrays import Array, to_device
 from probe_kit.train.reader import RunReader, Tokens
 from probe_kit.train.rows import ChosenRows, Features
@@ -77,11 +78,13 @@ class Samples:
 
 
 def sites_of(run: RunReader, view: str) -> list[Site]:
-    """Sites that have `view`, over all streams; a role's tokens are where its mean is. Raises UnknownSiteError."""
+    """Sites of probed streams that have `view`; a role's tokens are where its mean is. Raises UnknownSiteError."""
+    probed = [name for name, stream in run.streams.items() if stream.probed]
     if view == TOKENS:
-        return [site for stream in run.streams for site in run.sites(stream)]
+        return [site for stream in probed for site in run.sites(stream)]
     pooled = f"mean:{role_of(view)}" if is_token_view(view) else view
-    sites = [site for stream in run.streams if pooled in run.views(stream) for site in run.sites(stream)]
+    having = [stream for stream in probed if resolve_view(pooled, run.views(stream)) in run.views(stream)]
+    sites = [site for stream in having for site in run.sites(stream)]
     if not sites:
         known = sorted({name for stream in run.streams for name in run.views(stream)})
         raise UnknownSiteError(

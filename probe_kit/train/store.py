@@ -132,7 +132,7 @@ def _now() -> str:
 def _pack(curves: Mapping[tuple[str, str], Curve]) -> dict[str, Any]:
     """Arrays by `category/view/member`; views hold no slash."""
     return {
-        f"{category}/{view}/{name}": np.array([str(site) for site in value]) if name == "sites" else value
+        f"{category}/{view}/{name}": np.array([str(own) for own in value]) if isinstance(value, tuple) else value
         for (category, view), curve in curves.items()
         for name, value in vars(curve).items()
     }
@@ -144,7 +144,13 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
         category, view, member = name.rsplit("/", 2)
         members.setdefault((category, view), {})[member] = value
     return {
-        pair: Curve(**{**found, "sites": tuple(Site.parse(str(name)) for name in found["sites"])})
+        pair: Curve(
+            **{
+                **found,
+                "sites": tuple(Site.parse(str(name)) for name in found["sites"]),
+                "parts": tuple(str(part) for part in found.get("parts", ())),
+            }
+        )
         for pair, found in members.items()
     }
 

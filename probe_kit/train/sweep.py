@@ -172,7 +172,7 @@ def _settings(
 def _fit(sweep: _Sweep) -> ProbeResults:
     probes = _probe_all(sweep)
     curves = {
-        (category, view): _curve(problem, category, view, probes)
+        (category, view): _curve(sweep.run, problem, category, view, probes)
         for category, problem in sweep.problems.items()
         for view in sweep.settings.views
     }
@@ -197,7 +197,9 @@ def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     return {key: probes[key] for key in keys}
 
 
-def _curve(problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]) -> Curve:
+def _curve(
+    run: RunReader, problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]
+) -> Curve:
     found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
     fold_of = np.empty(problem.labels.size, dtype=np.int64)
     for number, fold in enumerate(problem.folds):
@@ -212,4 +214,5 @@ def _curve(problem: CategoryProblem, category: str, view: str, probes: Mapping[K
         decisions=np.stack([probe.decisions for probe in found.values()]),
         strengths=np.stack([probe.strengths for probe in found.values()]),
         null=np.stack([probe.null for probe in found.values()]),
+        parts=tuple(str(run.streams[site.stream].part) for site in found),
     )

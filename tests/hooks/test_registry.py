@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 
 from probe_kit.errors import CheckpointError, UnknownModelError, UsageError
-from probe_kit.hooks import Family, families, load_policy, registry
+from probe_kit.hooks import Family, known_families, load_policy, registry
 
 
 def test_an_unknown_model_is_refused_with_the_nearest_name() -> None:
@@ -27,22 +27,22 @@ def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pyte
     mine = Family("mine", "a family of my own", None, "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny")
     entry = SimpleNamespace(load=lambda: mine)
     monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == "probe_kit.policies" else [])
-    assert families()["mine"] is mine
+    assert known_families()["mine"] is mine
     assert load_policy("mine", random_weights=True).card.random_weights
 
 
 def test_a_third_party_cannot_replace_an_embedded_family(monkeypatch: pytest.MonkeyPatch) -> None:
     impostor = Family("pi0", "not pi0", None, "nowhere:nothing")
     monkeypatch.setattr(registry, "entry_points", lambda **_: [SimpleNamespace(load=lambda: impostor)])
-    assert families()["pi0"] is not impostor
+    assert known_families()["pi0"] is not impostor
 
 
 def test_a_family_that_cannot_be_verified_says_so() -> None:
     with pytest.raises(UsageError, match="pi0-tiny has no full-size"):
-        families()["pi0-tiny"].function("full_size")
+        known_families()["pi0-tiny"].function("full_size")
 
 
 def test_what_must_be_downloaded_is_said_before_it_is_tried(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HOME", str(tmp_path))
-    assert families()["pi0-tiny"].missing() == ""
-    assert "lerobot/pi0_base" in families()["pi0"].missing()
+    assert known_families()["pi0-tiny"].missing() == ""
+    assert "lerobot/pi0_base" in known_families()["pi0"].missing()

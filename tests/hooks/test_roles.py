@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from probe_kit.errors import EmptyRoleError, UnknownSiteError
-from probe_kit.hooks.roles import Roles, Span, pool, view_names
+from probe_kit.errors import EmptyRoleError, RolesMismatchError, UnknownSiteError
+from probe_kit.hooks.roles import Roles, Span, pool
+from probe_kit.hooks.views import view_names
 
 ROLES = Roles.from_labels(["image.base", "image.base", "language", "language", "padding"])
 
@@ -41,7 +42,7 @@ def test_a_view_without_a_token_is_an_error_and_not_a_zero() -> None:
 
 
 def test_roles_of_another_length_are_an_error() -> None:
-    with pytest.raises(EmptyRoleError, match="6 tokens"):
+    with pytest.raises(RolesMismatchError, match="6 tokens"):
         pool(torch.zeros(6, 2), ROLES, ["mean"])
 
 

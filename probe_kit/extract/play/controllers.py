@@ -1,21 +1,23 @@
 """Who decides: a captured policy, or the scripted expert that knows the answer."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CaptureChangedActionError, UsageError
+from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract.store.layout import StoredStream
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.views import view_names
 from probe_kit.identity import derive_seed
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from probe_kit.extract.play.staging import EpisodeBuffers
-    from probe_kit.hooks import Observation, Policy, Roles, Site, Tape
+    from probe_kit.hooks import Policy, Roles, Site, Tape
 
 SCRIPTED = {
     "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
@@ -33,9 +35,7 @@ class Turn:
     buffers: where the activations of the first calls go.
     """
 
-    image: NDArray[np.uint8]
-    state: NDArray[np.float32]
-    instruction: str
+    seen: Observation
     seed: int
     call: int
     buffers: "EpisodeBuffers"
@@ -84,15 +84,19 @@ class PolicyController:
     """Infers, executes the head of the chunk, and captures the first inferences of every episode."""
 
     def __init__(
-        self, policy: "Policy", name: str, instructions: Sequence[str], execute: int | None, captured_calls: int,
+        self,
+        policy: "Policy",
+        name: str,
+        examples: Sequence[Observation],
+        execute: int | None,
+        captured_calls: int,
         with_tokens: bool,
-    ) -> None:  # fmt: skip
-        if policy.card.chunk < 1:
-            raise UsageError(f"{name} does not act, so it has no episodes; choose a policy of `probe-kit models`")
+    ) -> None:
+        """examples: an observation per instruction of the suite, as the scene will show them."""
         self.policy = policy
         self.execute = execute or policy.card.execute
         self.captured_calls, self.with_tokens = captured_calls, with_tokens
-        self.streams = _stored_streams(policy, instructions)
+        self.streams = _stored_streams(policy, examples)
         card = policy.card
         self.script: str | None = None
         self.threads = 1 if card.parameters < SMALL else None
@@ -110,9 +114,7 @@ class PolicyController:
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """The first `execute` actions of a fresh chunk per turn, from one call of the policy."""
-        from probe_kit.hooks import Observation
-
-        observations = [Observation(turn.image, turn.state, turn.instruction) for turn in turns]
+        observations = [turn.seen for turn in turns]
         seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if captured:
@@ -124,13 +126,13 @@ class PolicyController:
     def certificate(self) -> dict[str, Any]:
         """The policy's card, fire counts of the last capture, and the check of `_prove_harmless`."""
         return {
-            "policy": asdict(self.policy.card),
+            "policy": self.policy.card.to_json(),
             "fires_per_inference": self._fires,
             "hooks_on_equals_hooks_off": True,
         }
 
     def _act_and_capture(
-        self, observations: "Sequence[Observation]", seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
+        self, observations: Sequence[Observation], seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
     ) -> NDArray[np.float32]:
         from probe_kit.hooks import capture
 
@@ -150,7 +152,7 @@ class PolicyController:
         return chunks
 
     def _prove_harmless(
-        self, observations: "Sequence[Observation]", seeds: Sequence[int], chunks: NDArray[np.float32]
+        self, observations: Sequence[Observation], seeds: Sequence[int], chunks: NDArray[np.float32]
     ) -> None:
         """Once per process: the same inference without hooks gives the same actions, bit for bit."""
         plain = self.policy.act(observations, seeds)
@@ -185,21 +187,10 @@ def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[s
     return torch.stack([pool(tokens, own, views) for tokens, own in zip(activation, roles, strict=True)])
 
 
-def _stored_streams(policy: "Policy", instructions: Sequence[str]) -> list[StoredStream]:
-    """The streams at the longest sequence any of the instructions makes."""
-    from probe_kit.hooks import Observation
-    from probe_kit.hooks.roles import view_names
-
-    blank = np.zeros((8, 8, 3), np.uint8)
-    roles = policy.roles([Observation(blank, np.zeros(8, np.float32), text) for text in instructions])
+def _stored_streams(policy: "Policy", examples: Sequence[Observation]) -> list[StoredStream]:
+    """The streams at the longest sequence any of the examples makes."""
+    roles = policy.roles(examples)
     return [
-        StoredStream(
-            name=name,
-            layers=stream.layers,
-            width=stream.width,
-            iterations=stream.iterations,
-            tokens=max(len(row) for row in roles[name]),
-            views=view_names(policy.role_names[name]),
-        )
+        StoredStream.of(stream, max(len(row) for row in roles[name]), view_names(policy.role_names[name]))
         for name, stream in policy.streams.items()
     ]

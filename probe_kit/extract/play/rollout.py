@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.play.controllers import Controller, Turn
-from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Seen
+from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
+from probe_kit.hooks.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Seat:
     def __init__(self, stage: AskableStage) -> None:
         self.stage = stage
         self.planned: PlannedEpisode | None = None
-        self.seen: Seen | None = None
+        self.seen: Observation | None = None
         self.calls = 0
 
     def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
@@ -60,8 +61,7 @@ class Seat:
         """The inference that is due."""
         assert self.planned is not None
         assert self.seen is not None
-        item, seed = self.planned.episode.item, self.planned.policy_seed
-        return Turn(self.seen.image, self.seen.state, item.instruction, seed, self.calls, self.buffers)
+        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers)
 
     def go_on(self, actions: NDArray[np.float32]) -> None:
         """Carry out actions."""
@@ -120,7 +120,7 @@ class Play:
                 except EPISODE_ERRORS as error:
                     yield self._give_up(seat, error)
                     continue
-                if isinstance(answer, Seen):
+                if isinstance(answer, Observation):
                     seat.seen = answer
                 else:
                     yield Rollout(seat.planned, answer.outcome, seat.buffers, answer.frames, answer.ends)

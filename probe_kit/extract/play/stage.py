@@ -20,6 +20,7 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.store.thumbnails import Ends, shrink
+from probe_kit.hooks.observation import Observation
 
 # What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
 EPISODE_ERRORS = (
@@ -34,17 +35,6 @@ EPISODE_ERRORS = (
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a policy may look at before its next inference.
-
-    image: (H, W, 3) uint8. state: (8,) float32, as in `Act2AnswerEnv`.
-    """
-
-    image: NDArray[np.uint8]
-    state: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class Ending:
     """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails."""
 
@@ -53,7 +43,7 @@ class Ending:
     ends: Ends | None = None
 
 
-Answer = Seen | Ending
+Answer = Observation | Ending
 
 
 class Stage:
@@ -65,7 +55,7 @@ class Stage:
 
     def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
         self.script, self._keep_ends = script, keep_ends
-        self._env = Act2AnswerEnv(scene)
+        self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
         """Set up an episode. Errors carry a note naming it."""
@@ -110,9 +100,9 @@ class Stage:
     def _ends(self) -> Ends | None:
         return None if self._first is None else (self._first, shrink(self._env.render()))
 
-    def _see(self) -> Seen:
-        seen = self._env.observe()
-        return Seen(seen["pixels"]["image"], seen["agent_pos"])
+    def _see(self) -> Observation:
+        seen, instruction = self._env.observe(), self._planned.episode.item.instruction
+        return Observation(seen["pixels"]["image"], seen["agent_pos"], instruction, self._intrinsics)
 
     def _shoot(self) -> None:
         if self._film:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.sites import QUANTITIES, Part, Site, Stream
 
 SCHEMA_VERSION = 1
 TOKEN_BLOCK = 128
@@ -42,20 +42,39 @@ class StoredStream:
     iterations: int | None
     tokens: int
     views: tuple[str, ...]
+    part: Part | None = None
+    label: str = ""
+    quantities: tuple[str, ...] = QUANTITIES
+    probed: bool = True
+
+    @classmethod
+    def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":
+        """A declared stream, stored."""
+        return cls(**{**asdict(stream), "tokens": tokens, "views": views})
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":
-        """Read back what `to_json` wrote."""
-        return cls(**{**values, "views": tuple(values["views"])})
+        """Read back what `to_json` wrote, in this version or before streams declared their part."""
+        lists = {name: tuple(values[name]) for name in ("views", "quantities") if name in values}
+        return cls(**{**values, **lists})
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `run.json`."""
-        return {**asdict(self), "views": list(self.views)}
+        return {**asdict(self), "views": list(self.views), "quantities": list(self.quantities)}
 
     @property
     def stream(self) -> Stream:
         """The stream without its storage."""
-        return Stream(self.name, self.layers, self.width, self.iterations)
+        return Stream(
+            self.name,
+            self.layers,
+            self.width,
+            self.iterations,
+            self.part,
+            self.label,
+            self.quantities,
+            self.probed,
+        )
 
     @property
     def lead(self) -> tuple[int, ...]:

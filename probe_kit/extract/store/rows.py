@@ -11,9 +11,9 @@ from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.arrays import decode_bfloat16
+from probe_kit.hooks.views import PADDING, plays
 
 Spans = Sequence[tuple[str, int, int]]
-PADDING = "padding"
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[
     mask = np.zeros((len(spans), tokens), bool)
     for row, episode in enumerate(spans):
         for name, start, stop in episode:
-            mask[row, start:stop] = name != PADDING if role is None else name == role
+            mask[row, start:stop] = name != PADDING if role is None else plays(name, role)
     return mask
 
 

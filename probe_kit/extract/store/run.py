@@ -27,6 +27,7 @@ from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.views import resolve_view
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -188,6 +189,7 @@ class Run:
         Raises UnknownSiteError, or RunDamagedError if stored bytes are missing or fail their checksum.
         """
         stored = self._check(site)
+        view = resolve_view(view, stored.views)
         if view not in stored.views:
             raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
         if self._columns is None:

@@ -11,8 +11,8 @@ from probe_kit.extract.store.arrays import codecs
 from probe_kit.extract.store.layout import COLUMNS
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.rows import PADDING
 from probe_kit.extract.store.run import Run
+from probe_kit.hooks.views import PADDING
 
 EPISODES_PER_CHUNK = 1024
 # What is held in memory at a time; all rows are read once more for every further slab.

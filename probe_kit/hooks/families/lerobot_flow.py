@@ -5,7 +5,8 @@ Never lerobot's own `from_pretrained`: it returns partly or fully random models 
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -16,13 +17,16 @@ from lerobot.configs.policies import PreTrainedConfig
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError
-from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.families.lerobot_normaliser import Normaliser, read_normaliser
 from probe_kit.hooks.families.lerobot_window import PictureWindow, read_window
-from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
-from probe_kit.hooks.roles import PADDING
+from probe_kit.hooks.model import Policy, Tap
+from probe_kit.hooks.observation import Observation, checked_picture
+from probe_kit.hooks.roles import Roles
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.views import PADDING
 from probe_kit.hooks.weights import Weights, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 
@@ -56,32 +60,60 @@ class Stack:
         return Tap(getattr(block, self.entry), fires)
 
 
-def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int, cameras: int) -> dict[str, Stack]:
-    """The three stacks of a flow policy; the vision tower runs once per camera, masked ones included."""
+def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:
+    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotFlow`."""
     return {
         "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
         "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
-        "vision": Stack(
-            vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, cameras, "layer_norm1"
-        ),
+        "vision": Stack(vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, 1, "layer_norm1"),
     }
 
 
 class LerobotFlow(Policy):
-    """A lerobot flow-matching policy behind the Policy contract; subclasses say how it packs its sequence."""
+    """A lerobot flow-matching policy behind the Policy contract; subclasses say how it packs its sequence.
+
+    cameras: those that a picture can be given for. shown: those that get one, in the configuration's order.
+    """
 
     family: ClassVar[str]
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]]
     """Parameters that inference never reads and a file may lack."""
+    other_roles: ClassVar[tuple[str, ...]]
+    """What positions of the prefix play besides pictures and padding."""
+    suffix_roles: ClassVar[tuple[str, ...]]
 
     def __init__(self, network: Any, folder: Path) -> None:
         self.network, self.folder, self.config = network, folder, network.config
         self.stacks = self._stacks()
-        self._vision = self.stacks.pop("vision")
-        self.streams = {name: _stream(name, stack) for name, stack in self.stacks.items()}
+        self.streams = {name: _stream(name, self.stacks[name]) for name in ("backbone", "expert")}
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
+        self._show(self.cameras[:1])
+
+    def showing(self, cameras: Sequence[str]) -> Self:
+        """The same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
+
+        Raises ObservationError unless they are the first ones of the configuration, in its order: lerobot moves
+        present cameras to the front.
+        """
+        if tuple(cameras) != self.cameras[: len(cameras)] or not cameras:
+            raise ObservationError(
+                f"cameras {list(cameras)} given; this checkpoint expects {list(self.cameras)}, in order"
+            )
+        other = copy(self)
+        other.stacks = dict(self.stacks)
+        other._show(tuple(cameras))
+        needs = frozenset(f"camera.{name}" for name in cameras[1:])
+        other.card = replace(self.card, needs=needs, notes=other._notes())
+        return other
+
+    def _show(self, cameras: tuple[str, ...]) -> None:
+        self.shown = cameras
+        self.stacks["vision"] = replace(self.stacks["vision"], iterations=len(cameras) + self.masked_cameras)
+        self.further_streams = {"vision": _stream("vision", self.stacks["vision"])}
+        images = tuple(f"image.{camera}" for camera in cameras)
+        self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}
 
     # -- what a family decides -------------------------------------------------------------------------
 
@@ -106,8 +138,21 @@ class LerobotFlow(Policy):
 
     @property
     @abstractmethod
+    def masked_cameras(self) -> int:
+        """Cameras without a picture that take positions all the same, masked, behind the shown ones."""
+
+    @property
+    @abstractmethod
     def tokens_per_camera(self) -> int:
-        """Positions one picture takes in the prefix."""
+        """Patches of one picture in the prefix."""
+
+    @abstractmethod
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """The role of every prefix position of one row, from those of its language positions."""
+
+    @abstractmethod
+    def suffix_labels(self) -> list[str]:
+        """The role of every suffix position."""
 
     @cached_property
     @abstractmethod
@@ -118,12 +163,17 @@ class LerobotFlow(Policy):
 
     @classmethod
     def load(
-        cls, checkpoint: str, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+        cls,
+        checkpoint: str,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        weights_seed: int = 0,
     ) -> Self:
         """Load a lerobot checkpoint from a folder or hub id.
 
         dtype: float32 or bfloat16; default what the checkpoint's config says.
-        random_weights: same architecture, tokenizer and statistics, but seeded random weights.
+        random_weights: same architecture, tokenizer and statistics, but random weights of `weights_seed`.
         Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
         """
         folder = checkpoint_folder(checkpoint)
@@ -132,14 +182,14 @@ class LerobotFlow(Policy):
             config.dtype = dtype
         network = cls.build(config, folder)
         if random_weights:
-            initialise(network, seed=0)
+            initialise(network, weights_seed)
             weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
         else:
             weights = read_weights(folder)
         audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
         config.device = device
         policy = cls(network.to(device), folder)
-        policy.card = PolicyCard(
+        policy.card = Card(
             family=cls.family,
             checkpoint=checkpoint,
             weights_sha256=audit.sha256,
@@ -153,6 +203,8 @@ class LerobotFlow(Policy):
             execute=min(config.n_action_steps, config.chunk_size),
             notes=policy._notes(),
             audit=audit.to_json(),
+            settings=content_hashes(policy.side_files()),
+            weights_seed=weights_seed if audit.random and random_weights else None,
         )
         return policy
 
@@ -170,8 +222,12 @@ class LerobotFlow(Policy):
         config.rtc_config = None
         return config
 
+    def side_files(self) -> dict[str, Path]:
+        """Every file besides the weights that loading and acting read: configuration, units, window, text."""
+        return side_files(self.folder)
+
     def _notes(self) -> tuple[str, ...]:
-        masked = self.cameras[1:]
+        masked = self.cameras[len(self.shown) :]
         cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
         return (*cameras, f"units: {self._units()}")
 
@@ -185,29 +241,28 @@ class LerobotFlow(Policy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
-        if len(seeds) != len(observations):
-            raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds")
+        self.check(seen, seeds)
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != 7:
             raise CheckpointError(
                 f"{self.folder} acts in {dimensions} dimensions; Act2Answer needs a 7-DoF end-effector delta"
             )
-        chunk = self.infer(self.batch(observations), self.noise(seeds))
+        chunk = self.infer(self.batch(seen), self.noise(seeds))
         return self.action_units.restore(chunk.float().cpu().numpy())
 
     def infer(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
         """(B, chunk, D) normalised actions for a batch in lerobot's keys.
 
         noise: (B, chunk, max_action_dim) float32.
-        Raises ObservationError unless the cameras are the first ones of the configuration, in its order, with
-        pictures in [0, 1]: lerobot moves present cameras to the front and rescales nothing.
+        Raises ObservationError unless the cameras are those that are shown, in the configuration's order, with
+        pictures in [0, 1]: lerobot rescales nothing.
         """
         given = [key.removeprefix(IMAGES) for key in batch if key.startswith(IMAGES)]
-        if given != list(self.cameras[: len(given)]) or not given:
+        if given != list(self.shown):
             raise ObservationError(
-                f"cameras {given} given; this checkpoint expects {list(self.cameras)}, in order"
+                f"cameras {given} given; this policy is shown {list(self.shown)} of {list(self.cameras)}, in order"
             )
         for camera in given:
             picture = batch[f"{IMAGES}{camera}"]
@@ -219,21 +274,26 @@ class LerobotFlow(Policy):
             chunk: Tensor = self.network.predict_action_chunk(batch, noise=noise)
         return chunk
 
-    def batch(self, observations: Sequence[Observation]) -> dict[str, Tensor]:
+    def batch(self, seen: Sequence[Observation]) -> dict[str, Tensor]:
         """The observations in lerobot's keys; the environment's picture goes to the first camera."""
         device = self.config.device
-        tokens, mask = self.tokenise([o.instruction for o in observations])
-        images = torch.from_numpy(np.stack([_checked_image(o.image) for o in observations]))
-        state = np.stack([np.asarray(o.state, np.float32) for o in observations])
+        tokens, mask = self.tokenise([o.instruction for o in seen])
+        state = np.stack([np.asarray(o.state, np.float32) for o in seen])
         expected = self.config.input_features[STATE].shape[0]
         if state.shape[1] != expected:
             raise ObservationError(f"the state has {state.shape[1]} numbers; this checkpoint reads {expected}")
         return {
-            f"{IMAGES}{self.cameras[0]}": self.window(images.permute(0, 3, 1, 2).to(device).float() / 255),
+            **{f"{IMAGES}{camera}": self._pictures(camera, seen) for camera in self.shown},
             STATE: torch.from_numpy(self.state_units.normalise(state)).to(device),
             TOKENS: tokens.to(device),
             MASK: mask.to(device),
         }
+
+    def _pictures(self, camera: str, seen: Sequence[Observation]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: the part of each picture that this checkpoint looks at."""
+        own = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in seen]
+        images = torch.from_numpy(np.stack([checked_picture(image) for image in own]))
+        return self.window(camera)(images.permute(0, 3, 1, 2).to(self.config.device).float() / 255)
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, max_action_dim) float32 flow noise, a row per seed, the same on every device."""
@@ -263,11 +323,16 @@ class LerobotFlow(Policy):
             mask[index, : len(row)] = True
         return tokens, mask
 
+    def window(self, camera: str) -> PictureWindow:
+        """The part of one camera's picture that this checkpoint looks at."""
+        if camera not in self._windows:
+            size = tuple(self.config.image_features[f"{IMAGES}{camera}"].shape[-2:])
+            self._windows[camera] = read_window(self.folder, f"{IMAGES}{camera}", size)
+        return self._windows[camera]
+
     @cached_property
-    def window(self) -> PictureWindow:
-        """The part of the picture this checkpoint looks at."""
-        camera = f"{IMAGES}{self.cameras[0]}"
-        return read_window(self.folder, camera, tuple(self.config.image_features[camera].shape[-2:]))
+    def _windows(self) -> dict[str, PictureWindow]:
+        return {}
 
     @cached_property
     def state_units(self) -> Normaliser:
@@ -283,35 +348,34 @@ class LerobotFlow(Policy):
 
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the stack's final norm, or a block's output."""
-        stack = self._vision if site.stream == "vision" else self.stacks.get(site.stream)
-        if stack is None or site not in _stream(site.stream, stack).sites(site.quantity):
-            streams = ", ".join(map(str, self.streams.values()))
-            raise UnknownSiteError(f"{self.family} has no site {site}; it has {streams} and vision")
-        return stack.tap(site)
+        self.stream_of(site)
+        return self.stacks[site.stream].tap(site)
 
-    @property
-    def vision(self) -> Stream:
-        """The vision tower; it runs once per camera, masked ones included."""
-        return _stream("vision", self._vision)
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Prefix and suffix as the family packs them."""
+        return self.packed_roles(*self.tokenise([o.instruction for o in seen]))
 
-    def language_roles(self, instructions: Sequence[str]) -> list[list[str]]:
-        """Per row, the roles of the language positions."""
-        tokens, mask = self.tokenise(instructions)
+    def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
+        """The roles for instructions as (B, tokenizer_max_length) ids and mask."""
+        suffix = Roles.from_labels(self.suffix_labels())
         special = torch.isin(tokens, torch.tensor(self.tokenizer.all_special_ids))
-        return [
+        language = [
             [
                 PADDING if not valid else "special" if marker else "language"
                 for valid, marker in zip(row, markers, strict=True)
             ]
             for row, markers in zip(mask.tolist(), special.tolist(), strict=True)
         ]
+        return {
+            "backbone": [Roles.from_labels(self.prefix_labels(row)) for row in language],
+            "expert": [suffix] * len(language),
+        }
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each instruction, without padding."""
+        tokens, mask = self.tokenise(instructions)
+        return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
 
 
 def _stream(name: str, stack: Stack) -> Stream:
     return Stream(name, len(stack.layers) + 1, stack.width, stack.iterations)
-
-
-def _checked_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
-    return image

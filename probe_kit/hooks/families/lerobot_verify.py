@@ -5,7 +5,6 @@ B batch, C cameras including empty ones, L layers, S flow-matching steps.
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from torch import Tensor, nn
 
 from probe_kit.hooks.capture_context import Tape, capture
 from probe_kit.hooks.families.lerobot_flow import IMAGES, MASK, STATE, TOKENS, LerobotFlow
-from probe_kit.hooks.policy import Tap
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.verify import Comparison, Produce, compare
 
@@ -45,21 +43,21 @@ def verify_flow(load: Callable[[str], LerobotFlow], folder: Path, recorded: Arra
     mean nothing.
     """
     policy = load(str(folder / "checkpoint"))
+    policy = policy.showing(policy.cameras)
     batch = _batch(policy, recorded)
     noise = torch.from_numpy(recorded["in_noise"])
     calls: dict[str, list[Tensor]] = {}
-    cameras = _Cameras(policy, recorded)
     with ExitStack() as stack:
         for name, module in _extra_modules(policy).items():
             calls[name] = _record_outputs(module, stack)
         calls["positions"] = _record_positions(policy, stack)
-        tape = stack.enter_context(capture(policy, [*cameras.sites, *_sites(policy)]))
+        tape = stack.enter_context(capture(policy, _sites(policy)))
         actions = policy.infer(batch, noise)
     produced: dict[str, Produce] = {
         **_streams(policy, tape),
         **_integration(calls["velocity"], noise, policy.iterations),
         **_preparation(policy, batch, recorded),
-        "vision_resid": partial(cameras.residuals, tape),
+        "vision_resid": lambda: _stacked(tape, policy.further_streams["vision"], "residual"),
         "actions": lambda: _numpy(actions),
         "actions_unnormalized": lambda: policy.action_units.restore(_numpy(actions)),
     }
@@ -81,32 +79,8 @@ def _batch(policy: LerobotFlow, recorded: Arrays) -> dict[str, Tensor]:
     }
 
 
-class _Cameras:
-    """The vision tower runs once per camera that is present or masked; here all recorded ones are present."""
-
-    def __init__(self, policy: LerobotFlow, recorded: Arrays) -> None:
-        self.count = recorded["vision_resid"].shape[0]
-        vision = policy.vision
-        self.stream = Stream("vision", vision.layers, vision.width, self.count)
-        tap_alone = policy.tap
-
-        def tap(site: Site) -> Tap:
-            found = tap_alone(site)
-            return Tap(found.module, self.count, found.end) if site.stream == "vision" else found
-
-        policy.tap = tap  # type: ignore[method-assign]
-
-    @property
-    def sites(self) -> list[Site]:
-        return self.stream.sites()
-
-    def residuals(self, tape: Tape) -> NDArray[Any]:
-        """(C, L+1, B, N, D)."""
-        return _stacked(tape, self.stream, "residual")
-
-
 def _sites(policy: LerobotFlow) -> list[Site]:
-    return [*policy.sites(), *policy.sites("final_norm")]
+    return [*policy.further_streams["vision"].sites(), *policy.sites(), *policy.sites("final_norm")]
 
 
 def _streams(policy: LerobotFlow, tape: Tape) -> dict[str, Produce]:
@@ -156,17 +130,14 @@ def _preparation(policy: LerobotFlow, batch: dict[str, Tensor], recorded: Arrays
         "prep_images": lambda: images(0),
         "prep_image_masks": lambda: images(1),
         "prep_state": lambda: _numpy(network.prepare_state(batch)),
-        "prefix_pad": lambda: _prefix_pad(policy, images(1), recorded),
+        "prefix_pad": lambda: _prefix_pad(policy, recorded),
     }
 
 
-def _prefix_pad(policy: LerobotFlow, camera_masks: NDArray[Any], recorded: Arrays) -> NDArray[Any]:
-    """(B, T) validity of every prefix position, in the order of the adapter's roles."""
-    images = np.repeat(camera_masks.T, policy.tokens_per_camera, axis=1)
-    tail = recorded["in_lang_mask"]
-    if "state" in policy.role_names["backbone"]:
-        tail = np.concatenate([tail, np.ones((len(tail), 1), bool)], axis=1)
-    return np.concatenate([images, tail], axis=1)
+def _prefix_pad(policy: LerobotFlow, recorded: Arrays) -> NDArray[np.bool_]:
+    """(B, T) validity of every prefix position, as the adapter's own roles say it."""
+    tokens, mask = (torch.from_numpy(recorded[name]) for name in ("in_lang_tokens", "in_lang_mask"))
+    return np.stack([row.valid for row in policy.packed_roles(tokens, mask.bool())["backbone"]])
 
 
 def _extra_modules(policy: LerobotFlow) -> dict[str, nn.Module]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.sites import ACTION_STREAMS
+from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
     HeatTableDisplay,
@@ -179,7 +179,7 @@ def _of_probes(name: str, position: int, results: ProbeResults) -> list[Exhibit]
             position, partial(iteration_maps, results, view, stream),
         )
         for view in views
-        for stream in ACTION_STREAMS
+        for stream in sorted(name for name in scores["stream"].unique() if part_of(name) == "action")
         if ((scores["view"] == view) & (scores["stream"] == stream) & scores["iteration"].notna()).any()
     ]  # fmt: skip
     for stream, rows in scores.groupby("stream", sort=False):

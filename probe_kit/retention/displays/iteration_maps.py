@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks.sites import ACTION_STREAMS
+from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.layer_curves import DEPTH
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
@@ -137,7 +137,7 @@ def _colours(stream: str) -> "Colormap":
     from matplotlib.colors import LinearSegmentedColormap
 
     colour = STREAMS.get(stream, OTHER_STREAM).colour
-    dark = "#331400" if stream in ACTION_STREAMS else "#001B2E"
+    dark = "#331400" if part_of(stream) == "action" else "#001B2E"
     return LinearSegmentedColormap.from_list(stream, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
 
 

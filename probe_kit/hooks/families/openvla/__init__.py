@@ -1,1 +1,31 @@
 """OpenVLA, native."""
+
+from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "openvla",
+        "OpenVLA (DINOv2 + SigLIP, Llama 2 7B, actions as tokens), native; fine-tunes and LoRA as --checkpoint",
+        "openvla/openvla-7b",
+        "probe_kit.hooks.families.openvla.adapter:load_openvla",
+        streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
+        embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
+        notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
+        verifier="probe_kit.hooks.families.prismatic.verify:verify_openvla",
+        full_size="probe_kit.models.prismatic:full_size_openvla",
+        options=(
+            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig, or the only one"),
+            Option(
+                "prompt",
+                str,
+                "openvla, openvla-v01 or a template with {instruction}.",
+                "the checkpoint's generation's",
+            ),
+            Option("centre_crop", bool, "Show 0.9 of the area: fine-tunes with augmentation.", "false"),
+            TOKENIZER,
+            BITS,
+        ),
+    ),
+)

@@ -71,7 +71,7 @@ class ActionStatistics:
             near = get_close_matches(chosen, statistics, n=1)
             hint = f" Did you mean {near[0]}?" if near else ""
             known = ", ".join(sorted(statistics))
-            raise UsageError(f"no action statistics of {chosen!r}; choose --unnorm-key among {known}.{hint}")
+            raise UsageError(f"no action statistics of {chosen!r}; choose -M unnorm_key among {known}.{hint}")
         return cls._read(chosen, statistics[chosen])
 
     @classmethod

@@ -12,12 +12,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
-from probe_kit.hooks.families.prismatic.adapter import Prismatic
+from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
-from probe_kit.hooks.policy import Observation
+from probe_kit.hooks.model import Policy
+from probe_kit.hooks.observation import Observation
 from probe_kit.models.prismatic import CROP_AREA, centre_crop
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
@@ -34,7 +35,7 @@ _LLAMA_PROMPT = [1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304]
 _GRIPPER_OPEN = 0.5
 
 
-class OpenVLA(Prismatic):
+class OpenVLA(PrismaticModel, Policy):
     """A loaded OpenVLA."""
 
     family: ClassVar[str] = "openvla"
@@ -57,18 +58,14 @@ class OpenVLA(Prismatic):
             chunk=1,
             execute=1,
             notes=(*self.card.notes, *self._notes(tokenizer)),
-            settings=self._settings(tokenizer),
+            settings={
+                **self.card.settings,
+                "unnorm_key": self.statistics.key,
+                "action_statistics": self.statistics.sha256,
+                "prompt": self.template,
+                "centre_crop": str(self.crop),
+            },
         )
-
-    def _settings(self, tokenizer: str | None) -> dict[str, str]:
-        chosen = {} if tokenizer is None else {"tokenizer": tokenizer}
-        return {
-            "unnorm_key": self.statistics.key,
-            "action_statistics": self.statistics.sha256,
-            "prompt": self.template,
-            "centre_crop": str(self.crop),
-            **chosen,
-        }
 
     def _notes(self, tokenizer: str | None) -> tuple[str, ...]:
         notes = [f"actions in the units and at the rate of {self.statistics.key}", f"prompt: {self.template!r}"]
@@ -80,17 +77,16 @@ class OpenVLA(Prismatic):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; decoding is greedy, so the seeds change nothing. See the contract."""
-        if len(seeds) != len(observations):
-            raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds")
+        self.check(seen, seeds)
         if self.steps != 7:
             raise CheckpointError(
                 f"{self.statistics.key} has actions of {self.steps} dimensions; Act2Answer needs a 7-DoF "
-                "end-effector delta. Choose another --unnorm-key"
+                "end-effector delta. Choose another -M unnorm_key"
             )
-        rows = [self.prompt(observation.instruction) for observation in observations]
-        pixels = self.pixel_values(self._look(observation.image) for observation in observations)
+        rows = [self.prompt(observation.instruction) for observation in seen]
+        pixels = self.pixel_values(self._look(observation.image) for observation in seen)
         ids = self.generate(pixels, rows).ids.cpu().numpy()
         self._say_unknown(ids)
         actions = self.statistics.restore(self.action_tokens.values(ids))
@@ -140,6 +136,7 @@ def load_openvla(
     centre_crop: bool = False,
     tokenizer: str | None = None,
     bits: int | None = None,
+    weights_seed: int = 0,
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
 
@@ -149,7 +146,7 @@ def load_openvla(
     tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
     Raises UsageError, and what `load_checkpoint` raises.
     """
-    loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits)
+    loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
     statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoint import side_files
 from probe_kit.hooks.families.lerobot_flow import LerobotFlow, Stack, flow_stacks
-from probe_kit.hooks.policy import Observation
-from probe_kit.hooks.roles import PADDING, Roles
+from probe_kit.hooks.views import PADDING
 from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_keys import current_pi0_keys
 from probe_kit.models.pi0_tiny import embedded_checkpoint
@@ -31,12 +31,8 @@ class Pi0(LerobotFlow):
     config_type = "pi0"
     unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
-        self.role_names = {
-            "backbone": (f"image.{self.cameras[0]}", "language", "special", PADDING),
-            "expert": ("state", "action"),
-        }
+    other_roles = ("language", "special")
+    suffix_roles = ("state", "action")
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
@@ -54,8 +50,7 @@ class Pi0(LerobotFlow):
         joint = self.network.model.paligemma_with_expert
         backbone, expert = joint.paligemma.model.language_model, joint.gemma_expert.model
         vision = joint.paligemma.model.vision_tower.vision_model
-        cameras = len(self.config.image_features)
-        return flow_stacks(backbone, expert, vision, self.iterations, cameras)
+        return flow_stacks(backbone, expert, vision, self.iterations)
 
     @property
     def iterations(self) -> int:
@@ -65,9 +60,8 @@ class Pi0(LerobotFlow):
     @cached_property
     def tokenizer(self) -> Any:
         """PaliGemma's, from the checkpoint folder or the hub."""
-        for place in (self.folder, self.folder.parent / "tokenizer"):
-            if (place / "tokenizer.json").is_file():
-                return AutoTokenizer.from_pretrained(place)
+        if (place := self._tokenizer_folder()) is not None:
+            return AutoTokenizer.from_pretrained(place)
         try:
             return AutoTokenizer.from_pretrained(_TOKENIZER)
         except OSError as error:
@@ -76,16 +70,33 @@ class Pi0(LerobotFlow):
                 "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
             ) from error
 
-    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Cameras without a picture are masked and lie behind the present one."""
-        images = [f"image.{self.cameras[0]}"] * self.tokens_per_camera
-        masked = [PADDING] * self.tokens_per_camera * (len(self.config.image_features) - 1)
-        language = self.language_roles([o.instruction for o in observations])
-        suffix = Roles.from_labels(["state", *["action"] * self.config.chunk_size])
-        return {
-            "backbone": [Roles.from_labels([*images, *masked, *row]) for row in language],
-            "expert": [suffix] * len(observations),
-        }
+    def _tokenizer_folder(self) -> Path | None:
+        places = (self.folder, self.folder.parent / "tokenizer")
+        return next((place for place in places if (place / "tokenizer.json").is_file()), None)
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the sizes and the tokenizer, where they lie beside the folder."""
+        found = super().side_files()
+        sizes, text = self.folder.parent / "dims.json", self._tokenizer_folder()
+        if "dims.json" not in found and sizes.is_file():
+            found["dims.json"] = sizes
+        if text is not None and text != self.folder:
+            found |= side_files(text, "tokenizer/")
+        return found
+
+    @property
+    def masked_cameras(self) -> int:
+        """All that are not shown."""
+        return len(self.config.image_features) - len(self.shown)
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """Cameras without a picture are masked and lie behind the shown ones."""
+        images = [f"image.{camera}" for camera in self.shown for _ in range(self.tokens_per_camera)]
+        return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
+
+    def suffix_labels(self) -> list[str]:
+        """The state, then the chunk."""
+        return ["state", *["action"] * self.config.chunk_size]
 
     @property
     def tokens_per_camera(self) -> int:
@@ -94,26 +105,43 @@ class Pi0(LerobotFlow):
         return int(vision.embeddings.num_patches)
 
 
-def load_pi0(checkpoint: str, device: str = "cpu", dtype: str | None = None, random_weights: bool = False) -> Pi0:
+def load_pi0(
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
+) -> Pi0:
     """Load a lerobot pi0 checkpoint; see `LerobotFlow.load`."""
-    return Pi0.load(checkpoint, device, dtype, random_weights)
+    return Pi0.load(checkpoint, device, dtype, random_weights, weights_seed)
 
 
 def load_pi0_tiny(
-    checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
 ) -> Pi0:
     """The embedded default: pi0 at 0.82 million parameters, trained on Color and Shape."""
-    return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights)
+    return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights, weights_seed)
 
 
 def load_pi0_tiny_early(
-    checkpoint: str | None = None, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
 ) -> Pi0:
     """The embedded default as it was early in its training."""
-    return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights)
+    return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights, weights_seed)
 
 
-def _load_embedded(name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool) -> Pi0:
-    policy = Pi0.load(checkpoint or str(embedded_checkpoint(name)), device, dtype, random_weights)
+def _load_embedded(
+    name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool, weights_seed: int
+) -> Pi0:
+    place = checkpoint or str(embedded_checkpoint(name))
+    policy = Pi0.load(place, device, dtype, random_weights, weights_seed)
     policy.card = replace(policy.card, family=name, checkpoint=checkpoint or "embedded")
     return policy

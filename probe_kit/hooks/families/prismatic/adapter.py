@@ -7,6 +7,8 @@ one the positions whose logits choose the output: the prompt's last token, then 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,15 +16,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError, UsageError
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
-from probe_kit.hooks.families.prismatic.tokenizer import TextTokenizer, find_tokenizer
-from probe_kit.hooks.policy import Observation, Policy, PolicyCard, Tap
-from probe_kit.hooks.roles import PADDING, Roles
+from probe_kit.hooks.families.prismatic.tokenizer import TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.model import Model, Question, Reader, Reading, Tap
+from probe_kit.hooks.observation import Observation, checked_picture
+from probe_kit.hooks.roles import Roles
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.views import PADDING
 from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
 
 CAMERA = "primary"
+# The frame around a question that prism-dinosiglip-224px+7b and its siblings without a chat were trained with.
+_FRAME = "In: {}\nOut:"
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
@@ -49,11 +57,11 @@ class Packed:
         return cls(ids, mask)
 
 
-class Prismatic(Policy):
-    """A loaded Prismatic model: looks at a picture, reads a prompt, puts out `steps` greedy tokens."""
+class PrismaticModel(Model):
+    """A loaded network of this kind: looks at a picture, reads a prompt, puts out `steps` greedy tokens."""
 
-    family: ClassVar[str] = "prismatic"
-    output: ClassVar[str] = "answer"
+    family: ClassVar[str]
+    output: ClassVar[str]
     """The stream of the positions that choose the output."""
 
     def __init__(self, loaded: LoadedPrismatic, steps: int, tokenizer: str | None = None) -> None:
@@ -63,13 +71,17 @@ class Prismatic(Policy):
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
         self.streams = {
             "backbone": Stream("backbone", layers, width),
-            self.output: Stream(self.output, layers, width, steps),
+            self.output: Stream(self.output, layers, width, steps, part="action"),
+        }
+        self.further_streams = {
+            name: Stream(name, len(tower.blocks), int(tower.embed_dim), part="vision", quantities=("residual",))
+            for name, tower in self._towers.items()
         }
         self.role_names = {
             "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
             self.output: (self.output,),
         }
-        self.card = PolicyCard(
+        self.card = Card(
             family=self.family,
             checkpoint=loaded.checkpoint,
             weights_sha256=loaded.audit.sha256,
@@ -84,7 +96,18 @@ class Prismatic(Policy):
             notes=loaded.notes,
             audit=loaded.audit.to_json(),
             exact=loaded.exact,
+            settings=self._settings(tokenizer),
+            weights_seed=loaded.weights_seed,
         )
+
+    def _settings(self, tokenizer: str | None) -> dict[str, str]:
+        """By content: what lies beside the weights, and a tokenizer from elsewhere."""
+        files: dict[str, Path] = {}
+        for number, folder in enumerate(self.loaded.folders):
+            files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
+        if tokenizer is not None and Path(tokenizer).is_dir():
+            files |= side_files(Path(tokenizer), "tokenizer/")
+        return {**content_hashes(files), "tokenizer": tokenizer or "the checkpoint's", "steps": str(self.steps)}
 
     # -- inputs ------------------------------------------------------------------------------------------
 
@@ -95,7 +118,7 @@ class Prismatic(Policy):
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
         """(B, 3 per tower, S, S) float32 of (H, W, 3) uint8 pictures. Raises ObservationError."""
-        rows = [prepare_picture(_checked(image), self.pictures) for image in images]
+        rows = [prepare_picture(checked_picture(image), self.pictures) for image in images]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     @cached_property
@@ -135,18 +158,11 @@ class Prismatic(Policy):
         with torch.inference_mode():
             return self.network.decode(packed.ids.to(device), packed.mask.to(device), pixel_values, self.steps)
 
-    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """Refused: raises UsageError."""
-        raise UsageError(
-            f"asked for actions of {len(observations)} observations with {len(seeds)} seeds, but {self.family} is "
-            "a vision-language model and does not act; OpenVLA is the policy made of it"
-        )
-
     # -- listening ---------------------------------------------------------------------------------------
 
-    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
-        rows = [self.prompt(observation.instruction) for observation in observations]
+        rows = [self.prompt(observation.instruction) for observation in seen]
         longest, special = max(map(len, rows)), self.tokenizer.special
         image = [f"image.{CAMERA}"] * self.network.patches
         backbone = []
@@ -157,15 +173,18 @@ class Prismatic(Policy):
             backbone.append(Roles.from_labels(labels))
         return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
 
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt."""
+        return [tuple(self.prompt(instruction)) for instruction in instructions]
+
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or a block's output."""
-        stream = self.streams.get(site.stream)
-        if stream is not None and site in stream.sites(site.quantity):
-            return self._language_tap(site)
-        if site.stream in self.vision and site in self.vision[site.stream].sites():
+        """The first norm of the block the site enters, the final norm, or a block's output.
+
+        A tower's last residual is what the projector reads, class and register tokens in front.
+        """
+        if self.stream_of(site).part == "vision":
             return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
-        streams = ", ".join(map(str, (*self.streams.values(), *self.vision.values())))
-        raise UnknownSiteError(f"{self.family} has no site {site}; it has {streams}")
+        return self._language_tap(site)
 
     def _language_tap(self, site: Site) -> Tap:
         tokens = _PROMPT if site.stream == "backbone" else _LAST
@@ -183,23 +202,42 @@ class Prismatic(Policy):
         return Tap(block.input_layernorm, self.steps, tokens=tokens)
 
     @property
-    def vision(self) -> dict[str, Stream]:
-        """The towers as streams of residual sites; the last one is what the projector reads, class and register
-        tokens in front. No part of `streams`: a tower is asked for by site.
-        """
-        return {
-            name: Stream(name, len(tower.blocks), int(tower.embed_dim)) for name, tower in self._towers.items()
-        }
-
-    @property
     def _towers(self) -> dict[str, Any]:
         return dict(zip(("vision", "vision_fused"), self.network.vision_backbone.towers, strict=False))
 
 
-def _checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
-    return image
+class Prismatic(PrismaticModel, Reader):
+    """A loaded Prismatic vision-language model: answers in text."""
+
+    family: ClassVar[str] = "prismatic"
+    output: ClassVar[str] = "answer"
+
+    def read(self, questions: Sequence[Question]) -> Reading:
+        """One prefill; see the contract. Raises UsageError if the model was loaded for more than one step."""
+        if self.steps != 1:
+            raise UsageError(
+                f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
+            )
+        self.check([question.seen for question in questions])
+        texts = [_FRAME.format(question.text) + question.begun for question in questions]
+        rows = [self.tokenizer.encode(text) for text in texts]
+        options = [
+            [id_behind(self.tokenizer, text, option) for option in question.options]
+            for text, question in zip(texts, questions, strict=True)
+        ]
+        pixels = self.pixel_values(question.seen.image for question in questions)
+        logits = self.generate(pixels, rows).logits[:, 0].float().cpu()
+        return Reading.of(logits.numpy(), options, (pixels, rows))
+
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Greedy text behind every prompt, up to its end-of-sequence token; see the contract."""
+        pixels, rows = reading.state
+        packed, device = self.pack(rows), self.loaded.device
+        with torch.inference_mode():
+            decoded = self.network.decode(packed.ids.to(device), packed.mask.to(device), pixels, tokens)
+        end = self.config.text.eos_token_id
+        spoken = [list(takewhile(lambda number: number != end, row)) for row in decoded.ids.tolist()]
+        return [self.tokenizer.decode(row) for row in spoken]
 
 
 def load_prismatic(
@@ -211,6 +249,7 @@ def load_prismatic(
     tokenizer: str | None = None,
     bits: int | None = None,
     steps: int = 1,
+    weights_seed: int = 0,
 ) -> Prismatic:
     """Load a Prismatic model in the layout of `PrismaticForConditionalGeneration`, from a folder or hub id.
 
@@ -219,5 +258,5 @@ def load_prismatic(
     """
     if checkpoint is None:
         raise UsageError("prismatic has no default checkpoint; pass a folder or hub id as --checkpoint")
-    loaded = load_checkpoint(checkpoint, device, dtype, random_weights, bits)
+    loaded = load_checkpoint(checkpoint, device, dtype, random_weights, bits, weights_seed)
     return Prismatic(loaded, steps, tokenizer)

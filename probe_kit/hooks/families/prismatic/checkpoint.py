@@ -41,10 +41,16 @@ class LoadedPrismatic:
     device: str
     exact: bool
     notes: tuple[str, ...]
+    weights_seed: int | None = None
 
 
 def load_checkpoint(
-    checkpoint: str, device: str, dtype: str | None, random_weights: bool, bits: int | None = None
+    checkpoint: str,
+    device: str,
+    dtype: str | None,
+    random_weights: bool,
+    bits: int | None = None,
+    weights_seed: int = 0,
 ) -> LoadedPrismatic:
     """Load a folder or hub id, which may hold a LoRA adapter that names its base.
 
@@ -62,7 +68,7 @@ def load_checkpoint(
     if name not in _DTYPES:
         raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
     if random_weights:
-        network, audit = _random(config, _DTYPES[name], checkpoint)
+        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
     else:
         network, audit = _stored(config, base, _DTYPES[name], adapter)
     network.requires_grad_(False)
@@ -82,6 +88,7 @@ def load_checkpoint(
         device=device,
         exact=bits is None,
         notes=notes,
+        weights_seed=weights_seed if random_weights else None,
     )
 
 
@@ -99,9 +106,11 @@ def _stored_dtype(config: PrismaticConfig) -> str:
     return str(config.dtype or "float32").removeprefix("torch.")
 
 
-def _random(config: PrismaticConfig, dtype: torch.dtype, checkpoint: str) -> tuple[PrismaticNetwork, WeightsAudit]:
+def _random(
+    config: PrismaticConfig, dtype: torch.dtype, checkpoint: str, seed: int
+) -> tuple[PrismaticNetwork, WeightsAudit]:
     network = build_prismatic(config, dtype, device="cpu")
-    initialise(network, seed=0)
+    initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     return network, load_weights(network, weights, weights.tensors)
 

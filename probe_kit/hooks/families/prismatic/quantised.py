@@ -20,7 +20,7 @@ def check_quantisation(bits: int, device: str) -> None:
     if not device.startswith("cuda") or not torch.cuda.is_available():
         raise UsageError(
             f"{bits}-bit weights need an NVIDIA GPU and --device cuda; device is {device!r} and CUDA is "
-            f"{'available' if torch.cuda.is_available() else 'not available'}. Leave --bits out to run exactly"
+            f"{'available' if torch.cuda.is_available() else 'not available'}. Leave -M bits out to run exactly"
         )
 
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from tokenizers import Tokenizer
 
-from probe_kit.errors import CheckpointError, InstructionError
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
 
 BYTES = "bytes"
 """Asks for `ByteTokenizer`."""
@@ -28,6 +28,23 @@ class TextTokenizer(Protocol):
 
     def encode(self, text: str) -> list[int]:
         """Ids, the beginning-of-sequence token first. Raises InstructionError for a word it does not know."""
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids that the model put out, without special tokens."""
+
+
+def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
+    """The first id of `answer` where it stands behind `prompt`.
+
+    Raises UsageError if the answer changes the prompt's own ids: its logit would be that of another prompt.
+    """
+    before, whole = tokenizer.encode(prompt), tokenizer.encode(prompt + answer)
+    if whole[: len(before)] != before or len(whole) == len(before):
+        raise UsageError(
+            f"the answer {answer!r} melts into the end of the prompt: {whole[len(before) - 2 :]} instead of "
+            f"{before[len(before) - 2 :]} and more. Give the option as it stands behind the prompt, such as ' A'"
+        )
+    return whole[len(before)]
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,10 @@ class FileTokenizer:
             )
         return ids
 
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids, without special tokens."""
+        return str(self._tokenizer.decode(list(ids), skip_special_tokens=True)).strip()
+
 
 @dataclass(frozen=True)
 class ByteTokenizer:
@@ -91,6 +112,10 @@ class ByteTokenizer:
     def encode(self, text: str) -> list[int]:
         """Ids, the beginning-of-sequence token first."""
         return [self.beginning, *(3 + byte for byte in text.encode())]
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The bytes among the ids as text."""
+        return bytes(number - 3 for number in ids if 3 <= number < 259).decode(errors="replace").strip()
 
 
 def find_tokenizer(
@@ -111,6 +136,6 @@ def find_tokenizer(
     raise CheckpointError(
         f"tokenizer.json and tokenizer_config.json are missing in {' and '.join(map(str, places))}. The tokenizer "
         "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
-        f"from, or name their folder with --tokenizer. For a development checkpoint that has none: "
-        f"--tokenizer {BYTES}"
+        f"from, or name their folder with -M tokenizer=DIR. For a development checkpoint that has none: "
+        f"-M tokenizer={BYTES}"
     )

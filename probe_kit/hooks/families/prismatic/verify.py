@@ -17,7 +17,7 @@ from torch import Tensor
 from probe_kit.hooks.capture_context import Tape, capture
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.openvla.adapter import OpenVLA, load_openvla
-from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
+from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, load_prismatic
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.verify import Comparison, Produce, compare
 from probe_kit.models.prismatic import PrismaticConfig, prepare_picture
@@ -48,7 +48,7 @@ def verify_openvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     return _compare(policy, recorded, reference.produced() | _actions(policy, reference, keys))
 
 
-def _compare(model: Prismatic, recorded: Arrays, produced: Mapping[str, Produce]) -> tuple[Comparison, ...]:
+def _compare(model: PrismaticModel, recorded: Arrays, produced: Mapping[str, Produce]) -> tuple[Comparison, ...]:
     inputs = set(_INPUTS) if _makes_prompt(model, recorded) else {*_INPUTS, "input_ids"}
     outputs = {name: values for name, values in recorded.items() if name not in inputs}
     valid: dict[str, NDArray[np.bool_]] = {}
@@ -60,7 +60,7 @@ def _compare(model: Prismatic, recorded: Arrays, produced: Mapping[str, Produce]
     return compare(outputs, produced, TOLERANCE, valid)
 
 
-def _makes_prompt(model: Prismatic, recorded: Arrays) -> bool:
+def _makes_prompt(model: PrismaticModel, recorded: Arrays) -> bool:
     """Whether the adapter has something to add to the recorded prompt, rather than only being given it."""
     return isinstance(model, OpenVLA) and "prompt_ids_without_empty" in recorded
 
@@ -68,7 +68,7 @@ def _makes_prompt(model: Prismatic, recorded: Arrays) -> bool:
 class _Reference:
     """The recorded inputs, run through the adapter."""
 
-    def __init__(self, model: Prismatic, recorded: Arrays) -> None:
+    def __init__(self, model: PrismaticModel, recorded: Arrays) -> None:
         self.model, self.recorded = model, recorded
         self.prompt = self._prompt()
         self.pixels = model.pixel_values([recorded["image_uint8"]])
@@ -185,7 +185,7 @@ def _actions(policy: OpenVLA, reference: _Reference, keys: list[str]) -> dict[st
     return produced
 
 
-def _column(tape: Tape, model: Prismatic, stream: str, iteration: int | None) -> Tensor:
+def _column(tape: Tape, model: PrismaticModel, stream: str, iteration: int | None) -> Tensor:
     """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
     blocks = model.streams[stream].layers - 1
     layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]

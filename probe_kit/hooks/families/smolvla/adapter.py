@@ -13,9 +13,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoint import side_files
 from probe_kit.hooks.families.lerobot_flow import LerobotFlow, Stack, flow_stacks
-from probe_kit.hooks.policy import Observation
-from probe_kit.hooks.roles import PADDING, Roles
+from probe_kit.hooks.views import PADDING
 from probe_kit.models.smolvla import build_smolvla, current_smolvla_keys
 
 
@@ -26,12 +26,8 @@ class SmolVLA(LerobotFlow):
     config_type = "smolvla"
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
-        self.role_names = {
-            "backbone": (f"image.{self.cameras[0]}", "language", "state", "special", PADDING),
-            "expert": ("action",),
-        }
+    other_roles = ("language", "state", "special")
+    suffix_roles = ("action",)
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
@@ -52,8 +48,7 @@ class SmolVLA(LerobotFlow):
     def _stacks(self) -> dict[str, Stack]:
         joint = self.network.model.vlm_with_expert
         backbone, expert, vision = joint.vlm.model.text_model, joint.lm_expert, joint.vlm.model.vision_model
-        cameras = min(len(self.config.image_features), 1 + self.config.empty_cameras)
-        return flow_stacks(backbone, expert, vision, self.iterations, cameras)
+        return flow_stacks(backbone, expert, vision, self.iterations)
 
     @property
     def iterations(self) -> int:
@@ -65,18 +60,25 @@ class SmolVLA(LerobotFlow):
         """The VLM's."""
         return self.network.model.vlm_with_expert.processor.tokenizer
 
-    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Of the cameras without a picture, `empty_cameras` are masked and the rest left out, as lerobot does."""
-        masked_cameras = min(len(self.config.image_features) - 1, self.config.empty_cameras)
-        images = self._camera_labels(f"image.{self.cameras[0]}")
-        masked = self._camera_labels(PADDING) * masked_cameras
-        suffix = Roles.from_labels(["action"] * self.config.chunk_size)
-        backbone = []
-        for row in self.language_roles([o.instruction for o in observations]):
-            labels = [*images, *masked, *row, "state"]
-            labels += [PADDING] * (self.config.prefix_length - len(labels))
-            backbone.append(Roles.from_labels(labels))
-        return {"backbone": backbone, "expert": [suffix] * len(observations)}
+    def side_files(self) -> dict[str, Path]:
+        """Also the VLM's configuration and tokenizer, where they lie in a folder here."""
+        vlm = Path(self.config.vlm_model_name)
+        return {**super().side_files(), **(side_files(vlm, "vlm/") if vlm.is_dir() else {})}
+
+    @property
+    def masked_cameras(self) -> int:
+        """Of the cameras that are not shown, `empty_cameras` are masked and the rest left out, as lerobot does."""
+        return min(len(self.config.image_features) - len(self.shown), int(self.config.empty_cameras))
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """Pictures, masked pictures, language and state, filled up to `prefix_length`."""
+        images = [label for camera in self.shown for label in self._camera_labels(f"image.{camera}")]
+        labels = [*images, *self._camera_labels(PADDING) * self.masked_cameras, *language, "state"]
+        return labels + [PADDING] * (self.config.prefix_length - len(labels))
+
+    def suffix_labels(self) -> list[str]:
+        """The chunk."""
+        return ["action"] * int(self.config.chunk_size)
 
     def _camera_labels(self, role: str) -> list[str]:
         """One camera's positions; the special tokens around a masked picture are not masked."""
@@ -92,7 +94,11 @@ class SmolVLA(LerobotFlow):
 
 
 def load_smolvla(
-    checkpoint: str, device: str = "cpu", dtype: str | None = None, random_weights: bool = False
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
 ) -> SmolVLA:
     """Load a lerobot SmolVLA checkpoint; see `LerobotFlow.load`."""
-    return SmolVLA.load(checkpoint, device, dtype, random_weights)
+    return SmolVLA.load(checkpoint, device, dtype, random_weights, weights_seed)

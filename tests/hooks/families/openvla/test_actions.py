@@ -41,7 +41,7 @@ def test_bridge_is_the_default_and_several_others_have_to_be_chosen_from() -> No
     known = {"bridge_orig": entry(), "other": entry()}
     assert ActionStatistics.choose(known, None).key == "bridge_orig"
     assert ActionStatistics.choose(known, "other").key == "other"
-    with pytest.raises(UsageError, match="choose --unnorm-key among a, b"):
+    with pytest.raises(UsageError, match="choose -M unnorm_key among a, b"):
         ActionStatistics.choose({"a": entry(), "b": entry()}, None)
 
 

@@ -229,5 +229,5 @@ def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path, observation
 
 
 def test_an_option_of_another_family_is_refused() -> None:
-    with pytest.raises(UsageError, match="pi0-tiny has no option unnorm_key"):
+    with pytest.raises(UsageError, match="pi0-tiny has no model option unnorm_key; it has none"):
         load_policy("pi0-tiny", unnorm_key="bridge_orig")

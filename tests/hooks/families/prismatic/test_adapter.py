@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks import Observation, Site, capture, load_model, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Packed, Prismatic, load_prismatic
 from probe_kit.hooks.verify import verify_reference
 from tests.prismatic_checkpoints import write_checkpoint
@@ -55,7 +55,7 @@ def test_both_streams_together_are_the_hidden_states_of_one_pass(
 
 def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, observation: Observation) -> None:
     pixels = model.pixel_values([observation.image])
-    sites = {name: stream.sites()[-1] for name, stream in model.vision.items()}
+    sites = {name: stream.sites()[-1] for name, stream in model.further_streams.items()}
     with capture(model, sites.values()) as tape:
         model.generate(pixels, [model.prompt("What is this?")])
     towers = model.network.vision_backbone.towers
@@ -82,14 +82,14 @@ def test_roles_name_what_every_position_is(model: Prismatic, observation: Observ
     assert len(short) == len(long)
 
 
-def test_a_vision_language_model_refuses_to_act(model: Prismatic, observation: Observation) -> None:
+def test_a_vision_language_model_is_no_policy() -> None:
     with pytest.raises(UsageError, match="does not act"):
-        model.act([observation], [0])
+        load_policy("prismatic")
 
 
 def test_there_is_no_default_checkpoint() -> None:
     with pytest.raises(UsageError, match="--checkpoint"):
-        load_policy("prismatic")
+        load_model("prismatic")
 
 
 def test_a_prompt_that_does_not_fit_is_refused(model: Prismatic) -> None:

@@ -1,0 +1,50 @@
+"""The card of a loaded model: enough to say whose numbers these are. Imports no torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Card:
+    """What was really loaded.
+
+    settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and
+    the contents of every file a loader reads; part of a run's identity.
+    weights_seed: of a random twin; None for weights from a file.
+    batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
+    needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
+    chunk, execute: actions per inference and how many of them are carried out; 0 for a model that does not act.
+    exact: False if the weights that ran are only near those of the file, as after quantisation.
+    """
+
+    family: str
+    checkpoint: str
+    weights_sha256: str
+    random_weights: bool
+    parameters: int
+    dtype: str
+    device: str
+    embodiment: str
+    cameras: tuple[str, ...]
+    chunk: int
+    execute: int
+    notes: tuple[str, ...] = ()
+    audit: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+    exact: bool = True
+    weights_seed: int | None = None
+    batch: int | None = None
+    needs: frozenset[str] = frozenset()
+
+    def to_json(self) -> dict[str, Any]:
+        """As stored in a run's certificate: plain values only."""
+        plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {
+            **plain,
+            "cameras": list(self.cameras),
+            "notes": list(self.notes),
+            "audit": dict(self.audit),
+            "settings": dict(self.settings),
+            "needs": sorted(self.needs),
+        }

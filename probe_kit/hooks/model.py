@@ -1,0 +1,210 @@
+"""The contract every model family fulfils: `Model`, and what it does: act (`Policy`), answer (`Reader`)."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.sites import Site, Stream
+
+
+@dataclass(frozen=True)
+class Rows:
+    """One of several equal blocks of a batch: under guidance a module runs 2B rows, and only half are the stream.
+
+    index: which block, counted from 0. blocks: how many.
+    """
+
+    index: int = 0
+    blocks: int = 1
+
+    def of(self, activation: Tensor) -> Tensor:
+        """The block as a view: (B, …) of (B * blocks, …). Raises CaptureError if the rows do not divide."""
+        if self.blocks == 1:
+            return activation
+        rows, left = divmod(activation.shape[0], self.blocks)
+        if left:
+            raise CaptureError(
+                f"{activation.shape[0]} rows do not make {self.blocks} equal blocks; correct the tap"
+            )
+        return activation[self.index * rows : (self.index + 1) * rows]
+
+
+ALL_ROWS = Rows()
+
+
+@dataclass(frozen=True)
+class Tap:
+    """Where a site is read and written: an input or output of `module`, called `fires` times per inference.
+
+    tokens: the positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
+    rows: the block of the batch which belongs to the site, where one call serves several.
+    first: calls of `module` in an inference that come before those of this stream and are passed over.
+    argument: name of the keyword that carries the tensor, where the module is not called with it in first place.
+    view: brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of the
+    result edits what passes.
+
+    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
+    place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
+    called with the residual stream itself, so writing into that tensor writes the stream.
+    """
+
+    module: nn.Module
+    fires: int
+    end: Literal["input", "output"] = "input"
+    tokens: slice = slice(None)
+    rows: Rows = ALL_ROWS
+    first: int = 0
+    argument: str | None = None
+    view: Callable[[Tensor], Tensor] | None = None
+
+    def select(self, passing: Tensor) -> Tensor:
+        """The site's own (B, T, D), a view of what passes."""
+        whole = passing if self.view is None else self.view(passing)
+        return self.rows.of(whole)[:, self.tokens]
+
+
+class Model(ABC):
+    """A network that can be listened to: what capture, edits, verification and the store need.
+
+    streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
+    role_names: per stream, every role its tokens can play.
+    """
+
+    card: Card
+    streams: Mapping[str, Stream]
+    further_streams: Mapping[str, Stream] = MappingProxyType({})
+    role_names: Mapping[str, tuple[str, ...]]
+
+    @abstractmethod
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Per stored stream, the roles of every token position of every row, from the model's own packing."""
+
+    @abstractmethod
+    def tap(self, site: Site) -> Tap:
+        """Where `site` is read and written. Raises UnknownSiteError."""
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
+        """Per instruction, the ids that reach the network as its prompt; None if the model cannot say."""
+        del instructions
+        return None
+
+    def sites(self, quantity: str = "residual") -> list[Site]:
+        """All sites of one quantity in the stored streams that have it, stream by stream."""
+        having = [stream for stream in self.streams.values() if quantity in stream.quantities]
+        if not having:
+            raise UnknownSiteError(f"no stream of {self.card.family} has a quantity {quantity!r}")
+        return [site for stream in having for site in stream.sites(quantity)]
+
+    def stream_of(self, site: Site) -> Stream:
+        """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
+        every = {**self.streams, **self.further_streams}
+        stream = every.get(site.stream)
+        if stream is None or site.quantity not in stream.quantities or site not in stream.sites(site.quantity):
+            there = "; ".join(
+                f"{own.name}: {own.layers} layers"
+                + (f" x {own.iterations} iterations" if own.iterations else "")
+                + f" of {', '.join(own.quantities)}"
+                for own in every.values()
+            )
+            raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {there}")
+        return stream
+
+    def check(self, seen: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
+        """Refuse what the card rules out; adapters call it first.
+
+        Raises ObservationError for a batch over `card.batch`, an observation without what `card.needs` names, and
+        another number of seeds than of observations.
+        """
+        if seeds is not None and len(seeds) != len(seen):
+            raise ObservationError(f"{len(seen)} observations but {len(seeds)} seeds; give each its own")
+        limit = self.card.batch
+        if limit is not None and len(seen) > limit:
+            raise ObservationError(
+                f"{len(seen)} observations in one call; {self.card.family} takes at most {limit}: a larger "
+                "batch changes its numbers"
+            )
+        for observation in seen:
+            if lacking := observation.lacks(self.card.needs):
+                raise ObservationError(
+                    f"the observation has no {', '.join(lacking)}, which {self.card.family} reads; choose a scene "
+                    "or recording that provides it"
+                )
+
+
+class Policy(Model):
+    """A model that turns observations and an instruction into actions.
+
+    Deterministic for given seeds. Capturing changes no action, bit for bit.
+    """
+
+    @abstractmethod
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation.
+
+        Returns (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot
+        base frame, gripper 1 = open and 0 = closed, at 5 Hz. All randomness of a row comes from its seed.
+        Raises InstructionError or ObservationError for what the policy cannot take in whole.
+        """
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question about an observation.
+
+    text: the whole question as a person would ask it; the family puts its frame around it.
+    options: how the admissible answers begin, such as letters; their logits are compared.
+    begun: how the answer has begun already, put behind the frame.
+    """
+
+    seen: Observation
+    text: str
+    options: tuple[str, ...] = ()
+    begun: str = ""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one prefill left.
+
+    option_logits: (B, options) float32, one column per option of the questions, in their order.
+    option_mass: (B,) float32 share of the next token's probability that lies on the options together.
+    state: what `Reader.speak` goes on from; nobody else looks into it.
+    """
+
+    option_logits: NDArray[np.float32]
+    option_mass: NDArray[np.float32]
+    state: Any = None
+
+    @classmethod
+    def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
+        """Of the logits (B, V) behind every prompt and, per row, the ids of its options."""
+        chosen = np.take_along_axis(logits, np.array(options, np.int64).reshape(len(logits), -1), axis=1)
+        shares = np.exp(logits - logits.max(axis=1, keepdims=True))
+        peak = np.exp(chosen - logits.max(axis=1, keepdims=True))
+        return cls(chosen, peak.sum(axis=1) / shares.sum(axis=1), state)
+
+
+class Reader(Model):
+    """A model that answers questions in text. Being asked is one inference, as `capture` counts it."""
+
+    @abstractmethod
+    def read(self, questions: Sequence[Question]) -> Reading:
+        """One prefill of all questions, which must have equally many options: every tap fires as promised.
+
+        Raises InstructionError or ObservationError for what the model cannot take in whole, UsageError for an
+        option that is not one token behind the prompt.
+        """
+
+    @abstractmethod
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Per row at most `tokens` greedy tokens of text, outside of any capture. No answer is an answer: ""."""

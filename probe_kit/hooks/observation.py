@@ -1,0 +1,49 @@
+"""What a model is shown: the same object from the stage to the network. Imports no torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import ObservationError
+
+NEEDS = ("state", "intrinsics")
+"""What an observation may lack and a card may ask for; a further camera is asked for as `camera.<name>`."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the model sees at one moment.
+
+    image: (H, W, 3) uint8, the third-person camera.
+    state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative
+    to the gripper pointing down, 0, gripper openness in [0, 1].
+    intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
+    cameras: further pictures (H, W, 3) uint8 by the name of their camera.
+    """
+
+    image: NDArray[np.uint8]
+    state: NDArray[np.float32]
+    instruction: str
+    intrinsics: NDArray[np.float32] | None = None
+    cameras: Mapping[str, NDArray[np.uint8]] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __reduce__(self) -> tuple[type["Observation"], tuple[object, ...]]:
+        """Between processes the cameras travel as a plain dict; a read-only view cannot."""
+        return Observation, (self.image, self.state, self.instruction, self.intrinsics, dict(self.cameras))
+
+    def lacks(self, needs: frozenset[str]) -> tuple[str, ...]:
+        """What of `needs` this observation does not hold, sorted."""
+        held = {"state"} | {f"camera.{name}" for name in self.cameras}
+        if self.intrinsics is not None:
+            held.add("intrinsics")
+        return tuple(sorted(needs - held))
+
+
+def checked_picture(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """`image`, if it is (H, W, 3) uint8; else raises ObservationError."""
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
+    return image

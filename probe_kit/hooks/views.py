@@ -1,0 +1,28 @@
+"""Names of token roles and of the pooled views made from them. Imports no torch."""
+
+from collections.abc import Sequence
+
+PADDING = "padding"
+
+
+def plays(role: str, asked: str) -> bool:
+    """Whether a token of `role` is meant by `asked`: `image.wrist` is by `image.wrist` and by `image`."""
+    return role == asked or role.startswith(f"{asked}.")
+
+
+def view_names(roles: Sequence[str]) -> tuple[str, ...]:
+    """The pooled views of a stream whose tokens play `roles`: mean, last, and one mean per role.
+
+    With several cameras also `mean:image` over all of them; with one, `resolve_view` finds it under that name.
+    """
+    images = [role for role in roles if plays(role, "image")]
+    named = [role for role in roles if role not in (PADDING, "special")]
+    return ("mean", "last", *(f"mean:{role}" for role in named), *(["mean:image"] if len(images) > 1 else []))
+
+
+def resolve_view(view: str, stored: Sequence[str]) -> str:
+    """The stored view that `view` names: itself, or `mean:image.<camera>` for `mean:image` of the only camera."""
+    if view in stored or not view.startswith("mean:"):
+        return view
+    parts = [name for name in stored if name.startswith(f"{view}.")]
+    return parts[0] if len(parts) == 1 else view
