@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.models.internvla.config import HeadConfig, QueryConfig
+from probe_kit.models.sinusoid import frequencies
 
 _SINUSOID = 256
 _LONGEST_PERIOD = 10000
@@ -34,9 +35,7 @@ class TimeEmbedder(nn.Module):
 
     def forward(self, steps: Tensor) -> Tensor:
         """(B, D) of (B,) int64; cosines stand before sines."""
-        half = _SINUSOID // 2
-        exponents = torch.arange(half, dtype=torch.float32, device=steps.device)
-        angles = steps[:, None].float() * torch.exp(-math.log(_LONGEST_PERIOD) * exponents / half)
+        angles = steps[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(steps.device)
         sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
         return cast(Tensor, self.mlp(sinusoid.to(next(self.mlp.parameters()).dtype)))
 

@@ -3,7 +3,6 @@
 B batch, P prompt positions, T = 1 + states + actions own positions, D width, H heads of size E, K cached heads.
 """
 
-import math
 from typing import cast
 
 import torch
@@ -14,6 +13,8 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import (
     apply_rotary_pos_emb,
     repeat_kv,
 )
+
+from probe_kit.models.sinusoid import frequencies
 
 Cache = tuple[Tensor, Tensor]
 """Keys and values of one layer of the vision-language model, (B, K, P, E) each, keys after rotation."""
@@ -51,10 +52,7 @@ class TimeEmbedder(nn.Module):
 
     def forward(self, moments: Tensor) -> Tensor:
         """(B, D) of (B,) float32 moments in thousandths; cosines stand before sines."""
-        half = _SINUSOID // 2
-        exponents = torch.arange(half, dtype=torch.float32, device=moments.device)
-        frequencies = torch.exp(-math.log(_LONGEST_PERIOD) * exponents / half)
-        angles = moments[:, None].float() * frequencies
+        angles = moments[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(moments.device)
         sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
         # The released model rounds the sinusoid to the precision of its weights.
         precision = next(self.mlp.parameters()).dtype
@@ -104,6 +102,14 @@ class GatedMLP(nn.Module):
         return cast(Tensor, self.down_proj(functional.silu(self.gate_proj(stream)) * self.up_proj(stream)))
 
 
+class Gate(nn.Module):
+    """Scales what is added to the stream; a module, so that what is added can be listened to."""
+
+    def forward(self, gate: Tensor, added: Tensor) -> Tensor:
+        """(B, T, D) of gate (B, 1, D) and (B, T, D)."""
+        return gate * added
+
+
 class Layer(nn.Module):
     """Attention, then an MLP. Each writes into the stream through a gate, and the sum is normalised at once.
 
@@ -118,6 +124,7 @@ class Layer(nn.Module):
         self.middle_layernorm = Qwen3VLTextRMSNorm(width)
         self.post_layernorm = Qwen3VLTextRMSNorm(width)
         self.final_layernorm = Qwen3VLTextRMSNorm(width)
+        self.attn_gate, self.mlp_gate = Gate(), Gate()
         self.adaln_table = nn.Parameter(torch.zeros(_MODULATIONS, width))
 
     def forward(self, stream: Tensor, cache: Cache, rotation: Rotation, moment: Tensor, mask: Tensor) -> Tensor:
@@ -125,10 +132,10 @@ class Layer(nn.Module):
         modulation = (self.adaln_table + moment).chunk(_MODULATIONS, dim=1)
         shift, scale, gate = modulation[:3]
         read = self.attn(self.input_layernorm(stream) * (1 + scale) + shift, cache, rotation, mask)
-        stream = self.middle_layernorm(stream + gate * read)
+        stream = self.middle_layernorm(stream + self.attn_gate(gate, read))
         shift, scale, gate = modulation[3:]
         written = self.mlp(self.post_layernorm(stream) * (1 + scale) + shift)
-        return cast(Tensor, self.final_layernorm(stream + gate * written))
+        return cast(Tensor, self.final_layernorm(stream + self.mlp_gate(gate, written)))
 
 
 class FlowTransformer(nn.Module):

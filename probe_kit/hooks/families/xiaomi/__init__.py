@@ -1,0 +1,23 @@
+"""Xiaomi-Robotics-R0, native."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "xiaomi-r0",
+        "Xiaomi-Robotics-R0 (Qwen3-VL 4B + flow transformer on its keys and values), native",
+        "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",
+        "probe_kit.hooks.families.xiaomi.adapter:load_xiaomi",
+        streams="backbone 37 layers, expert 17 layers x 5 iterations (renormalised within layers)",
+        embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
+        notes="Apache-2.0; 9.4 GB in bfloat16",
+        verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
+        full_size="probe_kit.models.xiaomi:full_size_xiaomi",
+        options=(
+            Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),
+            Option("steps", int, "Euler steps of the flow.", "5"),
+            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
+        ),
+    ),
+)

@@ -1,0 +1,243 @@
+"""The adapter for Xiaomi-Robotics-R0.
+
+Backbone: the chat with one picture. Expert: a sink, the state, the action chunk; each layer reads the keys and
+values of one of the backbone's last layers. The expert's stream is normalised twice in every layer, so nothing in
+it only adds: `residual` is the stream entering a layer, normed by the layer before; `attention` and `mlp` are what
+its halves add, gated; `middle` is the normed sum between them.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
+from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
+from probe_kit.hooks.model import Tap
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.weights import read_weights
+from probe_kit.models.qwen import QwenInputs
+from probe_kit.models.xiaomi import (
+    ActionUnits,
+    Robot,
+    XiaomiConfig,
+    XiaomiNetwork,
+    build_xiaomi,
+    look,
+    prompt,
+    read_units,
+    robot_of,
+)
+from probe_kit.models.xiaomi.network import STEPS
+
+DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
+EXECUTE = 4
+"""Actions the released evaluation carries out before it looks again."""
+_TIED = ("vlm.lm_head.weight",)
+_GRIPPER_OPEN = 0.5
+_USED = 7
+"""Of an action's numbers the first ones are the end-effector's delta and the gripper."""
+
+
+class Xiaomi(QwenVLA):
+    """A loaded Xiaomi-Robotics-R0."""
+
+    fast_pictures: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        filled: Filled[XiaomiNetwork],
+        config: XiaomiConfig,
+        folder: Path,
+        checkpoint: str,
+        device: str,
+        robot: str | None,
+        steps: int,
+        tokenizer: str | None,
+    ) -> None:
+        super().__init__(filled.network.vlm, folder, tokenizer, device)
+        self.network, self.config, self.steps = filled.network, config, steps
+        self._robot = robot
+        layers = len(self.network.dit.layers)
+        self.streams = {
+            "backbone": self.backbone_stream(),
+            "expert": Stream(
+                "expert",
+                layers + 1,
+                config.flow.width,
+                steps,
+                part="action",
+                quantities=("residual", "attention", "middle", "mlp"),
+            ),
+        }
+        self.further_streams = {"vision": self.vision_stream()}
+        self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
+        self.card = self._card(filled, checkpoint, tokenizer)
+
+    def _card(self, filled: Filled[XiaomiNetwork], checkpoint: str, tokenizer: str | None) -> Card:
+        units = self._units_or_reason()
+        known = isinstance(units, ActionUnits)
+        chunk = len(units.mean) if isinstance(units, ActionUnits) else self.config.action_length
+        files = side_files(self.folder)
+        if tokenizer is not None:
+            files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
+        return Card(
+            family="xiaomi-r0",
+            checkpoint=checkpoint,
+            weights_sha256=filled.audit.sha256,
+            random_weights=filled.audit.random,
+            parameters=filled.audit.parameters,
+            dtype=filled.dtype,
+            device=self.device,
+            embodiment="7-DoF end-effector delta, one third-person camera",
+            cameras=(CAMERA,),
+            chunk=chunk,
+            execute=min(EXECUTE, chunk),
+            notes=(f"robot: {units.robot}" if isinstance(units, ActionUnits) else f"cannot act: {units}",),
+            audit=filled.audit.to_json(),
+            settings={
+                **content_hashes(files),
+                "robot": units.robot if isinstance(units, ActionUnits) else "none",
+                "action_statistics": units.sha256 if known and isinstance(units, ActionUnits) else "none",
+                "steps": str(self.steps),
+            },
+            weights_seed=filled.weights_seed,
+        )
+
+    # -- the robot ---------------------------------------------------------------------------------------
+
+    def _units_or_reason(self) -> ActionUnits | str:
+        """The statistics, or why there are none: a checkpoint without them can be listened to, and cannot act."""
+        if self._robot is not None:
+            return self.units
+        try:
+            return self.units
+        except CheckpointError as error:
+            return str(error)
+
+    @property
+    def units(self) -> ActionUnits:
+        """What gives actions their units and the chunk its length. Raises CheckpointError, UsageError."""
+        return read_units(self.folder, self._robot, self.config.action_dim)
+
+    @property
+    def robot(self) -> Robot:
+        """How its scene is shown. Raises UsageError for one that Act2Answer's arm cannot stand in for."""
+        return robot_of(self.units.robot)
+
+    def text(self, instruction: str) -> str:
+        """The released prompt."""
+        return prompt(instruction, self.robot.heading)
+
+    def look(self, seen: Observation) -> NDArray[np.uint8]:
+        """The middle of the picture, at the size the robot's pictures have."""
+        return look(seen.image, self.robot)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation; see the contract."""
+        self.check(seen, seeds)
+        units = self.units
+        shape = units.mean.shape
+        noise = seeded_noise(seeds, (shape[0], shape[1]), self.device)
+        used = torch.from_numpy(units.used).expand_as(noise.cpu()).to(self.device)
+        chunk = self.infer(self.inputs(seen), self.state(seen), used, noise)
+        actions = units.restore(chunk.cpu().numpy())[..., :_USED]
+        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
+        return actions.astype(np.float32)
+
+    def state(self, seen: Sequence[Observation]) -> Tensor:
+        """(B, 1, state numbers) float32: the robot's own layout, filled up with zeros. Raises ObservationError."""
+        rows = torch.zeros(len(seen), self.config.state_length, self.config.state_dim)
+        for row, observation in zip(rows, seen, strict=True):
+            numbers = self.robot.state(np.asarray(observation.state, np.float32))
+            if len(numbers) > self.config.state_dim:
+                raise ObservationError(
+                    f"the state has {len(numbers)} numbers; this checkpoint reads {self.config.state_dim}"
+                )
+            row[0, : len(numbers)] = torch.from_numpy(numbers)
+        return rows.to(self.device)
+
+    def infer(self, inputs: QwenInputs, state: Tensor, used: Tensor, noise: Tensor) -> Tensor:
+        """(B, A, action numbers) normalised actions; one inference, as `capture` counts it."""
+        self._grid = inputs.grid
+        with torch.inference_mode():
+            actions: Tensor = self.network(inputs, state, used, noise, self.steps)
+        return actions
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """The chat; then sink, state, actions."""
+        states = ["state"] * self.config.state_length
+        expert = Roles.from_labels(["special", *states, *["action"] * self.card.chunk])
+        return {"backbone": self.backbone_roles(seen), "expert": [expert] * len(seen)}
+
+    def tap(self, site: Site) -> Tap:
+        """See the module's first lines; the backbone's sites are inputs: they hold what DeepStack added."""
+        stream = self.stream_of(site)
+        if stream.name == "backbone":
+            return self.backbone_tap(site)
+        return self.vision_tap(site) if stream.name == "vision" else self._expert_tap(site)
+
+    def _expert_tap(self, site: Site) -> Tap:
+        layers = self.network.dit.layers
+        if site.layer == len(layers):
+            return Tap(layers[-1], self.steps, "output")
+        layer: Any = layers[site.layer]
+        parts = {"attention": layer.attn_gate, "middle": layer.middle_layernorm, "mlp": layer.mlp_gate}
+        if site.quantity == "residual":
+            return Tap(layer.input_layernorm, self.steps)
+        return Tap(parts[site.quantity], self.steps, "output")
+
+    @property
+    def merger_entry(self) -> nn.Module:
+        """The merger's norm stands before its patches are joined."""
+        norm: nn.Module = self.tower.merger.norm
+        return norm
+
+
+def load_xiaomi(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    robot: str | None = None,
+    steps: int = STEPS,
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> Xiaomi:
+    """Load Xiaomi-Robotics-R0 from a folder or hub id.
+
+    robot: of preprocessor_config.json, or how just one of its names begins; default bridge_delta or the only one.
+    steps: Euler steps. tokenizer: folder of another one.
+    Raises CheckpointError, WeightsError, and UsageError for a robot or a number of steps that cannot be.
+    """
+    if steps < 1:
+        raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")
+    name = checkpoint or DEFAULT_CHECKPOINT
+    folder = checkpoint_folder(name)
+    config = XiaomiConfig.from_folder(folder)
+
+    def build(kind: torch.dtype, place: str) -> XiaomiNetwork:
+        return build_xiaomi(config, kind, place)
+
+    stored = str(config.dtype).removeprefix("torch.") if config.dtype else None
+    if random_weights:
+        filled = twin(build, name, dtype or stored, weights_seed)
+    else:
+        tied = _TIED if config.vlm.tie_word_embeddings else ()
+        filled = fill(build, lambda: read_weights(folder), dtype or stored, lambda _: tied)
+    filled.network.to(device)
+    return Xiaomi(filled, config, folder, name, device, robot, steps, tokenizer)
