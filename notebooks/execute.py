@@ -12,8 +12,6 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 
 FOLDER = Path(__file__).parent
-NOISE = ("pybullet build time:",)
-"""What libraries print when they are loaded; it says when they were compiled."""
 UNASKED = "TqdmWarning"
 """Printed where ipywidgets is not installed; no output of a cell."""
 
@@ -40,10 +38,9 @@ def executed(path: Path, folder: Path) -> NotebookNode:
 
 
 def _clean(output: NotebookNode, folder: str) -> bool:
-    """Take noise and the folder's own path out of an output; whether anything is left."""
+    """Take the folder's own path out of an output; whether anything is left."""
     if output.output_type == "stream":
-        lines = output.text.replace(folder, "").splitlines(keepends=True)
-        output.text = "".join(line for line in lines if not line.startswith(NOISE))
+        output.text = output.text.replace(folder, "")
         return bool(output.text.strip()) and UNASKED not in output.text
     content = output.get("data", {})
     content.pop("image/jpeg", None)  # beside the same picture as PNG

@@ -118,9 +118,8 @@ def _disk() -> Finding:
 
 def draw_scene() -> dict[str, Any]:
     """Draw one picture of the default scene, as an episode does. Raises SceneError if it shows nothing."""
-    import pybullet
-
     from probe_kit.env import Act2AnswerEnv
+    from probe_kit.env.bullet import import_pybullet
 
     env = Act2AnswerEnv()
     try:
@@ -136,7 +135,7 @@ def draw_scene() -> dict[str, Any]:
     height, width, _ = picture.shape
     return {
         "pybullet": version("pybullet"),
-        "numpy": bool(pybullet.isNumpyEnabled()),
+        "numpy": bool(import_pybullet().isNumpyEnabled()),
         "size": f"{width} × {height}",
         "seconds": seconds,
     }

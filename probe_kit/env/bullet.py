@@ -1,8 +1,53 @@
 """A private physics server, so that no call can reach another environment by accident."""
 
+import os
+import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
+from importlib import import_module
+from tempfile import TemporaryFile
+from threading import Lock
 from typing import Any
+
+_GREETING = b"pybullet build time:"
+_importing = Lock()
+
+
+def import_pybullet() -> Any:
+    """The module pybullet, without the line on stderr that says when it was compiled.
+
+    Its C code writes that line to the file descriptor on every first import, past `sys.stderr`.
+    """
+    with _importing:
+        if "pybullet" in sys.modules:
+            return sys.modules["pybullet"]
+        with _without_greeting():
+            return import_module("pybullet")
+
+
+@contextmanager
+def _without_greeting() -> Iterator[None]:
+    """Hold back what is written to file descriptor 2, and pass it on without the greeting."""
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # the process has no stderr; nothing can be seen
+        yield
+        return
+    with TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            held.seek(0)
+            rest = b"".join(line for line in held if not line.startswith(_GREETING))
+            if rest:
+                os.write(2, rest)
 
 
 class BulletClient:
@@ -12,8 +57,7 @@ class BulletClient:
     """
 
     def __init__(self) -> None:
-        import pybullet
-
+        pybullet = import_pybullet()
         if not pybullet.isNumpyEnabled():
             warnings.warn(
                 "pybullet was compiled without numpy: a picture comes back as nested tuples and costs three times "

@@ -1,3 +1,4 @@
+import re
 import sys
 from pathlib import Path
 from subprocess import run
@@ -49,3 +50,31 @@ def test_pictures_arrive_as_arrays():
     picture = client.getCameraImage(4, 4, renderer=client.ER_TINY_RENDERER)[2]
     assert isinstance(picture, np.ndarray)
     client.close()
+
+
+SIMULATES = "from probe_kit.env import Act2AnswerEnv; env = Act2AnswerEnv(); env.reset(seed=0); env.close()"
+
+
+def test_the_simulator_starts_in_silence_on_both_streams():
+    done = run([sys.executable, "-c", SIMULATES], capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
+def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
+    (tmp_path / "pybullet.py").write_text(
+        "import os, sys\nos.write(2, b'pybullet build time: today\\nby C\\n')\nsys.stderr.write('by Python\\n')\n"
+    )
+    code = "from probe_kit.env.bullet import import_pybullet as load; load(); load()"
+    done = run([sys.executable, "-c", code], capture_output=True, check=True, env={"PYTHONPATH": str(tmp_path)})
+    assert done.stderr == b"by C\nby Python\n"
+
+
+def test_it_can_be_imported_by_a_process_without_stderr():
+    code = "import os; os.close(2); from probe_kit.env.bullet import BulletClient; BulletClient(); print('there')"
+    assert run([sys.executable, "-c", code], stdout=-1, check=True).stdout == b"there\n"
+
+
+def test_pybullet_is_imported_in_one_place():
+    package = Path(__file__).parents[2] / "probe_kit"
+    importing = re.compile(r"^\s*(import pybullet\b|from pybullet\b)", re.MULTILINE)
+    assert [path for path in package.rglob("*.py") if importing.search(path.read_text())] == []
