@@ -11,6 +11,8 @@ import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
+from probe_kit.notebook import PROGRESS_MARK
+
 FOLDER = Path(__file__).parent
 UNASKED = "TqdmWarning"
 """Printed where ipywidgets is not installed; no output of a cell."""
@@ -43,6 +45,8 @@ def _clean(output: NotebookNode, folder: str) -> bool:
         output.text = output.text.replace(folder, "")
         return bool(output.text.strip()) and UNASKED not in output.text
     content = output.get("data", {})
+    if PROGRESS_MARK in content.get("text/html", ""):
+        return False  # how long it took here
     content.pop("image/jpeg", None)  # beside the same picture as PNG
     for kind in ("text/plain", "text/html"):
         if kind in content:

@@ -5,15 +5,14 @@ stderr.
 """
 
 import signal
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 import typer.core
-from click import NoSuchOption
 from rich.markup import escape
 
 from probe_kit.commands import demo, doctor
-from probe_kit.console import err
+from probe_kit.console import err, out
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.extract.commands import MOVED, extract
 from probe_kit.extract.model_commands import models
@@ -25,19 +24,32 @@ from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import show, train
 
 INTERRUPTED = 130
+ORDER = ("demo", "doctor", "models", "suite", "extract", "run", "train", "retention", "export", "verify")
+"""The order in which a study needs the commands, and help lists them; others follow by name."""
+
+PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
+"""click's UsageError, from the copy of click that typer uses, whichever that is."""
 
 
 class Commands(typer.core.TyperGroup):
     """Turns errors and interruptions of any command into messages and exit codes."""
 
+    def list_commands(self, ctx: Any) -> list[str]:
+        """All commands in the order of `ORDER`."""
+        known = {name: place for place, name in enumerate(ORDER)}
+        return sorted(super().list_commands(ctx), key=lambda name: (known.get(name, len(known)), name))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the options in front of the command."""
+        try:
+            return super().parse_args(ctx, args)
+        except PARSE_ERROR as error:
+            raise self._told_where(error, ctx) from None
+
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
-            return super().invoke(ctx)
-        except NoSuchOption as error:
-            if error.option_name in MOVED:
-                raise UsageError(f"{error.option_name} is now {MOVED[error.option_name]}") from None
-            raise
+            return self._run(ctx)
         except KeyboardInterrupt:
             err.print("[yellow]interrupted[/]; everything finished so far is kept, the same command continues")
             raise typer.Exit(INTERRUPTED) from None
@@ -58,6 +70,39 @@ class Commands(typer.core.TyperGroup):
             )
             raise typer.Exit(UsageError.exit_code) from error
 
+    def _run(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except PARSE_ERROR as error:
+            option = getattr(error, "option_name", None)
+            if option in MOVED:
+                raise UsageError(f"{option} is now {MOVED[option]}") from None
+            raise self._told_where(error, ctx) from None
+
+    def _told_where(self, error: Any, ctx: Any) -> Exception:
+        """The same error; of an option that only other commands have, it says which."""
+        option = getattr(error, "option_name", None)
+        homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
+        if homes:
+            named = ", ".join(f"`probe-kit {path}`" for path in homes)
+            error.message, error.possibilities = f"{option} is no option here, but one of {named}.", None
+        found: Exception = error
+        return found
+
+
+def commands_of(group: Any, ctx: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Every command below `group` with its path, such as `suite build`."""
+    found: list[tuple[str, Any]] = []
+    for name in group.list_commands(ctx):
+        command = group.get_command(ctx, name)
+        path = f"{prefix}{name}"
+        found += commands_of(command, ctx, f"{path} ") if hasattr(command, "commands") else [(path, command)]
+    return found
+
+
+def _options(command: Any) -> set[str]:
+    return {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+
 
 _PATH_ERRORS = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
 """What the system says of a path that cannot be what it was given for."""
@@ -76,6 +121,25 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from probe_kit import __version__
+
+        out.print(f"probe-kit {__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _before_commands(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and stop.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """What stands in front of every command."""
+
+
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)

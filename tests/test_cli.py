@@ -145,6 +145,56 @@ def test_importing_the_command_line_loads_nothing_heavy() -> None:
     assert loaded.stdout.strip() == "[]"
 
 
+def test_help_lists_the_commands_in_the_order_of_a_study() -> None:
+    import typer
+
+    from probe_kit.cli import ORDER, app
+
+    group = typer.main.get_command(app)
+    assert group.list_commands(None)[: len(ORDER)] == list(ORDER)  # type: ignore[attr-defined,arg-type]
+    shown = probe_kit("--help").stdout
+    places = [shown.index(f"│ {name} ") for name in ORDER]
+    assert places == sorted(places)
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    import probe_kit as package
+
+    assert probe_kit("--version").stdout == f"probe-kit {package.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "home"),
+    [
+        (["train", "x", "--html", "y"], "probe-kit retention"),
+        (["--model", "pi0"], "probe-kit extract"),
+        (["suite", "build", "x", "--epsilons", "1"], "probe-kit retention"),
+        (["retention", "x", "--deep"], "probe-kit run verify"),
+    ],
+)
+def test_an_option_of_another_command_says_which_one_has_it(arguments: list[str], home: str) -> None:
+    answer = probe_kit(*arguments)
+    assert answer.returncode == 2
+    assert f"but one of `{home}`" in " ".join(answer.stderr.replace("│", " ").split())
+
+
+def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    made = probe_kit(
+        "extract", "--model", "expert", "--suite", small_suite.folder, "--items", 2, "--max-steps", 1,
+        "--out", tmp_path / "runs" / "mine",
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")
+    for command in ("train", "retention", "export --format h5", "run verify", "models --run"):
+        answer = probe_kit(*command.split(), "runs", cwd=tmp_path)
+        assert answer.returncode == 2, answer.stderr
+        assert "It holds 2 runs: runs/mine, runs/yours" in answer.stderr, command
+    assert "Did you mean runs/mine?" in probe_kit("train", "runs/mien", cwd=tmp_path).stderr
+    assert "Make one with" in probe_kit("train", "elsewhere", cwd=tmp_path).stderr
+
+
 def test_models_lists_families_and_scripted_policies_as_json() -> None:
     rows = json.loads(probe_kit("models", "--json").stdout)
     assert {row["model"] for row in rows} >= {"pi0-tiny", "pi0", "expert", "expert-mirrored"}

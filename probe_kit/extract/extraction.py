@@ -21,6 +21,7 @@ from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.run import Run, open_run
 from probe_kit.extract.store.sealing import seal
 from probe_kit.extract.store.writer import RunWriter
+from probe_kit.notebook import notebook_progress
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
@@ -37,7 +38,8 @@ class Extraction(Prepared):
     def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
         """Play and commit every episode that is not committed yet, seal the run and open it.
 
-        progress: called with (episodes done, episodes planned, outcome of the last one).
+        progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
+        notebook, nothing elsewhere.
         Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
         object store that cannot be used so, EpisodesFailedError at the end if episodes were given up, and whatever
         is wrong with all episodes at once. Committed episodes stay, and the same call continues behind them.
@@ -51,7 +53,7 @@ class Extraction(Prepared):
                 self._check_exclusive(writer)
                 remaining = writer.remaining()
                 if remaining:
-                    self._play(writer, remaining, progress)
+                    self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
         return open_run(location)
 

@@ -11,9 +11,10 @@ from probe_kit.hooks.sites import Site, Stream
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.capture_context import Tape, capture, edit
+    from probe_kit.hooks.capture_context import capture, edit
     from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading, Rows, Tap
     from probe_kit.hooks.roles import Roles, pool
+    from probe_kit.hooks.tape import Tape
 
 __all__ = [
     "Card",
@@ -50,7 +51,7 @@ __getattr__ = lazy_names(
         "Reading": "model",
         "Rows": "model",
         "Tap": "model",
-        "Tape": "capture_context",
+        "Tape": "tape",
         "capture": "capture_context",
         "edit": "capture_context",
         "Roles": "roles",

@@ -21,24 +21,13 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.model import Model, Tap
 from probe_kit.hooks.sites import Site
+from probe_kit.hooks.tape import Tape
+
+__all__ = ["Edit", "Reduce", "Tape", "capture", "edit"]
 
 Reduce = Callable[[Site, Tensor], Tensor]
 Edit = Callable[[Tensor], Tensor]
 _listening: WeakSet[Model] = WeakSet()
-
-
-class Tape:
-    """The captured activations of one inference: `tape[site]` is (B, T, D) on the model's device."""
-
-    def __init__(self) -> None:
-        self._kept: dict[Site, Tensor] = {}
-        self.fires: dict[str, int] = {}
-
-    def __getitem__(self, site: Site) -> Tensor:
-        return self._kept[site]
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
 
 @contextmanager

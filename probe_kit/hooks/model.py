@@ -15,6 +15,7 @@ from probe_kit.hooks.card import Card
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.roles import Roles
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.summary import model_html, model_text
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,12 @@ class Model(ABC):
     streams: Mapping[str, Stream]
     further_streams: Mapping[str, Stream] = MappingProxyType({})
     role_names: Mapping[str, tuple[str, ...]]
+
+    def __repr__(self) -> str:
+        return model_text(type(self).__name__, self.card, self.streams)
+
+    def _repr_html_(self) -> str:
+        return model_html(self.card, self.streams)
 
     @abstractmethod
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:

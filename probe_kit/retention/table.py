@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
@@ -38,6 +38,16 @@ class RetentionTable:
     results: Mapping[str, ProbeResults] = field(default_factory=dict, repr=False)
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        from probe_kit.retention.notebook import table_text
+
+        return table_text(self)
+
+    def _repr_html_(self) -> str:
+        from probe_kit.retention.notebook import table_html
+
+        return table_html(self)
 
     @property
     def all_rows(self) -> list[RetentionRow]:

@@ -17,6 +17,7 @@ from probe_kit.train.directions import Direction, Place
 from probe_kit.train.permutation import site_p
 from probe_kit.train.reader import RunReader
 from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss
+from probe_kit.train.summary import results_html, results_text
 from probe_kit.train.targets import Target
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class ProbeSettings:
         return sha256_json(asdict(self))[:12]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ProbeResults:
     """Probes of one run under one set of settings.
 
@@ -63,6 +64,12 @@ class ProbeResults:
     directions: Mapping[Place, Direction] = field(default_factory=dict)
     controls: Controls = field(default_factory=Controls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
+
+    def __repr__(self) -> str:
+        return results_text(self)
+
+    def _repr_html_(self) -> str:
+        return results_html(self)
 
     @property
     def key(self) -> str:

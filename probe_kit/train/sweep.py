@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
+from probe_kit.notebook import notebook_progress
 from probe_kit.train.add_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.arrays import check_device
 from probe_kit.train.baselines import Baseline
@@ -54,6 +55,8 @@ def train_probes(
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
     ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
     machine; `jobs` is then how many sites at once, by default as many as it has cores.
+
+    progress: by default a bar in a notebook, nothing elsewhere.
 
     The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
     interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
@@ -188,12 +191,13 @@ def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
     keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key)
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
+    progress = sweep.progress or notebook_progress("sites probed")
     columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)
     for key, found in probe_columns(columns, sweep.problems, sweep.crew):
         unfinished.keep(*key, found)
         probes[key] = found
-        if sweep.progress is not None:
-            sweep.progress(len(probes), len(keys), f"{key[1]} {key[0]}")
+        if progress is not None:
+            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
     return {key: probes[key] for key in keys}
 
 

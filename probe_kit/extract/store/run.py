@@ -26,6 +26,7 @@ from probe_kit.extract.store.layout import (
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
+from probe_kit.extract.store.summary import run_html, run_text, what_to_open
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.views import resolve_view
 
@@ -61,7 +62,7 @@ def read_card(location: Location) -> dict[str, Any]:
         card: dict[str, Any] = json.loads(location.read(RUN_FILE))
     except FileNotFoundError:
         raise RunNotFoundError(
-            f"{location} is not a run: it has no {RUN_FILE}. Make one with `probe-kit extract`"
+            f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}"
         ) from None
     return card
 
@@ -79,6 +80,12 @@ class Run:
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
         self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
+
+    def __repr__(self) -> str:
+        return run_text(self)
+
+    def _repr_html_(self) -> str:
+        return run_html(self)
 
     @property
     def path(self) -> Path:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, panels, spell
 from probe_kit.train.reader import RunReader
 
@@ -27,7 +28,7 @@ _MANY = 300  # points, above which a vector figure holds them as a picture
 
 
 @dataclass
-class FinalPositionsDisplay:
+class FinalPositionsDisplay(Shown):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
     xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 from probe_kit.errors import UsageError
 from probe_kit.retention.cells import model_name, once_per_category
 from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, spell
 from probe_kit.retention.latex import HEAT
 from probe_kit.retention.rows import RetentionRow
@@ -30,7 +31,7 @@ class Cell:
 
 
 @dataclass
-class HeatTableDisplay:
+class HeatTableDisplay(Shown):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.

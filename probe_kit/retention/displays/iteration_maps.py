@@ -11,6 +11,7 @@ from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.layer_curves import DEPTH
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import OTHER_STREAM, STREAMS, axes_for, caption, panels, spell
 from probe_kit.train.controls import SIGNIFICANCE
 from probe_kit.train.results import ProbeResults
@@ -26,7 +27,7 @@ _LEGEND = f"dot: above chance, family-wise p < {SIGNIFICANCE} · frame: most acc
 
 
 @dataclass
-class IterationMapDisplay:
+class IterationMapDisplay(Shown):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
     accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream.

@@ -9,6 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.labels import place_labels
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, darker, plain, series, spell
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -34,7 +35,7 @@ class GapPoint:
 
 
 @dataclass
-class KnowledgeActionDisplay:
+class KnowledgeActionDisplay(Shown):
     """Success rate against the best probe of a stream, a point per category and model.
 
     On the diagonal the policy acts on what can be read; below it, it knows more than it does.

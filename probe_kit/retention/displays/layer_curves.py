@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import (
     OTHER_STREAM,
     STREAM_NAMES,
@@ -74,7 +75,7 @@ class StreamCurve:
 
 
 @dataclass
-class LayerCurveDisplay:
+class LayerCurveDisplay(Shown):
     """Held-out accuracy against depth, for one category in one view.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05). Grey: chance,

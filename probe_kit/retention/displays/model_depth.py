@@ -11,6 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.layer_curves import DEPTH
 from probe_kit.retention.displays.selection import known_view, scores_of
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import STREAM_NAMES, axes_for, caption, plain, series
 from probe_kit.train.results import ProbeResults
 
@@ -30,7 +31,7 @@ class ModelCurve:
 
 
 @dataclass
-class ModelDepthDisplay:
+class ModelDepthDisplay(Shown):
     """Held-out accuracy above chance against depth, averaged over categories, one line per model.
 
     At each depth the best iteration counts, in each category by itself.
@@ -83,13 +84,13 @@ class ModelDepthDisplay:
 
 def model_depths(results: Sequence[ProbeResults], view: str | None = None) -> "Figure":
     """Backbones side by side, and action experts, on one scale. Raises UsageError if no run has either."""
-    from matplotlib.figure import Figure
+    from probe_kit.retention.displays.shown_figure import ShownFigure
 
     streams = [name for name in STREAM_NAMES if any((one.scores["stream"] == name).any() for one in results)]
     displays = [ModelDepthDisplay.from_results(results, stream, view) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")
-    figure = Figure(figsize=(4.1 * max(len(displays), 1.5), 3.6), layout="constrained", dpi=150)
+    figure = ShownFigure(figsize=(4.1 * max(len(displays), 1.5), 3.6), layout="constrained", dpi=150)
     grid = figure.subplots(1, len(displays), sharey=True, squeeze=False)[0]
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)

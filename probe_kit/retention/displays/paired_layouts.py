@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, plain, spell
 from probe_kit.retention.success import PairedItems, paired_items
 from probe_kit.train.controls import SIGNIFICANCE
@@ -22,7 +23,7 @@ _PARTS = (
 
 
 @dataclass
-class PairedLayoutsDisplay:
+class PairedLayoutsDisplay(Shown):
     """Items by outcome of their two layouts, per category.
 
     Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its

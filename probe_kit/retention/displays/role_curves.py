@@ -8,6 +8,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.layer_curves import DEPTH, StreamCurve, draw_curve, filled_marker
 from probe_kit.retention.displays.selection import curve_of, scores_of
+from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import STREAM_NAMES, axes_for, caption, panels, plain, series, spell
 from probe_kit.train.results import ProbeResults
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class RoleCurvesDisplay:
+class RoleCurvesDisplay(Shown):
     """Held-out accuracy against depth, one line per view of one stream, for one category.
 
     curves: by view, such as `mean:language`; of iterative streams, the best iteration at each depth.

@@ -69,7 +69,9 @@ def axes_for(ax: "Axes | None", width: float, height: float) -> "tuple[Axes, Fig
         return ax, None
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(width, height), layout="constrained", dpi=DPI)
+    from probe_kit.retention.displays.shown_figure import ShownFigure
+
+    figure, axes = plt.subplots(FigureClass=ShownFigure, figsize=(width, height), layout="constrained", dpi=DPI)
     return axes, figure
 
 
@@ -77,11 +79,11 @@ def panels(
     count: int, width: float = 3.1, height: float = 2.5, columns: int | None = None, *, share: bool = True
 ) -> "tuple[Figure, list[Axes]]":
     """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row."""
-    from matplotlib.figure import Figure
+    from probe_kit.retention.displays.shown_figure import ShownFigure
 
     across = columns or (2 if count == 4 else min(3, count))
     rows = ceil(count / across)
-    figure = Figure(figsize=(max(width * across, 6.2), height * rows + 1.1), layout="constrained", dpi=DPI)
+    figure = ShownFigure(figsize=(max(width * across, 6.2), height * rows + 1.1), layout="constrained", dpi=DPI)
     grid = list(figure.subplots(rows, across, sharex=share, sharey=share, squeeze=False).flat)
     for position in range(count, len(grid)):
         grid[position].set_visible(False)

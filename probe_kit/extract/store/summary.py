@@ -1,0 +1,68 @@
+"""A run in one line and as a notebook shows it; and which runs a folder that is none holds."""
+
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit.extract.store.layout import RUN_FILE
+from probe_kit.hooks.summary import streams_text
+from probe_kit.notebook import facts_html
+
+if TYPE_CHECKING:
+    from probe_kit.extract.store.run import Run
+
+
+def run_text(run: "Run") -> str:
+    """One line: model, suite, how much is there, where."""
+    random = ", RANDOM WEIGHTS" if run.random_weights else ""
+    return f"<Run {run.model}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
+
+
+def run_html(run: "Run") -> str:
+    """What it is a run of, how it went, and where it lies."""
+    weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
+    facts = {
+        "suite": run.suite,
+        "weights": f"RANDOM ({weights})" if run.random_weights else weights,
+        "episodes": _episodes(run),
+        "outcomes": ", ".join(f"{name} {count}" for name, count in _outcomes(run).items()),
+        "streams": streams_text(run.streams.values()),
+        "at": str(run.location),
+    }
+    return facts_html(f"Run of {run.model}", facts, "run.episodes is the table, run.column(site) one site of it")
+
+
+def _episodes(run: "Run") -> str:
+    done = len(run.episodes)
+    return f"{done} episodes" if done == run.planned else f"{done} of {run.planned} episodes"
+
+
+def _outcomes(run: "Run") -> dict[str, int]:
+    if run.episodes.empty:
+        return {}
+    return {str(name): int(count) for name, count in run.episodes["outcome"].value_counts().items()}
+
+
+MOST = 12
+"""Runs of a folder that a message names."""
+
+
+def what_to_open(address: str) -> str:
+    """What to do where there is no run: the runs inside, one of nearly that name, or how to make one."""
+    folder = Path(address).expanduser()
+    if "://" not in address:
+        if inside := _runs_in(folder):
+            more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
+            return (
+                f"It holds {len(inside)} run{'s' * (len(inside) > 1)}: {', '.join(map(str, inside[:MOST]))}{more}"
+            )
+        beside = {path.name: path for path in _runs_in(folder.parent)}
+        if near := get_close_matches(folder.name, beside, n=1):
+            return f"Did you mean {beside[near[0]]}?"
+    return "Make one with `probe-kit extract`"
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))]

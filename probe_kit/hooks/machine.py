@@ -1,0 +1,62 @@
+"""What this machine can compute on, as far as that can be told without importing torch, which takes long."""
+
+import os
+import re
+import sys
+from pathlib import Path
+
+from probe_kit.errors import UsageError
+
+_DEVICE = re.compile(r"(?P<kind>[a-z]+)(:(?P<index>\d+))?")
+_KINDS = ("cpu", "cuda", "hpu", "mps", "mtia", "xpu")
+"""Of torch's kinds of devices, those that compute."""
+_GPU_NODES = ("nvidia[0-9]*", "nvidiactl", "nvhost-*", "nvgpu*", "nvmap", "dxg", "kfd")
+"""Device files of Linux without any of which neither CUDA nor ROCm has a GPU."""
+_NVIDIA = Path("/proc/driver/nvidia/gpus")
+
+
+def check_device_name(device: str) -> None:
+    """Raise UsageError for what is no device, or is one that this machine surely lacks; says what it has."""
+    found = _DEVICE.fullmatch(device)
+    if found is None or found["kind"] not in _KINDS:
+        raise UsageError(
+            f"device {device!r} cannot be used: it is none of {', '.join(_KINDS)}, with an index such as cuda:1. "
+            f"{what_is_here()}"
+        )
+    if (found["kind"] == "cuda" and _surely_without_gpu()) or (
+        found["kind"] == "mps" and sys.platform != "darwin"
+    ):
+        raise UsageError(f"device {device!r} cannot be used: this machine has no such device. {what_is_here()}")
+
+
+def what_is_here() -> str:
+    """One sentence on the devices that torch finds or, before torch is there, that the system shows."""
+    return f"This machine has {', '.join(_devices())}"
+
+
+def _devices() -> list[str]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return [f"cpu ({cores} core{'s' * (cores > 1)})", *(_of_torch() if "torch" in sys.modules else _of_system())]
+
+
+def _of_torch() -> list[str]:
+    torch = sys.modules["torch"]
+    if torch.cuda.is_available():
+        return [f"cuda:{n} ({torch.cuda.get_device_name(n)})" for n in range(torch.cuda.device_count())]
+    return ["mps"] if torch.backends.mps.is_available() else []
+
+
+def _of_system() -> list[str]:
+    """NVIDIA's driver numbers its GPUs in the order of their addresses, as CUDA does when told so."""
+    if sys.platform == "darwin":
+        return ["mps"]
+    models = [
+        found[1].strip()
+        for card in sorted(_NVIDIA.glob("*/information"))
+        if (found := re.search(r"^Model:(.*)$", card.read_text(errors="replace"), re.MULTILINE))
+    ]
+    return [f"{len(models)} GPU{'s' * (len(models) > 1)} ({', '.join(dict.fromkeys(models))})"] if models else []
+
+
+def _surely_without_gpu() -> bool:
+    return sys.platform == "linux" and not any(any(Path("/dev").glob(name)) for name in _GPU_NODES)

@@ -1,0 +1,87 @@
+"""What notebooks show of our objects: a few facts as a small table, and a progress bar that needs no widget."""
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+PROGRESS_MARK = "probe-kit-progress"
+"""Class of a progress bar's element, so that whoever keeps a notebook can leave the bars out."""
+_REDRAW_S = 0.2
+
+
+def facts_html(title: str, facts: Mapping[str, str], note: str = "") -> str:
+    """A bold title, a line per fact, and a note below; legible on light and dark pages."""
+    lines = "".join(
+        f'<tr><td style="text-align:left;opacity:.65">{escape(name)}</td>'
+        f'<td style="text-align:left">{escape(value)}</td></tr>'
+        for name, value in facts.items()
+        if value
+    )
+    below = f'<div style="opacity:.65">{escape(note)}</div>' if note else ""
+    return f"<div><b>{escape(title)}</b><table>{lines}</table>{below}</div>"
+
+
+def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], note: str = "") -> str:
+    """A bold title over a table with a heading per column, and a note below."""
+    head = "".join(f'<th style="text-align:left">{escape(name)}</th>' for name in columns)
+    body = "".join(
+        "<tr>" + "".join(f'<td style="text-align:left">{escape(str(value))}</td>' for value in row) + "</tr>"
+        for row in rows
+    )
+    below = f'<div style="opacity:.65">{escape(note)}</div>' if note else ""
+    return f"<div><b>{escape(title)}</b><table><tr>{head}</tr>{body}</table>{below}</div>"
+
+
+def notebook_progress(label: str) -> Callable[..., None] | None:
+    """A callback (done, total, …) that draws one progress bar below the cell; None outside notebooks."""
+    return _Bar(label) if _in_notebook() else None
+
+
+def _in_notebook() -> bool:
+    """Whether a kernel runs this process, so that somebody sees rich output."""
+    if "ipykernel" not in sys.modules:
+        return False
+    from IPython import get_ipython
+
+    return getattr(get_ipython(), "kernel", None) is not None
+
+
+class _Bar:
+    """Plain HTML that is replaced in place, which every front end can do; drawn at the first call."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._started = time.monotonic()
+        self._drawn = 0.0
+        self._handle: Any = None
+
+    def __call__(self, done: int, total: int, *_: object) -> None:
+        now = time.monotonic()
+        if self._handle is not None and done < total and now - self._drawn < _REDRAW_S:
+            return
+        self._drawn = now
+        from IPython.display import display
+
+        picture = _Drawn(self._label, done, total, now - self._started)
+        if self._handle is None:
+            self._handle = display(picture, display_id=True)  # type: ignore[no-untyped-call]
+        else:
+            self._handle.update(picture)
+
+
+class _Drawn:
+    """One state of a bar."""
+
+    def __init__(self, label: str, done: int, total: int, seconds: float) -> None:
+        left = f", about {seconds * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        self._text = f"{label}: {done} of {total}, {seconds:.0f} s{left}"
+        self._done, self._total = done, total
+
+    def __repr__(self) -> str:
+        return self._text
+
+    def _repr_html_(self) -> str:
+        bar = f'<progress value="{self._done}" max="{self._total}" style="width:16em"></progress>'
+        return f'<div class="{PROGRESS_MARK}">{bar} {escape(self._text)}</div>'

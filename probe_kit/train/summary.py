@@ -1,0 +1,45 @@
+"""Probe results in one line and as a notebook shows them."""
+
+from typing import TYPE_CHECKING
+
+from probe_kit.notebook import rows_html
+from probe_kit.train.controls import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.train.results import ProbeResults
+
+
+def results_text(results: "ProbeResults") -> str:
+    """One line: what was probed, with how many relabellings, and the key."""
+    settings = results.settings
+    random = ", RANDOM WEIGHTS" if settings.random_weights else ""
+    return (
+        f"<ProbeResults {results.key} of {settings.model}{random}: {', '.join(settings.categories)}; "
+        f"views {', '.join(settings.views)}; target {settings.target}; {settings.permutations} relabellings>"
+    )
+
+
+def results_html(results: "ProbeResults") -> str:
+    """The best site of every category, view and stream."""
+    settings = results.settings
+    random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
+    title = f"Probes of {settings.model}{random}, target {settings.target}: the best site of each stream"
+    columns = ("category", "view", "stream", "best site", "accuracy % [95 %]", "family-wise p", "n")
+    note = (
+        f"{settings.permutations} relabellings, key {results.key}; only p < {SIGNIFICANCE} is evidence. "
+        "results.scores has every site"
+    )
+    return rows_html(title, columns, [_cells(row) for _, row in _best(results.scores).iterrows()], note)
+
+
+def _best(scores: "pd.DataFrame") -> "pd.DataFrame":
+    by_stream = scores.groupby(["category", "view", "stream"], sort=False)
+    return scores.loc[by_stream["accuracy"].idxmax()]
+
+
+def _cells(row: "pd.Series") -> tuple[str, ...]:
+    accuracy = f"{100 * row['accuracy']:.1f} [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
+    p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
+    return row["category"], row["view"], row["stream"], row["site"], accuracy, p, str(row["n"])
