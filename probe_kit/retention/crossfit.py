@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit.train.scores import unseen
+
 Matrix = NDArray[np.float64]
 Sides = NDArray[np.int8]
 """(R, G): which half a group falls in, in each of R splits: 1 or −1; 0 for a group that takes no part."""
@@ -12,6 +14,7 @@ Sides = NDArray[np.int8]
 REPEATS = 100
 HALVINGS = 100
 REPEATS_OF_HALF = 10
+_NO_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,8 @@ def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: in
     The covariance comes from the same estimate on halves of the data, which share no group: half of what two of
     them differ by is the variance at half the size, and half of that the variance at full size. Choosing again is
     part of it. A bootstrap would count what its copies of a group agree on as signal. A half averages over
-    fewer splits than the whole, which errs on the side of width.
+    fewer splits than the whole, which errs on the side of width. Where all groups agree there is no difference to
+    see, and the variance is that of what unseen groups may hold.
     """
     generator = np.random.default_rng(seed)
     sizes = backbone.sizes
@@ -79,6 +83,9 @@ def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: in
     held_out = np.array([held_out_scores(stream, splits).mean(axis=0) for stream in (expert, backbone)])
     above = held_out.sum(axis=1) / sizes.sum() - chance
     covariance = _covariance_by_halving((expert, backbone), generator)
+    for stream in np.flatnonzero(covariance.diagonal() < _NO_VARIANCE):
+        share = above[stream] + chance
+        covariance[stream, stream] = ((unseen(share, sizes.size) - share) ** 2).mean()
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
 

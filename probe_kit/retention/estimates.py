@@ -6,13 +6,13 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.measure import Peak, Retention
 from probe_kit.train.curve import Curve
-from probe_kit.train.scores import bootstrap_means, draw_groups
+from probe_kit.train.scores import GAINS, bootstrap_means, constant, draw_groups, interval, units_seed, unseen
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,22 +28,29 @@ class Estimate:
     """A value and its (B,) bootstrap draws; a draw is NaN where the quantity has no meaning.
 
     units: seed of the draws, made from the names of what was drawn. Estimates of equal units are paired.
+    count: how many units were drawn.
     """
 
     value: float
     draws: NDArray[np.float64]
     units: int
+    count: int = 1
 
     def __sub__(self, other: "Estimate") -> "Estimate":
-        return Estimate(self.value - other.value, self.draws - other.draws, self.units)
+        """Paired units that all agree are no proof that unseen ones would: see `unseen`."""
+        value, draws, count = self.value - other.value, self.draws - other.draws, min(self.count, other.count)
+        if constant(draws[:, None])[0]:
+            draws = unseen(value, count, draws.size, GAINS)
+        return Estimate(value, draws, self.units, count)
 
     @property
     def ci(self) -> Limits:
-        """95 % percentile interval; without limits if too many draws have no meaning."""
-        if np.isnan(self.draws).mean() > TAIL:
+        """95 % percentile interval, with the value in it; without limits if too many draws have no meaning."""
+        known = self.draws[~np.isnan(self.draws)]
+        if known.size < (1 - TAIL) * self.draws.size:
             return UNBOUNDED
-        low, high = np.nanpercentile(self.draws, [100 * TAIL, 100 * (1 - TAIL)])
-        return float(low), float(high)
+        low, high = interval(known[:, None], np.array([self.value]))
+        return float(low[0]), float(high[0])
 
 
 Estimates = Mapping[str, Estimate]
@@ -54,31 +61,37 @@ def average(estimates: Sequence[Estimate]) -> Estimate:
     """The mean of several, draw by draw."""
     draws = np.mean([estimate.draws for estimate in estimates], axis=0)
     units = sorted({estimate.units for estimate in estimates})
-    return Estimate(fmean(e.value for e in estimates), draws, units[0] if len(units) == 1 else derive_seed(*units))
+    return Estimate(
+        value=fmean(estimate.value for estimate in estimates),
+        draws=draws,
+        units=units[0] if len(units) == 1 else derive_seed(*units),
+        count=max(estimate.count for estimate in estimates),
+    )
 
 
-def sr_estimate(episodes: "pd.DataFrame", suite: str, seed: int) -> Estimate:
+def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
     """SR of a table of episodes, whole items drawn."""
-    units = _units(episodes["item_id"].to_numpy(dtype=str), suite, seed)
+    items = episodes["item_id"].to_numpy(dtype=str)
+    units = units_seed(items, suite)
     correct = (episodes["outcome"] == "correct").to_numpy()
-    draws = bootstrap_means(correct[:, None], episodes["item_id"].to_numpy(dtype=str), units)
-    return Estimate(float(correct.mean()), draws[:, 0], units)
+    draws = bootstrap_means(correct[:, None], items, units)
+    return Estimate(float(correct.mean()), draws[:, 0], units, np.unique(items).size)
 
 
 def probe_estimates(
-    curve: Curve, peaks: Mapping[str, Peak], retention: Retention | None, suite: str, seed: int
+    curve: Curve, peaks: Mapping[str, Peak], retention: Retention | None, suite: str
 ) -> dict[str, Estimate]:
     """Accuracy of the best sites, and debiased retention where it is defined, whole groups drawn."""
-    units = _units(curve.groups, suite, seed)
+    units = units_seed(curve.groups, suite)
     rows = [curve.sites.index(peak.site) for peak in peaks.values()]
     draws = bootstrap_means(curve.correct[rows].T, curve.groups, units)
     found = {
-        f"{name}_accuracy": Estimate(peak.accuracy, draws[:, column], units)
+        f"{name}_accuracy": Estimate(peak.accuracy, draws[:, column], units, curve.n_groups)
         for column, (name, peak) in enumerate(peaks.items())
     }
     if retention is not None and retention.defined:
         ratios = retention_draws(retention.fit, curve.chance, units)
-        found["retention_debiased"] = Estimate(retention.debiased, ratios, units)
+        found["retention_debiased"] = Estimate(retention.debiased, ratios, units, curve.n_groups)
     return found
 
 
@@ -102,7 +115,3 @@ def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     values, vectors = np.linalg.eigh(covariance)
     root: NDArray[np.float64] = vectors * np.sqrt(values.clip(min=0))
     return root
-
-
-def _units(names: ArrayLike, suite: str, seed: int) -> int:
-    return derive_seed("units", seed, suite, *np.unique(np.asarray(names)).tolist())

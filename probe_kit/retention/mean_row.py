@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
-import numpy as np
-
-from probe_kit.retention.estimates import Estimates, Limits, average
+from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, average
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.run_rows import Drawn
 from probe_kit.retention.success import normalised_score
@@ -54,7 +52,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         twin=first.twin,
         retention=_mean(counted, "retention"),
         retention_debiased=_mean(counted, "retention_debiased"),
-        retention_ci=_limits(estimates, "retention_debiased"),
+        retention_ci=_retention_limits(counted, estimates),
         retention_defined=bool(counted),
         retention_note=note if counted else first.retention_note,
         categories=tuple(row.category for row in rows),
@@ -69,9 +67,17 @@ def average_estimates(estimates: Sequence[Estimates]) -> Estimates:
 
 
 def _limits(estimates: Estimates, name: str) -> Limits | None:
-    """None also where all draws agree: a bootstrap of rates that are all 0 or 1 knows no interval."""
     found = estimates.get(name)
-    return None if found is None or np.ptp(found.draws) == 0 else found.ci
+    return None if found is None else found.ci
+
+
+def _retention_limits(counted: Sequence[RetentionRow], estimates: Estimates) -> Limits | None:
+    """The category's own where there is one, and none where one category has none: a mean knows no more."""
+    if len(counted) == 1:
+        return counted[0].retention_ci
+    if any(row.retention_ci == UNBOUNDED for row in counted):
+        return UNBOUNDED
+    return _limits(estimates, "retention_debiased")
 
 
 def _mean(rows: Sequence[RetentionRow], name: str) -> Any:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
-from probe_kit.identity import derive_seed
 from probe_kit.retention.estimates import Estimates, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
@@ -16,6 +15,7 @@ from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
+from probe_kit.train.scores import units_seed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class RowSettings:
-    """What a table is asked to show. epsilons: zone radii in metres for `sr_by_epsilon`."""
+    """What a table is asked to show. epsilons: zone radii in metres for `sr_by_epsilon`. seed: of the splits."""
 
     views: Sequence[str] | None
     iterations: Iterations
@@ -66,14 +66,14 @@ def _row(
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> Drawn:
-    success = success_rate(episodes, derive_seed("success", settings.seed))
+    success = success_rate(episodes, units_seed(episodes["item_id"].to_numpy(dtype=str), run.suite))
     values = _identity(run, results) | _behaviour(success, sensitivity(episodes, settings.epsilons))
-    estimates = {"sr": sr_estimate(episodes, run.suite, settings.seed)}
+    estimates = {"sr": sr_estimate(episodes, run.suite)}
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
         peaks = _peaks(curve, settings.iterations)
         retention = measure_retention(curve, settings.iterations, settings.seed)
-        estimates |= probe_estimates(curve, peaks, retention, run.suite, settings.seed)
+        estimates |= probe_estimates(curve, peaks, retention, run.suite)
         values |= _probes(curve, peaks, success, estimates) | _retention(retention)
         values |= _controls(results.controls, category, view, curve.action_stream)
     return Drawn(RetentionRow(**values, category=category, view=view, group=group), estimates)

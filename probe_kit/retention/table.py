@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from probe_kit.env.outcome import SENSITIVITY_RADII
 from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.retention.differences import Difference, group_differences
+from probe_kit.retention.frames import frame_of
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.mixtures import mixed_settings
@@ -64,18 +65,15 @@ class RetentionTable:
     def to_frame(self) -> "pd.DataFrame":
         """All rows as a data frame with the fields of `RetentionRow`.
 
-        Intervals become two columns, `sr_ci_low` and so on, what is kept by name one column per name, such as
-        `baselines.pixels`, and lists become text.
+        Shares, ratios and limits are floats, NaN where they are not defined: retention without backbone signal
+        too, whose raw ratio `to_json` keeps. Intervals become two columns, `sr_ci_low` and so on, what is kept by
+        name one column per name, such as `baselines.pixels`, and lists become text.
         """
-        import pandas as pd
-
-        return pd.DataFrame([_flat(asdict(row)) for row in self.all_rows]).convert_dtypes()
+        return frame_of(self.all_rows)
 
     def differences_frame(self) -> "pd.DataFrame":
         """Differences between groups as a data frame with the fields of `Difference`, intervals as two columns."""
-        import pandas as pd
-
-        return pd.DataFrame([_flat(asdict(row)) for row in self.differences]).convert_dtypes()
+        return frame_of(self.differences)
 
     def to_json(self) -> str:
         """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
@@ -176,17 +174,3 @@ def _read_probes(
                 f"and success rates do not belong together. `probe-kit train {run.location}` fits new ones."
             )
     return results, missing
-
-
-def _flat(row: dict[str, object]) -> dict[str, object]:
-    """One value per column: limits, names and lists spread or joined."""
-    flat: dict[str, object] = {}
-    for name, value in row.items():
-        if name.endswith("_ci"):
-            low, high = value if isinstance(value, tuple) else (None, None)
-            flat |= {f"{name}_low": low, f"{name}_high": high}
-        elif isinstance(value, dict):
-            flat |= {f"{name}.{key}": part for key, part in value.items()}
-        else:
-            flat[name] = " ".join(value) if isinstance(value, tuple) else value
-    return flat

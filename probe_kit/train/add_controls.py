@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.identity import derive_seed
 from probe_kit.train.baselines import Baseline, baseline_features
 from probe_kit.train.controls import BaselineScore, TwinScore
 from probe_kit.train.curve import Curve
@@ -17,7 +16,7 @@ from probe_kit.train.problem import POOLED, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings
 from probe_kit.train.samples import Samples
-from probe_kit.train.scores import chance_level, correctness, group_bootstrap
+from probe_kit.train.scores import GAINS, chance_level, correctness, group_bootstrap, units_seed
 from probe_kit.train.targets import target_labels
 
 Prepared = Mapping[Baseline, NDArray[np.float32]]
@@ -55,9 +54,7 @@ def _baseline_scores(
         problem = category_problem(run.episodes, category, settings)
         probe = problem.probe(samples)
         right = correctness(probe.decisions, problem.labels)
-        low, high = group_bootstrap(
-            right[:, None], problem.groups, derive_seed("interval", settings.seed, category, name)
-        )
+        low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, settings.suite))
         p = float(site_p(right.mean(keepdims=True), probe.null[None, :])[0])
         yield BaselineScore(
             name=name,
@@ -116,8 +113,8 @@ def _twin_scores(
     here, there = (
         c.correct[[pair[side] for pair in pairs]].T.astype(float) for side, c in enumerate((curve, other))
     )
-    seed = derive_seed("twin", results.settings.seed, *place)
-    low, high = group_bootstrap(here - there, curve.groups, seed)
+    seed = units_seed(curve.groups, results.settings.suite)
+    low, high = group_bootstrap(here - there, curve.groups, seed, bounds=GAINS)
     for column, (row, twin_row, peak) in enumerate(pairs):
         yield TwinScore(
             *place,

@@ -10,13 +10,13 @@ import numpy as np
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import Site
-from probe_kit.identity import derive_seed, sha256_json
+from probe_kit.identity import sha256_json
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction, Place
 from probe_kit.train.permutation import site_p
 from probe_kit.train.reader import RunReader
-from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss
+from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss, units_seed
 from probe_kit.train.summary import results_html, results_text
 from probe_kit.train.targets import Target
 
@@ -113,7 +113,7 @@ def episodes_sha256(run: RunReader) -> str:
 def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -> list[dict[str, Any]]:
     settings, folds, correct = results.settings, curve.folds(), curve.correct
     accuracy = correct.mean(axis=1)
-    low, high = group_bootstrap(correct.T, curve.groups, derive_seed("interval", settings.seed, category, view))
+    low, high = group_bootstrap(correct.T, curve.groups, units_seed(curve.groups, settings.suite))
     p, p_fwe, control = site_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
     return [
         {

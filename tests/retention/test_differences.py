@@ -42,10 +42,14 @@ def test_retention_is_compared_only_where_both_groups_have_it(table: RetentionTa
     assert mean.retention == color.retention
 
 
-def test_equal_behaviour_on_the_same_items_differs_by_exactly_nothing(table: RetentionTable) -> None:
+def test_equal_behaviour_on_the_same_items_is_no_proof_of_equality(table: RetentionTable) -> None:
+    """Of 100 items that all agree, 3 % unlike them would not have been missed."""
     for row in table.differences:
         assert row.paired
-        assert (row.sr, row.sr_ci) == (0.0, (0.0, 0.0))
+        assert row.sr == 0.0
+        low, high = row.sr_ci
+        assert low == pytest.approx(-0.03, abs=0.011)
+        assert high == pytest.approx(0.03, abs=0.011)
 
 
 def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> None:
@@ -73,7 +77,7 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
 def test_every_format_shows_groups_and_differences(table: RetentionTable) -> None:
     content = json.loads(table.to_json())
     assert [row["group"] for row in content["rows"]] == ["with VQA"] * 3 + ["without"] * 3
-    assert content["differences"][0]["sr_ci"] == [0.0, 0.0]
+    assert content["differences"][0]["sr_ci"][0] < 0
     assert "**Difference: with VQA − without (the same items)**" in table.to_markdown()
     assert "| with VQA: vqa |" in table.to_markdown()
     assert r"\caption{Difference: with VQA $-$ without (the same items)}" in table.to_latex()

@@ -1,6 +1,7 @@
 import csv
 import io
 import json
+import math
 from collections.abc import Callable
 
 import pytest
@@ -87,3 +88,34 @@ def test_views_and_keys_that_are_not_there_are_errors(probed_run: ProbedRun) -> 
         retention([run], views=["last"])
     with pytest.raises(UsageError, match="no probe results"):
         retention([run], keys=["ffffffffffff"])
+
+
+UNDEFINED = ([0.5, 0.5, 0.5], [[0.54, 0.5]])
+
+
+def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: ProbedRun) -> None:
+    """An SR that happens to be 0 or 1 everywhere is no integer, and a ratio without meaning no number."""
+    probed = probed_run({"color": SIGNAL, "counting": NONE, "shape": UNDEFINED})
+    episodes = probed.episodes.assign(outcome="oob", side_placed="none")
+    bare = ArrayRun(probed.path.parent / "bare", "expert", probed.suite, episodes, {})
+    table = retention({"probed": [probed], "bare": [bare]})
+    pair = retention({"a": [probed], "b": [probed_run({"color": SIGNAL, "counting": NONE}, "other")]})
+    for frame in (table.to_frame(), retention([bare]).to_frame(), pair.differences_frame()):
+        floats = [
+            name for name in frame if any(part in str(name) for part in FLOATS) and "defined" not in str(name)
+        ]
+        assert floats
+        assert {str(frame[name].dtype) for name in floats if name not in TEXTS} == {"float64"}
+    frame = table.to_frame()
+    undefined = frame[~frame["retention_defined"]]
+    assert len(undefined) == 4
+    for name in ("retention", "retention_debiased", "retention_ci_low", "retention_ci_high"):
+        assert undefined[name].map(math.isnan).all(), name
+        assert frame[name].notna().any()
+    assert math.isnan(frame["delta"][3]), "a mean has none"
+    raw = [row["retention"] for row in json.loads(table.to_json())["rows"][:3]]
+    assert raw[1] == pytest.approx(0.08 / 0.05), "json keeps the raw ratio"
+
+
+FLOATS = ("sr", "delta", "accuracy", "_ci_", "retention", "p_", "depth", "gap", "chance", "score", "paired_p")
+TEXTS = ("retention_note",)

@@ -56,7 +56,8 @@ def test_the_twin_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -
     np.testing.assert_allclose([score.difference for score in sites], accuracy - others, atol=1e-12)
     assert sites[3].ci[0] > 0.2
     assert sites[3].ci[0] < sites[3].difference < sites[3].ci[1] < accuracy[3]
-    assert (sites[2].difference, sites[2].ci) == (0.0, (0.0, 0.0))  # the same features in both runs
+    assert sites[2].difference == 0.0, "the same features in both runs"
+    assert sites[2].ci[0] < 0.0 < sites[2].ci[1] < 0.15, "20 groups that agree are no certainty"
     peak = results.controls.twin_peak("color", "mean", "backbone")
     assert peak is not None
     assert (peak.site, peak.twin) == (str(PLANTED), "twin (random weights)")

@@ -49,8 +49,8 @@ def test_an_interval_where_all_agree_is_that_of_clopper_and_pearson_over_groups(
     right = np.array([[True, False, True], [True, False, False]]).repeat(20, axis=0)
     low, high = group_bootstrap(right, np.arange(40) // 4, seed=0)
     exact = binomtest(10, 10).proportion_ci()
-    assert (low[0], high[0]) == (pytest.approx(exact.low), 1.0)
-    assert (low[1], high[1]) == (0.0, pytest.approx(1 - exact.low))
+    assert (low[0], high[0]) == (pytest.approx(exact.low, abs=1e-4), 1.0)
+    assert (low[1], high[1]) == (0.0, pytest.approx(1 - exact.low, abs=1e-4))
     assert 0.0 < low[2] < high[2] < 1.0
 
 

@@ -32,18 +32,21 @@ if TYPE_CHECKING:
 DEPTH = "depth (0 enters the first block, 1 leaves the last)"
 _SIDESTEP = 0.006  # in depth, so that the two streams' bars do not hide each other
 
+_ENOUGH = 20  # relabellings, fewer than which have no 95 % band
+
 Shares = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class StreamCurve:
-    """One stream's held-out accuracy by depth; arrays (L,), accuracies as shares.
+    """One stream's held-out accuracy by layer; arrays (L,), accuracies as shares. depth: the layer as a fraction.
 
     accuracy: of the best iteration where there are several, with its 95 % interval `low`, `high` over groups.
     least, most: over all iterations. significant: above chance, family-wise. iterations: how many there are.
     """
 
     stream: str
+    layers: NDArray[np.int64]
     depth: Shares
     accuracy: Shares
     low: Shares
@@ -63,6 +66,7 @@ class StreamCurve:
         )
         return cls(
             stream=str(best["stream"].iloc[0]),
+            layers=best["layer"].to_numpy(dtype=np.int64),
             depth=depth,
             accuracy=accuracy,
             low=low,
@@ -79,7 +83,7 @@ class LayerCurveDisplay(Shown):
     """Held-out accuracy against depth, for one category in one view.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05). Grey: chance,
-    and `null_band`, which holds 95 % of the accuracies under relabelling; None without relabellings.
+    and `null_band`, which holds 95 % of the accuracies under relabelling; None below 20 relabellings.
     """
 
     category: str
@@ -98,7 +102,7 @@ class LayerCurveDisplay(Shown):
         """
         view = known_view(results, view)
         curve = curve_of(results, category, view)
-        band = np.percentile(curve.null, [2.5, 97.5]) if curve.null.size else None
+        band = np.percentile(curve.null, [2.5, 97.5]) if curve.null.shape[1] >= _ENOUGH else None
         scores = scores_of(results, category, view)
         return cls(
             category=category,

@@ -1,0 +1,131 @@
+"""Every interval that a table, a report or a figure shows, searched in many worlds."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from probe_kit.retention import Difference, RetentionRow, RetentionTable, layer_curve, retention
+from probe_kit.retention.displays import LayerCurveDisplay
+from probe_kit.train import ArrayRun, load_results
+from probe_kit.train.add_controls import add_twin
+from probe_kit.train.scores import GAINS, SHARES, group_bootstrap, unseen
+
+ProbedRun = Callable[..., ArrayRun]
+PERFECT = ([1.0, 1.0], [[1.0, 1.0]])
+HOPELESS = ([0.0, 0.5], [[0.0, 0.5]])
+GOOD = ([0.5, 0.9], [[0.6, 0.7]])
+NONE = ([0.5, 0.52], [[0.5, 0.51]])
+WORLDS = {
+    "perfect": {"color": PERFECT},
+    "perfect and good": {"color": PERFECT, "shape": GOOD},
+    "perfect everywhere": {"color": PERFECT, "shape": PERFECT, "state": PERFECT},
+    "hopeless": {"color": HOPELESS, "shape": NONE},
+    "good": {"color": GOOD},
+    "mixed": {"color": GOOD, "shape": NONE, "state": PERFECT},
+}
+
+
+@pytest.fixture(params=WORLDS)
+def table(request: pytest.FixtureRequest, probed_run: ProbedRun) -> RetentionTable:
+    """A run of the world against an equal one and against a good one."""
+    world = WORLDS[request.param]
+    runs = {name: [probed_run(world, name)] for name in ("one", "again")}
+    return retention({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), "other")]})
+
+
+def intervals(rows: Sequence[RetentionRow] | Sequence[Difference]) -> Iterator[tuple[str, float, float, float]]:
+    """Name, value and limits of every interval that has any; unbounded ones are an answer of their own."""
+    values = {"prefix_ci": "prefix_accuracy", "action_ci": "action_accuracy"}
+    for row in rows:
+        fields = asdict(row)
+        for name, limits in fields.items():
+            if not name.endswith("_ci") or limits is None or limits == (None, None):
+                continue
+            of = values.get(name, name.removesuffix("_ci"))
+            if of == "retention":
+                of = "retention_debiased" if "retention_debiased" in fields else of
+            yield f"{row.category} {name}", fields[of], *limits
+
+
+def test_no_interval_is_without_width_and_each_holds_its_number(table: RetentionTable) -> None:
+    found = [*intervals(table.all_rows), *intervals(table.differences)]
+    assert len(found) > 20
+    for name, value, low, high in found:
+        assert high - low > 1e-3, name
+        assert low <= value <= high, name
+
+
+def test_one_number_has_one_interval_in_rows_scores_and_curves(table: RetentionTable) -> None:
+    for row in table.rows:
+        results = table.results[row.run]
+        scores = results.scores[results.scores["category"] == row.category]
+        display = LayerCurveDisplay.from_results(results, row.category)
+        for stream, layer, step, limits in (
+            ("backbone", row.prefix_layer, None, row.prefix_ci),
+            ("expert", row.action_layer, row.action_iteration, row.action_ci),
+        ):
+            site = scores[(scores["stream"] == stream) & (scores["layer"] == layer)]
+            site = site if step is None else site[site["iteration"] == step]
+            assert limits == (site["ci_low"].item(), site["ci_high"].item())
+            (curve,) = [one for one in display.streams if one.stream == stream]
+            at = list(curve.layers).index(layer)
+            assert limits == (curve.low[at], curve.high[at])
+
+
+def test_a_mean_is_as_wide_as_its_only_category_and_never_wider_known_than_its_parts(
+    table: RetentionTable,
+) -> None:
+    for mean in table.means:
+        own = [row for row in table.rows if row.run == mean.run]
+        for name in ("sr_ci", "prefix_ci", "action_ci", "retention_ci"):
+            parts = [getattr(row, name) for row in own if name != "retention_ci" or row.retention_defined]
+            limits = getattr(mean, name)
+            if len(parts) == 1:
+                assert limits == parts[0], name
+            elif parts and (None, None) in parts:
+                assert limits == (None, None), name
+            elif parts:
+                widest = max(high - low for low, high in parts)
+                assert limits[1] - limits[0] > 0.8 * widest / len(parts), name
+
+
+def test_a_mean_of_equal_categories_without_variance_has_a_width(probed_run: ProbedRun) -> None:
+    (mean,) = retention([probed_run({"color": PERFECT, "shape": PERFECT})]).means
+    low, high = mean.prefix_ci  # type: ignore[misc]
+    assert (mean.prefix_accuracy, high) == (1.0, 1.0)
+    assert low < 0.99
+
+
+@pytest.mark.parametrize(("value", "count"), [*product([0.0, 0.25, 0.5, 1.0], [1, 2, 12, 150])])
+def test_groups_that_agree_have_an_interval_that_narrows_with_their_number(value: float, count: int) -> None:
+    column = np.full((4 * count, 1), value)
+    low, high = group_bootstrap(column, np.arange(4 * count) // 4, seed=0)
+    fewer_low, fewer_high = group_bootstrap(column[: 2 * count + 2], np.arange(2 * count + 2) // 4, seed=0)
+    assert 0.0 <= low[0] <= value <= high[0] <= 1.0
+    assert 0 < high[0] - low[0] <= fewer_high[0] - fewer_low[0] + 1e-9
+    assert high[0] - low[0] < 4 / count
+
+
+def test_what_unseen_groups_may_hold_keeps_to_the_bounds() -> None:
+    for bounds, value in product((SHARES, GAINS), (0.0, 0.4, 1.0)):
+        draws = unseen(value, 10, bounds=bounds)
+        assert bounds[0] <= draws.min() < draws.max() <= bounds[1]
+
+
+def test_a_twin_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": PERFECT}, "one"))
+    twin = load_results(probed_run({"color": HOPELESS}, "twin", random_weights=True))
+    for score in add_twin(results, twin).controls.twin:
+        assert -1 <= score.ci[0] <= score.difference <= score.ci[1] <= 1
+        assert score.ci[1] - score.ci[0] > 1e-3
+
+
+def test_a_band_of_few_relabellings_is_not_drawn(probed_run: ProbedRun) -> None:
+    results = load_results(probed_run({"color": GOOD}))
+    assert LayerCurveDisplay.from_results(results, "color").null_band is not None
+    few = {place: replace(curve, null=curve.null[:, :5]) for place, curve in results.curves.items()}
+    assert LayerCurveDisplay.from_results(replace(results, curves=few), "color").null_band is None
+    layer_curve(replace(results, curves=few))
