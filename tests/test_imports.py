@@ -35,7 +35,13 @@ EXTRACT = {
     "extraction": {"store", "plan", "settings", "play", "prepared", "crews"},
 }
 
-READS_ONLY = ("probe_kit.extract", "probe_kit.extract.store", "probe_kit.hooks.sites", "probe_kit.env.outcome")
+READS_ONLY = (
+    "probe_kit.extract",
+    "probe_kit.extract.store",
+    "probe_kit.hooks.sites",
+    "probe_kit.hooks.views",
+    "probe_kit.env.outcome",
+)
 """All that probes and tables may know of the rooms that hold models and simulators."""
 
 

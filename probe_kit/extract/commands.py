@@ -110,6 +110,10 @@ def extract(
     ray: Annotated[
         str | None, typer.Option(help="Work on this Ray cluster; auto: the one of this machine, or a new one.")
     ] = None,
+    allow_mixed: Annotated[
+        bool,
+        typer.Option("--allow-mixed", help="Continue a run begun with other versions or on another device."),
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Start even if the disk looks too small.")] = False,
 ) -> None:
@@ -160,6 +164,7 @@ def extract(
         env_workers=env_workers,
         workers=workers,
         ray=ray,
+        allow_mixed=allow_mixed,
     )
     with err.status("loading suite and model"):
         extraction = prepare(settings)

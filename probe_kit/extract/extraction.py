@@ -48,11 +48,12 @@ class Extraction(Prepared):
         if not force and not location.exists(RUN_FILE):
             refuse_if_full(self.plan.bytes, location)
         with location.in_words():
-            writer = RunWriter(location, self.plan, self.identity())
+            writer = self.writer(location)
             with writer.owned():
                 self._check_exclusive(writer)
                 remaining = writer.remaining()
                 if remaining:
+                    writer.begin(self.settings.allow_mixed)
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
         return open_run(location)

@@ -1,5 +1,6 @@
 """The plan: which episodes in which order, and what they will cost, before anything is written."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,16 +56,19 @@ class Plan:
         return sum(len(stream.stream.sites()) for stream in self.streams)
 
 
-def make_plan(suite: Suite, streams: list[StoredStream], seed: int, calls: int, with_tokens: bool) -> Plan:
-    """Plan every episode of `suite`."""
-    episodes = tuple(
-        PlannedEpisode(
+def plan_episodes(suite: Suite, seed: int) -> Iterator[PlannedEpisode]:
+    """Every episode of `suite` in order, with its seeds."""
+    for index, episode in enumerate(suite.episodes()):
+        yield PlannedEpisode(
             index,
             episode,
             scene_seed=derive_seed(seed, "scene", episode.item.item_id),
             policy_seed=derive_seed(seed, "policy", episode.episode_id),
         )
-        for index, episode in enumerate(suite.episodes())
-    )
+
+
+def make_plan(suite: Suite, streams: list[StoredStream], seed: int, calls: int, with_tokens: bool) -> Plan:
+    """Plan every episode of `suite`."""
+    episodes = tuple(plan_episodes(suite, seed))
     per_call = sum(stream.raw_bytes(with_tokens) for stream in streams)
     return Plan(suite, episodes, tuple(streams), per_call * calls * len(episodes))

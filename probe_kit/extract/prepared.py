@@ -3,10 +3,15 @@
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.errors import UsageError
+from probe_kit.extract.plan import Plan, make_plan, plan_episodes
 from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
+from probe_kit.extract.play.rehearsal import rehearse
 from probe_kit.extract.settings import ExtractSettings, run_label
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.provenance import provenance_here
+from probe_kit.extract.store.writer import RunWriter
 from probe_kit.identity import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
@@ -36,19 +41,34 @@ class Prepared:
             "scene": self.settings.scene.to_json(),
         }
 
+    def provenance(self) -> dict[str, Any]:
+        """That of a process that plays with these settings here."""
+        dtype: str | None = self.card.get("dtype")
+        return provenance_here(self.settings.device, dtype)
+
+    def writer(self, location: Location) -> RunWriter:
+        """A writer of the run at `location`, which it begins or continues.
+
+        Raises SettingsMismatchError if other settings are there.
+        """
+        return RunWriter(location, self.plan, self.identity(), self.provenance())
+
     def default_name(self) -> str:
         """Folder name that repeats for the same settings, so that the same command finds its run again."""
         return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
 
 
-def load(settings: ExtractSettings) -> Prepared:
-    """Find the suite, load the model and plan the episodes.
+def load(settings: ExtractSettings, rehearsed: bool = False) -> Prepared:
+    """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     if settings.model not in SCRIPTED:
         _find_family(settings.model)
+    _refuse_meaningless(settings)
     suite = _suite(settings)
+    if not rehearsed:
+        rehearse(settings.scene, plan_episodes(suite, settings.seed))
     controller = _controller(settings, suite)
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.captured_calls, with_tokens)
@@ -60,6 +80,32 @@ def _find_family(name: str) -> None:
     from probe_kit.hooks.registry import find_family
 
     find_family(name, tuple(SCRIPTED))
+
+
+def _refuse_meaningless(settings: ExtractSettings) -> None:
+    """A scripted policy has no weights, no chunks and no activations, so nothing that is asked of them."""
+    if settings.weights_seed and not settings.random_weights:
+        raise UsageError(
+            f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
+            "Leave it out, or add --random-weights"
+        )
+    if settings.model not in SCRIPTED:
+        return
+    asked = {
+        "--checkpoint": settings.checkpoint is not None,
+        "--random-weights": settings.random_weights,
+        "--batch": settings.batch != 1,
+        "--execute": settings.execute is not None,
+        "--dtype": settings.dtype is not None,
+        "--tokens all": settings.tokens == "all",
+        "--captured-calls": settings.captured_calls != 1,
+        **{f"-M {name}": True for name in settings.options},
+    }
+    if meaningless := [option for option, given in asked.items() if given]:
+        raise UsageError(
+            f"{settings.model} is scripted: it has no network, so {', '.join(meaningless)} means nothing. Leave "
+            "it out, or choose a model with weights"
+        )
 
 
 def _suite(settings: ExtractSettings) -> Suite:
@@ -84,6 +130,11 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
     )
     examples = example_observations(settings.scene, suite)
     refuse_unfit(policy.card, settings.batch, examples[0])
+    if settings.execute is not None and settings.execute > policy.card.chunk > 0:
+        raise UsageError(
+            f"--execute {settings.execute}: {settings.model} gives {policy.card.chunk} actions per inference; "
+            f"execute 1 to {policy.card.chunk} of them"
+        )
     return PolicyController(
         policy, settings.model, examples, settings.execute, settings.captured_calls, settings.tokens == "all"
     )

@@ -14,7 +14,7 @@ VIDEOS = ("none", "first", "all")
 FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
 _ELSEWHERE = {"checkpoint", "options", "label", "weights_seed", "suite", "categories", "items", "scene"}
-_MACHINE = {"device", "video", "frames", "batch", "env_workers", "workers", "ray"}
+_MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", "workers", "ray"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class ExtractSettings:
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
     ray: address of a Ray cluster, or `auto`; the workers then run there.
+    allow_mixed: continue a run whose episodes were made on another kind of device or with other versions; it is
+    then marked as mixed wherever it is shown.
     """
 
     model: str
@@ -63,6 +65,7 @@ class ExtractSettings:
     env_workers: int | None = None
     workers: int = 0
     ray: str | None = None
+    allow_mixed: bool = False
 
     def __post_init__(self) -> None:
         for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS), ("frames", FRAMES)):

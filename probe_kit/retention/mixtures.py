@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, ProbeSettings
 from probe_kit.train.targets import TARGETS
 
@@ -14,6 +15,16 @@ _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
     "seeds": lambda settings: str(settings.seed),
     "categories": lambda settings: ", ".join(settings.categories),
 }
+
+
+def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
+    """A sentence for every run whose episodes were not all made by the same device kind and versions."""
+    return [
+        f"{run.location} is mixed: its episodes were made with other {', '.join(mixed)}, which changes numbers "
+        "(--allow-mixed)."
+        for run in runs
+        if (mixed := getattr(run, "mixed", ()))
+    ]
 
 
 def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | None = None) -> list[str]:

@@ -11,7 +11,7 @@ from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.frames import frame_of
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
-from probe_kit.retention.mixtures import mixed_settings
+from probe_kit.retention.mixtures import mixed_episodes, mixed_settings
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.train.reader import RunReader
@@ -142,17 +142,22 @@ def retention(
         means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
     differences = group_differences(by_group)
-    notes += mixed_settings(results, views)
+    notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
     return RetentionTable([one.row for one in drawn], means, differences, results, iterations, tuple(notes))
 
 
 def _refuse_doubles(runs: Sequence[RunReader]) -> None:
-    """A run that counts twice makes every interval too narrow."""
-    seen: set[str] = set()
+    """A run that counts twice makes every interval too narrow; a copy of its folder is the same run."""
+    seen: dict[str, str] = {}
     for run in runs:
-        if run.location.address in seen:
-            raise UsageError(f"{run.location} is given twice; its episodes would count twice. Leave one out")
-        seen.add(run.location.address)
+        stamp = getattr(run, "stamp", None)
+        for name in (run.location.address, *([f"{run.settings_sha256} {stamp}"] if stamp else [])):
+            if name in seen:
+                other = "" if seen[name] == str(run.location) else f", once as its copy {seen[name]}"
+                raise UsageError(
+                    f"{run.location} is given twice{other}; its episodes would count twice. Leave one out"
+                )
+            seen[name] = str(run.location)
 
 
 def _read_probes(

@@ -5,13 +5,13 @@ never be mixed with, or called, the paper's numbers.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.identity import sha256_json, sha256_text
-from probe_kit.suite.card import new_suite
+from probe_kit.suite.card import drawing_libraries, new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS
 from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION
@@ -64,7 +64,7 @@ def default_suite(
     Arguments and errors are those of `build_suite`.
     """
     options = _options(categories, items_per_category, seed)
-    key = sha256_json({"options": options, "code": _drawing_code()})[:12]
+    key = _cache_key(options)
     folder = _cache_folder() / "suites" / f"{SUITE_NAME}-{SUITE_VERSION}-{key}"
     if folder.is_dir():
         return load_suite(folder)
@@ -102,11 +102,18 @@ def _cache_folder() -> Path:
     return Path(given) if given else Path.home() / ".cache" / "probe_kit"
 
 
-def _drawing_code() -> str:
-    """Hash of the generators' source, so that a changed drawing is never served from an old cache.
+def _cache_key(options: Mapping[str, Any]) -> str:
+    """A name for all that a built suite depends on, so that a changed drawing is never served from an old cache.
 
-    The art needs no hash of its own: the notice beside it holds its checksums.
+    The libraries that draw and the code that draws, words, groups and lays out. The art needs no hash of its own:
+    the notice beside it holds its checksums.
     """
     folder = Path(__file__).parent
-    sources = [*sorted((folder / "generators").glob("*.py")), folder / "art" / "NOTICE.md"]
-    return sha256_text("\n".join(source.read_text(encoding="utf-8") for source in sources))
+    own = ("build", "card", "categories", "grouping", "items", "manifest", "pictures", "suite", "wording")
+    sources = [
+        *sorted((folder / "generators").glob("*.py")),
+        *(folder / f"{name}.py" for name in own),
+        folder / "art" / "NOTICE.md",
+    ]
+    code = sha256_text("\n".join(source.read_text(encoding="utf-8") for source in sources))
+    return sha256_json({"options": options, "code": code, "libraries": drawing_libraries()})[:12]

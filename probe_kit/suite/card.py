@@ -36,14 +36,14 @@ def new_suite(
         "curation": sorted({item.curation_status for item in items}),
         "licenses": sorted({item.license for item in items}),
         "contains_real_faces": any(item.contains_real_face for item in items),
-        "environment": _environment(),
+        "environment": drawing_libraries(),
         "content_sha256": content_sha256(items),
         **(extra or {}),
     }
     return Suite(name, version, items, Path(), card)
 
 
-def _environment() -> dict[str, str]:
+def drawing_libraries() -> dict[str, str]:
     """Versions that the pixels of a drawn picture can depend on."""
     freetype = features.version("freetype2") or "none"
     return {"pillow": PIL.__version__, "freetype": freetype, "numpy": np.__version__}

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from typing import Any, Self
 
 from probe_kit.cluster import ray_cluster
+from probe_kit.errors import ProbeKitError
 from probe_kit.train.crew import Probed, Problems, probe_column
 from probe_kit.train.samples import Samples
 
@@ -44,13 +45,18 @@ class RayCrew:
 
     def result(self, task: Any) -> Probed:
         """What a finished task found."""
-        found: Probed = self._ray.get(task)
+        found: Probed | ProbeKitError = self._ray.get(task)
+        if isinstance(found, ProbeKitError):
+            raise found
         return found
 
 
-def _probe_alone(samples: Samples, problems: Problems) -> Probed:
-    """One BLAS thread, as the task was given one core."""
+def _probe_alone(samples: Samples, problems: Problems) -> Probed | ProbeKitError:
+    """One BLAS thread, as the task was given one core. What goes wrong is an answer: Ray would wrap it."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     with threadpool_limits(1):
-        return probe_column(samples, problems)
+        try:
+            return probe_column(samples, problems)
+        except ProbeKitError as error:
+            return error

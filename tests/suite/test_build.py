@@ -3,11 +3,13 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
+from typing import Any
 
 import pytest
 
 from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
 from probe_kit.suite import Suite, build_suite, default_suite
+from probe_kit.suite.card import drawing_libraries
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -141,6 +143,33 @@ def test_default_suites_with_other_options_do_not_meet(tmp_path: Path, monkeypat
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
     suites = [default_suite(["color"], 2), default_suite(["shape"], 2), default_suite(["color"], 2, seed=1)]
     assert len({suite.folder for suite in suites}) == 3
+
+
+@pytest.mark.parametrize("library", ["pillow", "freetype", "numpy"])
+def test_another_version_of_what_draws_is_another_suite_in_the_cache(
+    library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
+    before = default_suite(["color"], 2).folder
+    versions = {**drawing_libraries(), library: "0.0"}
+    monkeypatch.setattr("probe_kit.suite.build.drawing_libraries", lambda: versions)
+    assert default_suite(["color"], 2).folder != before
+
+
+@pytest.mark.parametrize("source", ["wording.py", "pictures.py", "grouping.py", "generators/canvas.py"])
+def test_other_code_that_draws_or_words_is_another_suite_in_the_cache(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
+    before = default_suite(["color"], 2).folder
+    read = Path.read_text
+
+    def edited(path: Path, *arguments: Any, **named: Any) -> str:
+        text = read(path, *arguments, **named)
+        return f"{text}\n# edited" if path.match(f"probe_kit/suite/{source}") else text
+
+    monkeypatch.setattr(Path, "read_text", edited)
+    assert default_suite(["color"], 2).folder != before
 
 
 def test_a_damaged_cache_is_reported_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

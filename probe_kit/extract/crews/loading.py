@@ -4,12 +4,15 @@ from probe_kit.extract.play.worker import Worker
 from probe_kit.extract.prepared import load
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.writer import RunWriter
 
 
 def load_worker(settings: ExtractSettings, run: str) -> Worker:
-    """A worker for a run that exists, with a model of its own. Raises SettingsMismatchError if they differ."""
-    prepared = load(settings)
+    """A worker for a run that exists, with a model of its own.
+
+    Raises SettingsMismatchError if they differ, or if this machine gives other numbers than those before it.
+    """
+    prepared = load(settings, rehearsed=True)
     assert prepared.controller is not None
-    writer = RunWriter(locate(run), prepared.plan, prepared.identity())
+    writer = prepared.writer(locate(run))
+    writer.begin(settings.allow_mixed)
     return Worker(writer, settings, prepared.controller, len(writer.remaining()))

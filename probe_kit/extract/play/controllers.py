@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -111,6 +112,7 @@ class PolicyController:
         if card.settings:
             self.identity["policy"] = dict(card.settings)
         self._fires: dict[str, int] = {}
+        self._check: dict[str, Any] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """The first `execute` actions of a fresh chunk per turn, from one call of the policy."""
@@ -124,11 +126,11 @@ class PolicyController:
         return [chunk[: self.execute] for chunk in chunks]
 
     def certificate(self) -> dict[str, Any]:
-        """The policy's card, fire counts of the last capture, and the check of `_prove_harmless`."""
+        """The policy's card, fire counts of the last capture, and what `_prove_harmless` measured."""
         return {
             "policy": self.policy.card.to_json(),
             "fires_per_inference": self._fires,
-            "hooks_on_equals_hooks_off": True,
+            "capture_check": self._check,
         }
 
     def _act_and_capture(
@@ -156,7 +158,12 @@ class PolicyController:
     ) -> None:
         """Once per process: the same inference without hooks gives the same actions, bit for bit."""
         plain = self.policy.act(observations, seeds)
-        if not np.array_equal(plain, chunks):
+        self._check = {
+            "actions_with_hooks_sha256": _sha256(chunks),
+            "actions_without_hooks_sha256": _sha256(plain),
+            "observations": len(observations),
+        }
+        if self._check["actions_with_hooks_sha256"] != self._check["actions_without_hooks_sha256"]:
             raise CaptureChangedActionError(
                 f"capturing changed the actions by up to {np.abs(plain - chunks).max():.3g}; they must be equal "
                 "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
@@ -176,6 +183,13 @@ class PolicyController:
                 buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
                 kept = torch.stack([_pool_rows(site[None], [own], stored.views)[0] for site in kept])
             buffers.keep_pooled(stored.name, kept)
+
+
+def _sha256(actions: NDArray[np.float32]) -> str:
+    """Of shape, type and every bit."""
+    return sha256(
+        f"{actions.dtype} {actions.shape}".encode() + np.ascontiguousarray(actions).tobytes()
+    ).hexdigest()
 
 
 def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":

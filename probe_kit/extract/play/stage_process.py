@@ -5,8 +5,8 @@ from typing import Any
 
 from probe_kit.child import Child
 from probe_kit.env import SceneSpec
-from probe_kit.errors import StageDiedError
-from probe_kit.extract.play.stage import EPISODE_ERRORS, Answer, Stage
+from probe_kit.errors import ProbeKitError, StageDiedError
+from probe_kit.extract.play.stage import Answer, Stage
 
 
 class ProcessStage:
@@ -37,7 +37,7 @@ class ProcessStage:
             raise StageDiedError(
                 f"the process that simulates the episode ended with code {code}; look above for its last words"
             ) from None
-        if isinstance(answer, Exception):
+        if isinstance(answer, ProbeKitError):
             raise answer
         result: Answer = answer
         return result
@@ -49,13 +49,18 @@ class ProcessStage:
 
 def serve(connection: Connection) -> None:
     """The child's side: answer questions until the parent hangs up."""
-    stage = Stage(*connection.recv())
+    try:
+        stage = Stage(*connection.recv())
+    except ProbeKitError as error:
+        connection.recv()
+        connection.send(error)
+        return
     try:
         while True:
             method, arguments = connection.recv()
             try:
-                answer: Answer | Exception = getattr(stage, method)(*arguments)
-            except EPISODE_ERRORS as error:
+                answer: Answer | ProbeKitError = getattr(stage, method)(*arguments)
+            except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
                 answer = error
             connection.send(answer)
     finally:

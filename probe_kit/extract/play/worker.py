@@ -1,14 +1,12 @@
 """A worker: plays the episodes it is given and commits them. The same code in this process and in others."""
 
-import platform
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from PIL import Image
@@ -31,7 +29,6 @@ from probe_kit.extract.store.writer import RunWriter
 SPARE_BUFFERS = 2
 # With fewer episodes than this, starting processes takes longer than they save.
 WORTH_PROCESSES = 8
-_PACKAGES = ("probe-kit", "torch", "lerobot", "transformers", "pybullet", "zarr", "numcodecs", "numpy")
 _FILM_SIZE = (320, 240)
 
 
@@ -100,7 +97,7 @@ class Worker:
         try:
             rollout.buffers.wait()
             with self._writer.location.in_words():
-                self._writer.write_certificate({**self._controller.certificate(), **_versions()})
+                self._writer.write_certificate(self._controller.certificate())
                 if rollout.ends:
                     write_thumbnail(self._writer.location, rollout.planned.index, rollout.ends)
                 self._writer.write(rollout.record)
@@ -127,14 +124,6 @@ def _torch_threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _versions() -> dict[str, Any]:
-    return {
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "versions": {package: version(package) for package in _PACKAGES},
-    }
 
 
 def _save_film(location: Location, rollout: Rollout) -> None:

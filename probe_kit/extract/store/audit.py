@@ -21,6 +21,7 @@ from probe_kit.extract.store.commits import (
 from probe_kit.extract.store.layout import COMMITS, DATA, PLAN_FILE, RUN_FILE
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.provenance import PROVENANCE, name_of, read_provenances
 from probe_kit.extract.store.run import Run, read_card
 from probe_kit.identity import sha256_json
 
@@ -65,6 +66,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     sizes = committed_sizes(location, commits)
     for number, commit in commits.items():
         problems += _commit_problems(location, number, commit, sizes, deep)
+    problems += _provenance_problems(location, commits)
     columns = find_columns(location, stamp_of(commits))
     if deep and columns is not None and not problems:
         problems += _column_problems(Run(location))
@@ -89,6 +91,15 @@ def _commit_problems(
             problem = f"has other bytes than were written (crc32c is not {checksum})"
         if problem:
             yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}; delete {name} to redo it"
+
+
+def _provenance_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
+    stored = read_provenances(location)
+    for name in sorted({commit["provenance"] for commit in commits.values() if "provenance" in commit}):
+        if name not in stored:
+            yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with"
+        elif name_of(stored[name]) != name:
+            yield f"{PROVENANCE}/{name}.json was changed after it was written"
 
 
 def _column_problems(run: Run) -> Iterator[str]:

@@ -21,11 +21,13 @@ import numpy as np
 
 from probe_kit.hooks.sites import QUANTITIES, Part, Site, Stream
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+READABLE = (1, 2)
+"""Schemas that can be read; only runs of the last one are continued."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
-FRAMES = "frames"
+FRAMES, CERTIFICATES = "frames", "certificates"
 CODECS = ("zstd", "fast", "none")
 
 

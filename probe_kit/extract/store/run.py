@@ -17,14 +17,16 @@ from probe_kit.extract.store.columns import Columns, find_columns
 from probe_kit.extract.store.commits import Commit, read_commits, read_failures, stamp_of
 from probe_kit.extract.store.layout import (
     CERTIFICATE_FILE,
+    CERTIFICATES,
     DATA,
     PLAN_FILE,
+    READABLE,
     RUN_FILE,
-    SCHEMA_VERSION,
     StoredStream,
 )
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.provenance import PROVENANCE, Provenance, differences, read_provenances
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.summary import run_html, run_text, what_to_open
 from probe_kit.hooks.sites import Site, Stream
@@ -73,9 +75,10 @@ class Run:
     def __init__(self, location: Location) -> None:
         self.location = location
         card = read_card(location)
-        if card["schema_version"] != SCHEMA_VERSION:
+        if card["schema_version"] not in READABLE:
             raise RunDamagedError(
-                f"{location} has schema {card['schema_version']}; this version reads {SCHEMA_VERSION}; update it"
+                f"{location} has schema {card['schema_version']}; this version of probe_kit reads "
+                f"{', '.join(map(str, READABLE))}. Update it"
             )
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
@@ -115,9 +118,41 @@ class Run:
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
-        """What was loaded and checked."""
+        """What was loaded and checked: the first process's record, then what every process measured.
+
+        `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions with
+        and without capture have one hash, `mixed` what changes numbers and was not the same for all episodes.
+        """
         certificate: dict[str, Any] = json.loads(self.location.read(CERTIFICATE_FILE))
-        return certificate
+        processes = [json.loads(text) for text in self.location.read_all(CERTIFICATES, ".json").values()]
+        if not processes:  # a run of schema 1
+            return certificate
+        checks = [process["capture_check"] for process in processes if process.get("capture_check")]
+        if checks:
+            certificate["hooks_on_equals_hooks_off"] = all(
+                check["actions_with_hooks_sha256"] == check["actions_without_hooks_sha256"] for check in checks
+            )
+        return {**certificate, "processes": processes, "mixed": list(self.mixed)}
+
+    @cached_property
+    def provenances(self) -> dict[str, Provenance]:
+        """Device and versions that committed episodes were made with, by the name commits call them.
+
+        Empty for a run of schema 1. Raises RunDamagedError if a commit names one that is not there.
+        """
+        stored = read_provenances(self.location)
+        named = sorted({commit["provenance"] for commit in self.commits() if "provenance" in commit})
+        if missing := [name for name in named if name not in stored]:
+            raise RunDamagedError(
+                f"{self.location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was "
+                "there when they were committed. Restore it from a copy, or extract the run again"
+            )
+        return {name: stored[name] for name in named}
+
+    @property
+    def mixed(self) -> tuple[str, ...]:
+        """What changes numbers and is not the same for all episodes, such as `versions.torch`; mostly nothing."""
+        return differences(self.provenances.values())
 
     @cached_property
     def _commits(self) -> dict[int, Commit]:

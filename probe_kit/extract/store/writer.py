@@ -16,8 +16,24 @@ from probe_kit.extract.plan import Plan, PlannedEpisode
 from probe_kit.extract.settings import refuse_other_settings
 from probe_kit.extract.store.arrays import create_arrays
 from probe_kit.extract.store.commits import RecordingStore, as_json, create_once, read_commits, write_commit
-from probe_kit.extract.store.layout import CERTIFICATE_FILE, DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
+from probe_kit.extract.store.layout import (
+    CERTIFICATE_FILE,
+    CERTIFICATES,
+    DATA,
+    FAILED,
+    PLAN_FILE,
+    RUN_FILE,
+    SCHEMA_VERSION,
+)
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.provenance import (
+    Provenance,
+    keep_provenance,
+    name_of,
+    provenance_here,
+    read_provenances,
+    refuse_other_provenance,
+)
 from probe_kit.extract.store.run import read_card
 from probe_kit.identity import canonical_json, sha256_json
 
@@ -43,11 +59,16 @@ class EpisodeRecord:
 class RunWriter:
     """Creates a run or continues the one that is there; any number of processes may do so at once.
 
+    provenance: of this process, by default of one that computes on the CPU.
     Raises SettingsMismatchError if the location holds a run with other settings, or anything else.
     """
 
-    def __init__(self, location: Location, plan: Plan, settings: dict[str, Any]) -> None:
+    def __init__(
+        self, location: Location, plan: Plan, settings: dict[str, Any], provenance: Provenance | None = None
+    ) -> None:
         self.location, self.plan = location, plan
+        self.provenance = provenance or provenance_here()
+        self._certified = False
         self.settings = json.loads(canonical_json(settings))
         if not location.exists(RUN_FILE):
             location.found(self._beginning(), last=RUN_FILE)
@@ -92,6 +113,17 @@ class RunWriter:
         with self.location.held(lambda: self.location.remove(FAILED)):
             yield
 
+    def begin(self, allow_mixed: bool = False) -> None:
+        """Say in the run who is going to play in it.
+
+        Raises SettingsMismatchError if episodes were played where numbers come out otherwise, unless that is
+        allowed.
+        """
+        if not allow_mixed:
+            stored = read_provenances(self.location).values()
+            refuse_other_provenance(stored, self.provenance, str(self.location))
+        keep_provenance(self.location, self.provenance)
+
     def remaining(self) -> list[int]:
         """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
         done = read_commits(self.location)
@@ -109,11 +141,17 @@ class RunWriter:
             "episode_id": planned.episode.episode_id,
             "outcome": episode.outcome,
             "roles": episode.roles,
+            "provenance": name_of(self.provenance),
             "objects": {key: list(record) for key, record in sorted(store.objects.items())},
         }
         write_commit(self.location, planned.index, commit)
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
-        """Record what was loaded and checked; the first one stays."""
+        """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""
+        if self._certified:
+            return
+        own = json.loads(json.dumps({**certificate, "provenance": name_of(self.provenance)}, default=list))
         if not self.location.exists(CERTIFICATE_FILE):
-            create_once(self.location, CERTIFICATE_FILE, json.loads(json.dumps(certificate, default=list)))
+            create_once(self.location, CERTIFICATE_FILE, {**own, **self.provenance})
+        create_once(self.location, f"{CERTIFICATES}/{sha256_json(own)[:16]}.json", own)
+        self._certified = True

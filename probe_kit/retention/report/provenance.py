@@ -39,6 +39,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
         "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
+        "mixed": ", ".join(getattr(run, "mixed", ())),
         "probes": str(probes.get("key", "none")),
     }
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}

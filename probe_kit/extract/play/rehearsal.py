@@ -1,0 +1,36 @@
+"""The scene is built once before anything is played: what is wrong with all episodes is said before the first."""
+
+from collections.abc import Iterable
+from itertools import islice
+
+from probe_kit.env import Act2AnswerEnv, SceneSpec
+from probe_kit.errors import SceneError
+from probe_kit.extract.plan import PlannedEpisode
+
+EPISODES = 3
+"""If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
+
+
+def rehearse(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> None:
+    """Set up the first episode, or the next ones if its start cannot be reached.
+
+    Raises SceneError if none of the first episodes can be set up, such as for an arm whose meshes are not
+    installed, and SuiteError if a picture of the first one is not what the suite says.
+    """
+    env = Act2AnswerEnv(scene)
+    failed: SceneError | None = None
+    try:
+        for planned in islice(episodes, EPISODES):
+            try:
+                env.reset(
+                    seed=planned.scene_seed,
+                    options={"item": planned.episode.item, "layout": planned.episode.layout},
+                )
+            except SceneError as error:
+                failed = error
+            else:
+                return
+    finally:
+        env.close()
+    if failed is not None:
+        raise failed

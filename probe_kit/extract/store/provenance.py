@@ -1,0 +1,112 @@
+"""Provenance: on what device and with which versions a process plays, stored once and named by its commits.
+
+    provenance/<first digits of its sha256>.json
+
+Settings say what was asked for; provenance says what answered. Numbers made on another kind of device or by other
+libraries are not the same numbers, so a run is not continued there unless that is asked for, and then says so.
+"""
+
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import probe_kit.version
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract.store.commits import create_once
+from probe_kit.extract.store.location import Location
+from probe_kit.identity import sha256_json, sha256_text
+
+Provenance = Mapping[str, Any]
+
+PROVENANCE = "provenance"
+DIGITS = 16
+_LIBRARIES = ("torch", "lerobot", "transformers", "timm", "pybullet", "zarr", "numcodecs", "numpy", "pillow")
+DECISIVE = ("device", "dtype", *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")))
+"""What changes numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
+
+
+def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, Any]:
+    """That of this process when it computes on `device` in `dtype`."""
+    kind = device.partition(":")[0]
+    return {
+        "device": kind,
+        "device_name": _gpu_name(device) if kind == "cuda" else platform.machine(),
+        "dtype": dtype,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "versions": {"probe-kit": probe_kit.version.__version__, **_versions()},
+        "code_sha256": code_sha256(),
+    }
+
+
+def _gpu_name(device: str) -> str:
+    import torch
+
+    return torch.cuda.get_device_name(device)
+
+
+def _versions() -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+@cache
+def code_sha256() -> str:
+    """Hash of probe_kit's own source files."""
+    root = Path(probe_kit.version.__file__).parent
+    files = sorted(root.rglob("*.py"))
+    return sha256_json(
+        [[f.relative_to(root).as_posix(), sha256_text(f.read_text(encoding="utf-8"))] for f in files]
+    )
+
+
+def name_of(provenance: Provenance) -> str:
+    """What commits call it."""
+    return sha256_json(provenance)[:DIGITS]
+
+
+def keep_provenance(location: Location, provenance: Provenance) -> None:
+    """Store it in the run, unless another process did."""
+    create_once(location, f"{PROVENANCE}/{name_of(provenance)}.json", provenance)
+
+
+def read_provenances(location: Location) -> dict[str, Provenance]:
+    """Every provenance of a run by its name; a run made before there was any has none."""
+    stored = location.read_all(PROVENANCE, ".json")
+    return {name.removesuffix(".json"): json.loads(text) for name, text in stored.items()}
+
+
+def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:
+    """The decisive parts that are not the same in all of them, such as `versions.torch`."""
+    seen = [dict(_decisive(provenance)) for provenance in provenances]
+    return tuple(part for part in DECISIVE if len({one[part] for one in seen}) > 1)
+
+
+def _decisive(provenance: Provenance) -> Iterable[tuple[str, Any]]:
+    for part in DECISIVE:
+        outer, _, inner = part.partition(".")
+        yield part, provenance.get(outer, {}).get(inner) if inner else provenance.get(outer)
+
+
+def refuse_other_provenance(stored: Iterable[Provenance], here: Provenance, where: str) -> None:
+    """Raise SettingsMismatchError naming what differs here from what made the episodes of a run so far."""
+    for one in stored:
+        if different := differences([one, here]):
+            was, now = dict(_decisive(one)), dict(_decisive(here))
+            lines = [f"  {part}: stored {was[part]!r}, here {now[part]!r}" for part in different]
+            raise SettingsMismatchError(
+                f"{where} holds episodes that were made elsewhere, and this changes numbers:\n"
+                + "\n".join(lines)
+                + "\n"
+                "Continue it where it was begun, choose another --out, or accept a mixed run with --allow-mixed, "
+                "which its certificate and every table will say"
+            )

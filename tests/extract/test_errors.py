@@ -1,0 +1,155 @@
+"""What is wrong with a whole run keeps its class, its exit code and its words, whoever plays."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import (
+    CaptureChangedActionError,
+    ProbeKitError,
+    SceneError,
+    SuiteError,
+    UsageError,
+)
+from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract.play.stage import LocalStage
+from probe_kit.extract.play.stage_process import ProcessStage
+from probe_kit.hooks import Observation
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.suite import Suite, build_suite
+
+SHORT = SceneSpec(max_steps=2)
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
+
+
+@pytest.mark.parametrize("stage_kind", [LocalStage, ProcessStage])
+def test_a_stage_raises_the_same_error_wherever_it_stands(
+    stage_kind: type[LocalStage | ProcessStage], suite: Suite, tmp_path: Path
+) -> None:
+    """A picture that changed on disk is no dead process."""
+    copy = Path(shutil.copytree(suite.folder, tmp_path / "suite"))
+    planned = prepare(ExtractSettings("expert", suite=copy)).plan.episodes[0]
+    for picture in copy.rglob("*.png"):
+        picture.write_bytes(b"not a picture")
+    stage = stage_kind(SHORT, None)
+    try:
+        stage.ask("begin", planned, False)
+        with pytest.raises(SuiteError) as caught:
+            stage.answer()
+    finally:
+        stage.close()
+    assert any(planned.episode.episode_id in note for note in caught.value.__notes__)
+
+
+def test_an_arm_without_its_extra_is_said_before_anything_is_played(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.env.widowx.find_spec", lambda _name: None)
+    settings = ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(arm="widowx"), env_workers=0)
+    with pytest.raises(SceneError, match=r"probe-kit\[widowx\]") as caught:
+        extract_run(settings, tmp_path / "run")
+    assert caught.value.exit_code == 2
+    assert not (tmp_path / "run").exists()
+
+
+WITHOUT_MESHES = """
+import importlib.util as util
+found = util.find_spec
+util.find_spec = lambda name, *rest: None if name == "rtbdata" else found(name, *rest)
+"""
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "1"), ("--env-workers", "2")])
+def test_the_exit_code_of_a_missing_extra_is_that_of_a_wrong_usage(
+    workers: tuple[str, ...], suite: Suite, tmp_path: Path
+) -> None:
+    blocked = tmp_path / "blocked"
+    blocked.mkdir()
+    (blocked / "sitecustomize.py").write_text(WITHOUT_MESHES)
+    command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--suite", str(suite.folder)]
+    ran = subprocess.run(
+        [*command, "--arm", "widowx", "--out", str(tmp_path / "run"), *workers],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(blocked)},
+    )  # fmt: skip
+    assert (ran.returncode, "SceneError" in ran.stderr) == (2, True), ran.stderr
+
+
+def test_a_scene_in_which_no_episode_can_start_is_refused_at_once(suite: Suite, tmp_path: Path) -> None:
+    spec = SceneSpec(home=(0.49, 0.29, 0.39))
+    with pytest.raises(SceneError):
+        extract_run(ExtractSettings("expert", suite=suite.folder, scene=spec), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_adapter_that_acts_otherwise_under_capture_stops_the_run(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps state between calls: every inference adds a little more to its actions."""
+    sound, calls = Pi0.act, count(1)
+
+    def drifting(policy: Pi0, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return sound(policy, seen, seeds) + np.float32(1e-6 * next(calls))
+
+    monkeypatch.setattr(Pi0, "act", drifting)
+    settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, env_workers=0)
+    with pytest.raises(CaptureChangedActionError, match="must be equal"):
+        extract_run(settings, tmp_path / "run")
+    assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
+    assert not (tmp_path / "run" / "certificate.json").exists()
+
+
+def test_the_certificate_holds_what_was_measured_in_every_process(suite: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, env_workers=0)
+    run = extract_run(settings, tmp_path / "run")
+    (process,) = run.certificate["processes"]
+    check = process["capture_check"]
+    assert check["actions_with_hooks_sha256"] == check["actions_without_hooks_sha256"]
+    assert len(check["actions_with_hooks_sha256"]) == 64
+    assert run.certificate["hooks_on_equals_hooks_off"] is True
+    forged = tmp_path / "run" / "certificates" / "forged.json"
+    forged.write_text('{"capture_check": {"actions_with_hooks_sha256": "a", "actions_without_hooks_sha256": "b"}}')
+    assert open_run(run.path).certificate["hooks_on_equals_hooks_off"] is False
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"random_weights": True},
+        {"execute": 2},
+        {"checkpoint": "somewhere"},
+        {"tokens": "all"},
+        {"captured_calls": 2},
+        {"dtype": "bfloat16"},
+        {"options": {"bits": 8}},
+    ],
+)
+def test_what_means_nothing_to_a_scripted_policy_is_refused(suite: Suite, change: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="is scripted"):
+        prepare(ExtractSettings("expert", suite=suite.folder, **change))
+
+
+def test_more_actions_than_a_chunk_has_are_refused(suite: Suite) -> None:
+    with pytest.raises(UsageError, match="gives 16 actions per inference"):
+        prepare(ExtractSettings("pi0-tiny", suite=suite.folder, execute=17))
+
+
+def test_errors_survive_the_way_through_a_pipe() -> None:
+    import pickle
+
+    error = SuiteError("seen, expected, do")
+    error.add_note("in episode 3")
+    back: ProbeKitError = pickle.loads(pickle.dumps(error))
+    assert (type(back), str(back), back.exit_code, back.__notes__) == (SuiteError, str(error), 1, error.__notes__)
