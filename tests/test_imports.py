@@ -9,7 +9,7 @@ from tests.import_graph import circles, import_graph, upward
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
-BASE = {"child", "cluster", "console", "errors", "extras", "identity", "lazy", "version"}
+BASE = {"child", "cluster", "console", "errors", "extras", "identity", "lazy", "notebook", "version"}
 ROOMS = {
     **dict.fromkeys(BASE, BASE),
     "statistics": BASE,

@@ -20,16 +20,8 @@ from probe_kit.retention.cells import (
     title,
 )
 from probe_kit.retention.differences import Difference
+from probe_kit.retention.heat import HEAT
 from probe_kit.retention.rows import MEAN, RetentionRow
-
-HEAT = (
-    (0.2, "pkheat1", "FDE0DD"),
-    (0.4, "pkheat2", "FBD3C0"),
-    (0.6, "pkheat3", "FEF0C7"),
-    (0.8, "pkheat4", "E2F0CB"),
-    (float("inf"), "pkheat5", "C3E6C3"),
-)
-"""Upper bound of retention, colour name, RGB: from lost (red) to kept (green)."""
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",

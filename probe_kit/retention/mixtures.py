@@ -4,7 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, ProbeSettings
+from probe_kit.train.results import ProbeResults
+from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.targets import TARGETS
 
 _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {

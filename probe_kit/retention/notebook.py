@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 from probe_kit.retention.cells import model_name
+from probe_kit.retention.differences import Difference
 from probe_kit.retention.report.tables import (
     HtmlCell,
     HtmlTable,
@@ -12,35 +12,32 @@ from probe_kit.retention.report.tables import (
     difference_tables,
     retention_table,
 )
-
-if TYPE_CHECKING:
-    from probe_kit.retention.table import RetentionTable
+from probe_kit.retention.rows import RetentionRow
 
 _CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
 _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of text
 
 
-def table_html(table: "RetentionTable") -> str:
+def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The report's first tables, without its page: headings explain themselves when pointed at."""
-    rows = table.all_rows
-    found = [behaviour_table(rows), retention_table(rows), *difference_tables(table.differences)]
-    return _heading(table) + "".join(_table(one) for one in found if one is not None)
+    found = [behaviour_table(rows), retention_table(rows), *difference_tables(differences)]
+    return _heading(rows) + "".join(_table(one) for one in found if one is not None)
 
 
-def _heading(table: "RetentionTable") -> str:
+def _heading(rows: Sequence[RetentionRow]) -> str:
     """Whose numbers these are, since a table of one model does not repeat its name."""
-    suites = ", ".join(dict.fromkeys(row.suite for row in table.rows))
-    return f"<div>{escape(_models(table))} on {escape(suites)}</div>" if table.rows else ""
+    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
+    return f"<div>{escape(_models(rows))} on {escape(suites)}</div>" if rows else ""
 
 
-def _models(table: "RetentionTable") -> str:
-    return ", ".join(dict.fromkeys(map(model_name, table.rows)))
+def _models(rows: Sequence[RetentionRow]) -> str:
+    return ", ".join(dict.fromkeys(map(model_name, rows)))
 
 
-def table_text(table: "RetentionTable") -> str:
+def table_text(rows: Sequence[RetentionRow]) -> str:
     """One line: how many rows, of which models."""
-    categories = len({row.category for row in table.rows})
-    models = _models(table) or "no runs"
+    categories = len({row.category for row in rows})
+    models = _models(rows) or "no runs"
     return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
 
 

@@ -43,12 +43,12 @@ class RetentionTable:
     def __repr__(self) -> str:
         from probe_kit.retention.notebook import table_text
 
-        return table_text(self)
+        return table_text(self.rows)
 
     def _repr_html_(self) -> str:
         from probe_kit.retention.notebook import table_html
 
-        return table_html(self)
+        return table_html(self.all_rows, self.differences)
 
     @property
     def all_rows(self) -> list[RetentionRow]:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from probe_kit.train.curve import Curve
     from probe_kit.train.directions import Direction
     from probe_kit.train.reader import RunReader
-    from probe_kit.train.results import ProbeResults, ProbeSettings
+    from probe_kit.train.results import ProbeResults
+    from probe_kit.train.settings import ProbeSettings
     from probe_kit.train.store import load_results, save_results
     from probe_kit.train.sweep import Progress, train_probes
     from probe_kit.train.targets import TARGETS, Target
@@ -51,7 +52,7 @@ __getattr__ = lazy_names(
         "Curve": "curve",
         "Direction": "directions",
         "ProbeResults": "results",
-        "ProbeSettings": "results",
+        "ProbeSettings": "settings",
         "Progress": "sweep",
         "RunReader": "reader",
         "TARGETS": "targets",

@@ -14,9 +14,10 @@ from probe_kit.train.curve import Curve
 from probe_kit.train.permutation import site_p
 from probe_kit.train.problem import POOLED, category_problem
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, ProbeSettings
+from probe_kit.train.results import ProbeResults
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import GAINS, chance_level, correctness, group_bootstrap, units_seed
+from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.targets import target_labels
 
 Prepared = Mapping[Baseline, NDArray[np.float32]]

@@ -7,7 +7,7 @@ from typing import Any
 from probe_kit.errors import NoProbesError
 from probe_kit.extract.store.location import Location
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import FORMAT
+from probe_kit.train.settings import FORMAT
 from probe_kit.train.store import is_current, load_results, read_controls, read_headers, settings_of
 from probe_kit.train.unfinished import unfinished_sweeps
 

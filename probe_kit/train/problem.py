@@ -11,9 +11,9 @@ from probe_kit.errors import TooFewGroupsError
 from probe_kit.identity import derive_seed
 from probe_kit.train.permutation import exchange_items, flip_items
 from probe_kit.train.probe import NestedFold, SiteProbe, nested_folds, probe_site
-from probe_kit.train.results import ProbeSettings
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import chance_level
+from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.targets import target_labels
 
 if TYPE_CHECKING:

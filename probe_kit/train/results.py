@@ -1,7 +1,7 @@
 """Probe results: a table of scores, and the out-of-fold decisions behind it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,37 +17,11 @@ from probe_kit.train.directions import Direction, Place
 from probe_kit.train.permutation import site_p
 from probe_kit.train.reader import RunReader
 from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss, units_seed
+from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.summary import results_html, results_text
-from probe_kit.train.targets import Target
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FORMAT = 3  # raise when settings have other fields or would give other numbers
-
-
-@dataclass(frozen=True)
-class ProbeSettings:
-    """Everything that decides the numbers; its hash is the results' key."""
-
-    model: str
-    random_weights: bool
-    weights: str | None
-    suite: str
-    run_settings: str
-    episodes: str  # sha256 of the episode ids, so that a run that grew is probed again
-    categories: tuple[str, ...]
-    views: tuple[str, ...]
-    target: Target
-    permutations: int
-    seed: int
-    token_permutations: int = 0  # 0 where no token view is probed
-    format: int = FORMAT
-
-    @property
-    def key(self) -> str:
-        """First 12 hex digits of the settings' sha256: the name of the results' folder."""
-        return sha256_json(asdict(self))[:12]
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,10 +40,10 @@ class ProbeResults:
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
 
     def __repr__(self) -> str:
-        return results_text(self)
+        return results_text(self.settings)
 
     def _repr_html_(self) -> str:
-        return results_html(self)
+        return results_html(self.settings, self.scores)
 
     @property
     def key(self) -> str:

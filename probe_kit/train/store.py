@@ -21,7 +21,8 @@ from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import StoredDirections, save_directions
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import FORMAT, ProbeResults, ProbeSettings, episodes_sha256
+from probe_kit.train.results import ProbeResults, episodes_sha256
+from probe_kit.train.settings import FORMAT, ProbeSettings
 from probe_kit.train.targets import Target
 
 HOME = "probes"

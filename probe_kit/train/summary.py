@@ -4,34 +4,31 @@ from typing import TYPE_CHECKING
 
 from probe_kit.notebook import rows_html
 from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.settings import ProbeSettings
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.train.results import ProbeResults
 
-
-def results_text(results: "ProbeResults") -> str:
+def results_text(settings: ProbeSettings) -> str:
     """One line: what was probed, with how many relabellings, and the key."""
-    settings = results.settings
     random = ", RANDOM WEIGHTS" if settings.random_weights else ""
     return (
-        f"<ProbeResults {results.key} of {settings.model}{random}: {', '.join(settings.categories)}; "
+        f"<ProbeResults {settings.key} of {settings.model}{random}: {', '.join(settings.categories)}; "
         f"views {', '.join(settings.views)}; target {settings.target}; {settings.permutations} relabellings>"
     )
 
 
-def results_html(results: "ProbeResults") -> str:
+def results_html(settings: ProbeSettings, scores: "pd.DataFrame") -> str:
     """The best site of every category, view and stream."""
-    settings = results.settings
     random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
     title = f"Probes of {settings.model}{random}, target {settings.target}: the best site of each stream"
     columns = ("category", "view", "stream", "best site", "accuracy % [95 %]", "family-wise p", "n")
     note = (
-        f"{settings.permutations} relabellings, key {results.key}; only p < {SIGNIFICANCE} is evidence. "
+        f"{settings.permutations} relabellings, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
         "results.scores has every site"
     )
-    return rows_html(title, columns, [_cells(row) for _, row in _best(results.scores).iterrows()], note)
+    return rows_html(title, columns, [_cells(row) for _, row in _best(scores).iterrows()], note)
 
 
 def _best(scores: "pd.DataFrame") -> "pd.DataFrame":

@@ -16,8 +16,9 @@ from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction
 from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults, ProbeSettings, episodes_sha256
+from probe_kit.train.results import ProbeResults, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
+from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.store import is_stored, load_results, save_results
 from probe_kit.train.targets import Target
 from probe_kit.train.unfinished import Unfinished

@@ -13,8 +13,8 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
-from probe_kit.extract.play.stage import Seen
 from probe_kit.extract.play.stage_process import ProcessStage
+from probe_kit.hooks.observation import Observation
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -63,7 +63,7 @@ def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -
         with pytest.raises(StageDiedError, match="code -9"):
             stage.answer()
         stage.ask("begin", planned, False)
-        assert isinstance(stage.answer(), Seen)
+        assert isinstance(stage.answer(), Observation)
     finally:
         stage.close()
 

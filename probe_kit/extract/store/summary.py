@@ -2,23 +2,60 @@
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from probe_kit.extract.store.layout import RUN_FILE
 from probe_kit.hooks.summary import streams_text
 from probe_kit.notebook import facts_html
 
 if TYPE_CHECKING:
-    from probe_kit.extract.store.run import Run
+    import pandas as pd
+
+    from probe_kit.extract.store.location import Location
+    from probe_kit.hooks.sites import Stream
 
 
-def run_text(run: "Run") -> str:
+class Summarised(Protocol):
+    """What of a run is said in a few words; see `Run`."""
+
+    location: "Location"
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted."""
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether nobody trained them."""
+
+    @property
+    def suite(self) -> str:
+        """Identity of the suite."""
+
+    @property
+    def planned(self) -> int:
+        """Episodes of the plan."""
+
+    @property
+    def episodes(self) -> "pd.DataFrame":
+        """Committed episodes."""
+
+    @property
+    def streams(self) -> "dict[str, Stream]":
+        """Captured streams."""
+
+
+def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
     return f"<Run {run.model}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
 
 
-def run_html(run: "Run") -> str:
+def run_html(run: Summarised) -> str:
     """What it is a run of, how it went, and where it lies."""
     weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
     facts = {
@@ -32,12 +69,12 @@ def run_html(run: "Run") -> str:
     return facts_html(f"Run of {run.model}", facts, "run.episodes is the table, run.column(site) one site of it")
 
 
-def _episodes(run: "Run") -> str:
+def _episodes(run: Summarised) -> str:
     done = len(run.episodes)
     return f"{done} episodes" if done == run.planned else f"{done} of {run.planned} episodes"
 
 
-def _outcomes(run: "Run") -> dict[str, int]:
+def _outcomes(run: Summarised) -> dict[str, int]:
     if run.episodes.empty:
         return {}
     return {str(name): int(count) for name, count in run.episodes["outcome"].value_counts().items()}

@@ -10,7 +10,7 @@ from probe_kit.retention.cells import model_name, once_per_category
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, spell
-from probe_kit.retention.latex import HEAT
+from probe_kit.retention.heat import HEAT, heat_colour
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.table import RetentionTable
 
@@ -169,11 +169,6 @@ class RetentionTableDisplay(HeatTableDisplay):
             return Cell(values)
 
         return cls._of([row for row in table.all_rows if row.view is not None], cell)
-
-
-def heat_colour(value: float) -> str:
-    """The colour `#RRGGBB` of a share or ratio, from lost (red) to kept (green)."""
-    return f"#{next(rgb for bound, _, rgb in HEAT if value < bound)}"
 
 
 def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> str:

@@ -20,8 +20,8 @@ from probe_kit.retention.cells import (
     with_limits,
 )
 from probe_kit.retention.differences import Difference
-from probe_kit.retention.displays.heat_table import heat_colour
 from probe_kit.retention.displays.style import spell
+from probe_kit.retention.heat import heat_colour
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
