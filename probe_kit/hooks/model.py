@@ -152,7 +152,12 @@ class Policy(Model):
     """A model that turns observations and an instruction into actions.
 
     Deterministic for given seeds. Capturing changes no action, bit for bit.
+
+    flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
+    then does is the family's. None for a family that cannot tell.
     """
+
+    flagged: NDArray[np.bool_] | None = None
 
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:

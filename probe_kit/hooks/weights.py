@@ -52,10 +52,11 @@ class WeightsAudit:
         return asdict(self)
 
 
-def read_weights(folder: Path) -> Weights:
+def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
     """Read `model.safetensors`, every shard of `model.safetensors.index.json`, or the only `.pt` file.
 
-    A `.pt` file is read with `weights_only=True`: it cannot run code.
+    A `.pt` file is read with `weights_only=True`: it cannot run code. unlisted: tensors that shards may hold
+    although the index does not name them.
     Raises WeightsError if a file is missing or damaged, or if the index and the shards disagree.
     """
     index, pickles = folder / INDEX_FILE, sorted(folder.glob("*.pt"))
@@ -73,8 +74,7 @@ def read_weights(folder: Path) -> Weights:
     random = False
     for name, expected in shards.items():
         content, metadata = _read_file(folder / name)
-        if expected is not None and set(content) != expected:
-            difference = sorted(set(content) ^ expected)
+        if expected is not None and (difference := sorted((set(content) ^ expected) - (set(unlisted) - expected))):
             raise WeightsError(f"{folder / name} and {INDEX_FILE} disagree about {_names(difference)}")
         tensors |= content
         random = random or metadata.get(RANDOM_MARK, "").startswith("random")

@@ -158,6 +158,9 @@ def _sizes(rows: Sequence[RetentionRow]) -> str:
     ]
     if groups := [row.n_groups for row in single if row.n_groups is not None]:
         parts.append(f"{_span(groups)} groups")
+    flags = [percent(row.p_flagged) for row in single if row.p_flagged is not None]
+    if flags:
+        parts.append(f"no action in {' / '.join(dict.fromkeys(flags))} % of steps (flagged)")
     if chances := {percent(row.chance) for row in single if row.chance is not None}:
         parts.append(f"chance {' or '.join(sorted(chances))} %")
     return ", ".join(parts)

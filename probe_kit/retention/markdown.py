@@ -33,6 +33,7 @@ SUCCESS_COLUMNS: list[Column] = [
     ("wrong %", lambda row: percent(row.p_wrong)),
     ("outside %", lambda row: percent(row.p_oob)),
     ("never moved %", lambda row: percent(row.p_never_moved)),
+    ("flagged steps %", lambda row: percent(row.p_flagged)),
     ("original / swapped %", lambda row: f"{percent(row.sr_original)} / {percent(row.sr_swapped)}"),
     ("left / right %", lambda row: f"{percent(row.sr_left)} / {percent(row.sr_right)}"),
     ("regime", lambda row: row.regime or f"normalised score {number(row.normalised_score, 1)}"),

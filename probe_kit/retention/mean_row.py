@@ -10,7 +10,7 @@ from probe_kit.retention.run_rows import Drawn
 from probe_kit.retention.success import normalised_score
 
 _AVERAGED = (
-    "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "chance",
+    "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
     "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
     "action_twin",
 )  # fmt: skip

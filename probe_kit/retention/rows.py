@@ -43,6 +43,7 @@ class RetentionRow:
     p_wrong: float | None = None
     p_oob: float | None = None
     p_never_moved: float | None = None
+    p_flagged: float | None = None
     regime: str | None = None
     regime_reason: str | None = None
     side_preference: float | None = None

@@ -107,6 +107,7 @@ def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> dict[str
         "p_wrong": success.p_wrong,
         "p_oob": success.p_oob,
         "p_never_moved": success.p_never_moved,
+        "p_flagged": success.p_flagged,
         "regime": str(success.regime),
         "regime_reason": success.reason,
         "side_preference": success.side_preference,

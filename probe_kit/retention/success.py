@@ -44,7 +44,8 @@ class SuccessRate:
 
     ci: 95 % interval of `sr`, whole items resampled. sr_original, sr_swapped: per layout, and layout_mean their
     mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None if it was not
-    recorded. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
+    recorded. p_flagged: share of inferences that put out no action, None for a policy that cannot tell. sr_left,
+    sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
     guessing explains, for N = episodes; delta_items: the same for N = items, conservative. side_preference:
     share placed left among episodes placed in a zone. A rate over no episodes is None.
     """
@@ -61,6 +62,7 @@ class SuccessRate:
     p_wrong: float
     p_oob: float
     p_never_moved: float | None
+    p_flagged: float | None
     delta: float
     delta_items: float
     regime: Regime
@@ -127,6 +129,7 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         p_wrong=p_wrong,
         p_oob=p_oob,
         p_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
+        p_flagged=_flagged(episodes),
         delta=delta,
         delta_items=chance_margin(n_items),
         regime=name,
@@ -134,6 +137,13 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         side_preference=_rate(placed == "left"),
         paired=paired_items(episodes),
     )
+
+
+def _flagged(episodes: "pd.DataFrame") -> float | None:
+    """Every inference counts once, whatever its episode."""
+    if not {"flagged_steps", "inferences"} <= set(episodes):
+        return None
+    return float(episodes["flagged_steps"].sum() / episodes["inferences"].sum())
 
 
 def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:

@@ -47,6 +47,7 @@ class Controller(Protocol):
 
     script: for `Stage`, None if this controller acts itself.
     threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
+    flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
     """
 
     identity: dict[str, Any]
@@ -54,6 +55,7 @@ class Controller(Protocol):
     script: str | None
     threads: int | None
     on_gpu: bool
+    flagged: NDArray[np.bool_] | None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
@@ -71,6 +73,7 @@ class ScriptedController:
         self.script: str | None = name
         self.threads: int | None = None
         self.on_gpu = False
+        self.flagged: NDArray[np.bool_] | None = None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Never asked: a scripted stage plays to the end by itself."""
@@ -102,6 +105,7 @@ class PolicyController:
         self.script: str | None = None
         self.threads = 1 if card.parameters < SMALL else None
         self.on_gpu = card.device.startswith("cuda")
+        self.flagged: NDArray[np.bool_] | None = None
         self.identity: dict[str, Any] = {
             "model": name,
             "random_weights": card.random_weights,
@@ -123,6 +127,7 @@ class PolicyController:
             chunks = self._act_and_capture(observations, seeds, captured)
         else:
             chunks = self.policy.act(observations, seeds)
+        self.flagged = self.policy.flagged
         return [chunk[: self.execute] for chunk in chunks]
 
     def certificate(self) -> dict[str, Any]:

@@ -51,10 +51,12 @@ class Seat:
         self.planned: PlannedEpisode | None = None
         self.seen: Observation | None = None
         self.calls = 0
+        self.flagged: int | None = None
 
     def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
         """Begin an episode."""
         self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
+        self.flagged = None
         self.stage.ask("begin", planned, film)
 
     def turn(self) -> Turn:
@@ -63,11 +65,18 @@ class Seat:
         assert self.seen is not None
         return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers)
 
-    def go_on(self, actions: NDArray[np.float32]) -> None:
-        """Carry out actions."""
+    def go_on(self, actions: NDArray[np.float32], flagged: bool | None) -> None:
+        """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""
         self.seen = None
         self.calls += 1
+        if flagged is not None:
+            self.flagged = (self.flagged or 0) + flagged
         self.stage.ask("advance", actions)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What the outcome record says of the policy's steps, where the policy can tell."""
+        return {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
 
     def leave(self) -> None:
         """The episode is over."""
@@ -123,7 +132,8 @@ class Play:
                 if isinstance(answer, Observation):
                     seat.seen = answer
                 else:
-                    yield Rollout(seat.planned, answer.outcome, seat.buffers, answer.frames, answer.ends)
+                    outcome = {**answer.outcome, **seat.counts}
+                    yield Rollout(seat.planned, outcome, seat.buffers, answer.frames, answer.ends)
                     self._begin_next(seat)
             if not any(seat.seen for seat in group):
                 return
@@ -138,8 +148,9 @@ class Play:
             for seat in due:
                 yield self._give_up(seat, error)
             return
-        for seat, actions in zip(due, chunks, strict=True):
-            seat.go_on(actions)
+        flags = self._controller.flagged
+        for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
+            seat.go_on(actions, None if flags is None else bool(flags[row]))
 
     def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
         assert seat.planned is not None

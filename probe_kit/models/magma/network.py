@@ -123,6 +123,14 @@ class MagmaNetwork(nn.Module):
             ids.append(choose(logits[-1]))
         return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), decoding)
 
+    def unheard(self) -> Any:
+        """A second language model over the same weights: hooks hang on modules, so none of ours hears it run."""
+        with torch.device("meta"):
+            twin = LlamaForCausalLM(self.config.text).requires_grad_(False)
+        twin.load_state_dict(self.language_model.state_dict(keep_vars=True), strict=True, assign=True)
+        twin.model.rotary_emb = self.language_model.model.rotary_emb
+        return twin.eval()
+
 
 class Decoding:
     """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones."""
@@ -131,17 +139,21 @@ class Decoding:
         self.language_model, self._mask = language_model, packed.mask
         self._cache = DynamicCache(config=language_model.config)
         self._positions = positions(packed.mask)
-        self.logits = self._run(packed.embeddings)
+        self.logits = self._run(language_model, packed.embeddings)
 
-    def feed(self, ids: Tensor) -> Tensor:
-        """(B, V) logits behind one more token (B,) per row."""
+    def feed(self, ids: Tensor, through: Any = None) -> Tensor:
+        """(B, V) logits behind one more token (B,) per row.
+
+        through: another language model with the same weights, see `MagmaNetwork.unheard`.
+        """
+        language_model = self.language_model if through is None else through
         self._positions = self._positions[:, -1:] + 1
         self._mask = torch.cat([self._mask, torch.ones_like(self._mask[:, :1])], dim=1)
-        self.logits = self._run(self.language_model.get_input_embeddings()(ids[:, None]))
+        self.logits = self._run(language_model, language_model.get_input_embeddings()(ids[:, None]))
         return self.logits
 
-    def _run(self, embeddings: Tensor) -> Tensor:
-        output = self.language_model(
+    def _run(self, language_model: Any, embeddings: Tensor) -> Tensor:
+        output = language_model(
             inputs_embeds=embeddings,
             position_ids=self._positions,
             attention_mask=needed(self._mask),

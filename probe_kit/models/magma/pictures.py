@@ -52,12 +52,14 @@ class PictureSettings:
     def of(cls, vision: VisionConfig, folder: Path) -> "PictureSettings":
         """From `folder/preprocessor_config.json`, or where there is none from the configuration.
 
+        Recorded references hold the same fields in `action_config.json`.
         Raises CheckpointError for a file that lacks a field.
         """
-        file = folder / "preprocessor_config.json"
-        if not file.is_file():
-            return cls(vision.base, vision.crops)
-        return cls.from_json(json.loads(file.read_text()), str(file))
+        for name, part in (("preprocessor_config.json", None), ("action_config.json", "preprocessor")):
+            if (folder / name).is_file():
+                values = json.loads((folder / name).read_text())
+                return cls.from_json(values if part is None else values.get(part, {}), str(folder / name))
+        return cls(vision.base, vision.crops)
 
     @classmethod
     def from_json(cls, values: dict[str, object], source: str) -> "PictureSettings":

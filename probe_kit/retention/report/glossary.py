@@ -25,6 +25,10 @@ GLOSSARY = MappingProxyType(
         "goes left": (
             "Among episodes that reached a picture, the share that ended on the left one. 50 %: no habit."
         ),
+        "flagged": (
+            "Share of the policy's steps in which it put out something that is no action, such as text. Magma "
+            "then holds still; OpenVLA takes the nearest action, as its authors do."
+        ),
         "right twice": (
             "Questions answered correctly in both layouts, of those that ran in both. A habit of going to one "
             "side cannot produce these."

@@ -128,6 +128,10 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
         )
     elif (mean.p_oob or 0) > _MOSTLY:
         found.append(f"The cube reached neither picture in {percent(mean.p_oob)} % of episodes.")
+    if mean.p_flagged:
+        found.append(
+            f"In {percent(mean.p_flagged)} % of its steps the policy put out something that is no action."
+        )
     biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
     if biased:
         found.append(f"The policy has a habit of going to one side in {_of(biased, rows)}.")

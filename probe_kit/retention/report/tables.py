@@ -155,6 +155,7 @@ _MORE_BEHAVIOUR = [
     _share("original %", "sr_original", "original"),
     _share("swapped %", "sr_swapped", "swapped"),
     _share("goes left %", "side_preference", "goes left"),
+    _share("flagged steps %", "p_flagged", "flagged"),
 ]
 
 _RETENTION = [

@@ -88,7 +88,9 @@ class OpenVLA(PrismaticModel, Policy):
         rows = [self.prompt(observation.instruction) for observation in seen]
         pixels = self.pixel_values(self._look(observation.image) for observation in seen)
         ids = self.generate(pixels, rows).ids.cpu().numpy()
-        self._say_unknown(ids)
+        self.flagged = ~np.asarray(self.action_tokens.known(ids).all(axis=1))
+        if self.flagged.any():
+            self._say_unknown()
         actions = self.statistics.restore(self.action_tokens.values(ids))
         actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
         return actions[:, None].astype(np.float32)
@@ -96,13 +98,13 @@ class OpenVLA(PrismaticModel, Policy):
     def _look(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return centre_crop(image, self.config.towers[0].image_size) if self.crop else image
 
-    def _say_unknown(self, ids: NDArray[np.int64]) -> None:
-        if not self.action_tokens.known(ids).all():
-            warnings.warn(
-                "the model put out tokens that name no action; they count as the nearest bin, as in the original "
-                "software. Random weights do this; if trained ones do, prompt or tokenizer are wrong",
-                stacklevel=3,
-            )
+    def _say_unknown(self) -> None:
+        warnings.warn(
+            "the model put out tokens that name no action; they count as the nearest bin, as in the original "
+            "software, and the step as flagged. Random weights do this; if trained ones do, prompt or tokenizer "
+            "are wrong",
+            stacklevel=3,
+        )
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""

@@ -1,0 +1,40 @@
+"""Magma, native."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "magma",
+        "Magma (ConvNeXt-XXLarge, Llama 3 8B, actions as tokens, answers in text), native",
+        "microsoft/Magma-8B",
+        "probe_kit.hooks.families.magma.adapter:load_magma",
+        streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
+        embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
+        notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
+        verifier="probe_kit.hooks.families.magma.verify:verify_magma",
+        full_size="probe_kit.models.magma:full_size_magma",
+        options=(
+            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig"),
+            Option("statistics", str, "File with action statistics, above ours and the checkpoint's.", "none"),
+            Option("shrink", int, "Side to which pictures are shrunk first; 0: whole, at any resolution.", "256"),
+            Option(
+                "prompt",
+                str,
+                "Order of turns; act2answer: the user's first.",
+                "magma",
+                choices=("magma", "act2answer"),
+            ),
+            Option("temperature", float, "0: the likeliest token; 0.7: drawn as the release does.", "0"),
+            Option("tokenizer", str, "Folder of another tokenizer.", "the checkpoint's"),
+            Option(
+                "layer_scale", str, "weight: accept them under that name.", "gamma", choices=("gamma", "weight")
+            ),
+        ),
+        reads=True,
+        unstored=(
+            "vision_tower.clip_vision_model.head.",
+            "vision_tower.clip_vision_model.trunk.head.",
+        ),
+    ),
+)

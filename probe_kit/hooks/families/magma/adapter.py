@@ -1,0 +1,345 @@
+"""The adapter for Magma: its chat, its actions as tokens, its answers in text.
+
+Sequence: beginning, system and user turn with the picture's tokens in place of one placeholder, the header of the
+assistant's turn. Seven tokens follow, one per dimension, then the end of the turn; iteration k of the stream
+`action` is the position that chooses the k-th. Asked a question, the same seven steps begin the answer.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.magma.answer import Answer
+from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
+from probe_kit.hooks.families.magma.sampling import chooser
+from probe_kit.hooks.families.magma.text import ChatText, Prompt
+from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
+from probe_kit.hooks.model import Policy, Question, Reader, Reading, Tap
+from probe_kit.hooks.observation import Observation, checked_picture
+from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.views import PADDING
+from probe_kit.models.magma import (
+    ACTION_QUESTION,
+    Choose,
+    Decoded,
+    Picture,
+    PictureSettings,
+    PictureSpan,
+    choose_grid,
+    greedy,
+    prepare_picture,
+    shrink_picture,
+)
+
+DEFAULT_CHECKPOINT = "microsoft/Magma-8B"
+CAMERA = "primary"
+SEPARATOR = "separator"
+"""Role of the vectors that end every row of a picture's map."""
+STEPS, BINS = 7, 256
+PROMPTS = ("magma", "act2answer")
+_SHRINK = 256
+_GRIPPER_OPEN = 0.5
+_PROMPT, _LAST = slice(None, -1), slice(-1, None)
+
+
+class Magma(Policy, Reader):
+    """A loaded Magma: acts, and answers questions in text."""
+
+    def __init__(
+        self,
+        loaded: LoadedMagma,
+        statistics: ActionStatistics,
+        *,
+        shrink: int = _SHRINK,
+        prompt: str = "magma",
+        temperature: float = 0.0,
+        tokenizer: str | None = None,
+        layer_scale: str = "gamma",
+        steps: int = STEPS,
+    ) -> None:
+        self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
+        self.statistics, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
+        self.steps = steps
+        self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
+        self.decoder: Any = self.network.language_model.model
+        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        self.streams = {
+            "backbone": Stream("backbone", layers, width),
+            "action": Stream("action", layers, width, steps, part="action"),
+        }
+        self.further_streams = {
+            name: Stream(name, len(stage.blocks) + 1, _width(stage), part="vision", quantities=("residual",))
+            for name, stage in self._stages.items()
+        }
+        self.role_names = {
+            "backbone": (f"image.{CAMERA}", SEPARATOR, "language", "special", PADDING),
+            "action": ("action",),
+        }
+        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": layer_scale})
+
+    def _card(self, options: dict[str, str]) -> Card:
+        loaded, statistics = self.loaded, self.statistics
+        files = side_files(loaded.folder)
+        if self._text_folder != loaded.folder and self._text_folder.is_dir():
+            files |= side_files(self._text_folder, "tokenizer/")
+        side = f"shrunk to {self.shrink} x {self.shrink} first" if self.shrink else "whole, at any resolution"
+        how = f"drawn at temperature {self.temperature:g}" if self.temperature else "the likeliest"
+        return Card(
+            family="magma",
+            checkpoint=loaded.checkpoint,
+            weights_sha256=loaded.audit.sha256,
+            random_weights=loaded.audit.random,
+            parameters=loaded.audit.parameters,
+            dtype=loaded.dtype,
+            device=loaded.device,
+            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {statistics.key}",
+            cameras=(CAMERA,),
+            chunk=1,
+            execute=1,
+            notes=(
+                *loaded.notes,
+                f"actions in the units and at the rate of {statistics.key}",
+                f"pictures: {side}; tokens: {how}",
+            ),
+            audit=loaded.audit.to_json(),
+            settings={
+                **content_hashes(files),
+                "unnorm_key": statistics.key,
+                "action_statistics": statistics.sha256,
+                "prompt": self.order,
+                "question": ACTION_QUESTION,
+                "shrink": str(self.shrink),
+                "temperature": repr(self.temperature),
+                **options,
+            },
+            weights_seed=loaded.weights_seed,
+        )
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def pictures(self) -> PictureSettings:
+        """How pictures become crops."""
+        return PictureSettings.of(self.config.vision, self.loaded.folder)
+
+    @cached_property
+    def text(self) -> ChatText:
+        """How the model is spoken to. Raises CheckpointError naming the files that are missing."""
+        return ChatText.of(self._text_folder, self.config, self.order == "act2answer")
+
+    @cached_property
+    def action_tokens(self) -> ActionTokens:
+        """Which ids name which values: the last ones before the added tokens."""
+        return ActionTokens(self.text.vocabulary, BINS)
+
+    def prompt(self, instruction: str) -> Prompt:
+        """What the model is asked to act on an instruction."""
+        return self.text.prompt(ACTION_QUESTION.format(instruction=instruction))
+
+    def picture(self, image: NDArray[np.uint8]) -> Picture:
+        """Crops of a (H, W, 3) uint8 picture. Raises ObservationError."""
+        whole = checked_picture(image)
+        return prepare_picture(shrink_picture(whole, self.shrink) if self.shrink else whole, self.pictures)
+
+    def span(self, ids: Sequence[int], image: NDArray[np.uint8]) -> PictureSpan:
+        """Where the picture's tokens stand among those of a prompt, without preparing it."""
+        height, width = (self.shrink, self.shrink) if self.shrink else checked_picture(image).shape[:2]
+        return self.network.span(ids, choose_grid(width, height, self.pictures), self.pictures.base)
+
+    # -- running -----------------------------------------------------------------------------------------
+
+    def generate(
+        self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None, choose: Choose = greedy
+    ) -> Decoded:
+        """Seven tokens behind every prompt; one inference, as `capture` counts it. Raises InstructionError."""
+        limit = int(self.config.text.max_position_embeddings)
+        for row, ids in enumerate(prompts):
+            length = len(ids) + self.steps
+            if pictures is not None:
+                length += self.network.span(ids, pictures[row].grid, self.pictures.base).length - 1
+            if length > limit:
+                raise InstructionError(f"a prompt makes {length} positions; this model has {limit}. Shorten it")
+        with torch.inference_mode():
+            return self.network.decode(prompts, pictures, self.steps, choose)
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One action per observation; a row that put out no action holds still, see `flagged` and the contract."""
+        self.check(seen, seeds)
+        if not len(self.statistics.low) == self.steps == STEPS:
+            raise CheckpointError(
+                f"{self.statistics.key} has actions of {len(self.statistics.low)} dimensions and Magma puts out "
+                f"{self.steps} tokens; Act2Answer needs {STEPS} of both. Choose another -M unnorm_key"
+            )
+        choose = chooser(self.temperature, seeds)
+        prompts = [self.prompt(observation.instruction).ids for observation in seen]
+        decoded = self.generate(prompts, [self.picture(observation.image) for observation in seen], choose)
+        ids = decoded.ids.cpu().numpy()
+        self.flagged = ~self._whole(ids, decoded, choose)
+        actions = self.statistics.restore(self.action_tokens.values(ids))
+        actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
+        for row in np.flatnonzero(self.flagged):
+            actions[row] = [0] * (STEPS - 1) + [seen[row].state[-1] > _GRIPPER_OPEN]
+        return actions[:, None].astype(np.float32)
+
+    def _whole(self, ids: NDArray[np.int64], decoded: Decoded, choose: Choose) -> NDArray[np.bool_]:
+        """(B,) which rows put out seven tokens that name bins, and then the end of the turn."""
+        named = np.asarray(self.action_tokens.known(ids).all(axis=1))
+        if not named.any():
+            return named
+        ends = np.isin(choose(self._behind(decoded)).cpu().numpy(), list(self.text.ends))
+        return np.asarray(named & ends)
+
+    def _behind(self, decoded: Decoded) -> Tensor:
+        """(B, V) logits behind the seven tokens, from modules on which nobody listens."""
+        with torch.inference_mode():
+            return decoded.decoding.feed(decoded.ids[:, -1], self._unheard)
+
+    @cached_property
+    def _unheard(self) -> Any:
+        """The language model's weights in modules of their own, so that what runs there fires no tap."""
+        return self.network.unheard()
+
+    # -- answering ---------------------------------------------------------------------------------------
+
+    def read(self, questions: Sequence[Question]) -> Reading:
+        """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
+        self.check([question.seen for question in questions])
+        prompts = [self.text.prompt(question.text, question.begun).ids for question in questions]
+        options = [
+            [self.text.option(question.text, question.begun, option) for option in question.options]
+            for question in questions
+        ]
+        pictures = [self.picture(question.seen.image) for question in questions]
+        decoded = self.generate(prompts, pictures)
+        return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
+
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Greedy text up to the end of the turn; see the contract. Raises UsageError for another's reading."""
+        answer = reading.state
+        if not isinstance(answer, Answer):
+            raise UsageError("this reading does not come from Magma; pass what its read() returned")
+        while len(answer.ids) < tokens and not answer.over(self.text.ends):
+            with torch.inference_mode():
+                answer.go_on(self._unheard)
+        rows = torch.stack(answer.ids[:tokens], dim=1).tolist() if tokens else [[]] * len(answer.ids[0])
+        return [self.text.decode(row) for row in rows]
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
+        rows = [self._labels(self.prompt(one.instruction), one.image) for one in seen]
+        longest = max(map(len, rows))
+        backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
+        return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}
+
+    def _labels(self, prompt: Prompt, image: NDArray[np.uint8]) -> list[str]:
+        """Of every position but the last, which belongs to the stream `action`."""
+        span = self.span(prompt.ids, image)
+        labels = ["language" if asked else "special" for asked in prompt.question]
+        row = [f"image.{CAMERA}"] * span.columns + [SEPARATOR]
+        labels[span.start : span.start + 1] = row * span.rows
+        return labels[:-1]
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt, the picture as one placeholder."""
+        return [self.prompt(instruction).ids for instruction in instructions]
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or a block's output.
+
+        `vision_<k>`: maps of stage k as tokens, one row per crop; the last one is the stage's output.
+        """
+        if self.stream_of(site).part == "vision":
+            blocks = self._stages[site.stream].blocks
+            if site.layer == len(blocks):
+                return Tap(blocks[-1], 1, "output", view=_as_tokens)
+            return Tap(blocks[site.layer], 1, view=_as_tokens)
+        return self._language_tap(site, _PROMPT if site.stream == "backbone" else _LAST)
+
+    def _language_tap(self, site: Site, tokens: slice) -> Tap:
+        if site.quantity == "final_norm":
+            return Tap(self.decoder.norm, self.steps, "output", tokens)
+        if site.layer == len(self.decoder.layers):
+            return Tap(self.decoder.norm, self.steps, tokens=tokens)
+        block = self.decoder.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, self.steps, "output", tokens)
+        if site.quantity == "attention":
+            return Tap(block.self_attn.o_proj, self.steps, "output", tokens)
+        return Tap(block.input_layernorm, self.steps, tokens=tokens)
+
+    @property
+    def _stages(self) -> dict[str, Any]:
+        return {f"vision_{number}": stage for number, stage in enumerate(self.network.vision_tower.stages)}
+
+
+def _width(stage: Any) -> int:
+    return int(stage.blocks[0].conv_dw.in_channels)
+
+
+def _as_tokens(maps: Tensor) -> Tensor:
+    """(N, h · w, C) of (N, C, h, w), in the same memory."""
+    return maps.flatten(2).transpose(1, 2)
+
+
+def load_magma(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    unnorm_key: str | None = None,
+    statistics: str | None = None,
+    shrink: int = _SHRINK,
+    prompt: str = "magma",
+    temperature: float = 0.0,
+    tokenizer: str | None = None,
+    layer_scale: str = "gamma",
+    weights_seed: int = 0,
+    steps: int = STEPS,
+) -> Magma:
+    """Load Magma or one of its fine-tunes, from a folder or hub id.
+
+    unnorm_key: data set whose units the actions get; default bridge_orig. statistics: file with action
+    statistics. shrink: side to which pictures are shrunk first, 0 for whole pictures. prompt: `magma`, or
+    `act2answer` for the order of turns of that release. temperature: 0 for the likeliest token. tokenizer: folder
+    of another tokenizer. layer_scale: `weight` for files that store them under that name. steps: tokens per
+    inference, for comparisons with other than seven; only seven are an action.
+    Raises UsageError, and what `load_checkpoint` raises.
+    """
+    for name, value, known in (("prompt", prompt, PROMPTS), ("layer_scale", layer_scale, ("gamma", "weight"))):
+        if value not in known:
+            raise UsageError(f"{name} is {value!r}; expected {' or '.join(known)}")
+    if shrink < 0:
+        raise UsageError(f"shrink is {shrink}; expected a side in pixels, or 0 for whole pictures")
+    chooser(temperature, ())
+    loaded = load_checkpoint(
+        checkpoint or DEFAULT_CHECKPOINT,
+        device,
+        dtype,
+        random_weights,
+        weights_seed=weights_seed,
+        statistics=statistics,
+        layer_scale=layer_scale,
+    )
+    return Magma(
+        loaded,
+        ActionStatistics.choose(loaded.statistics, unnorm_key),
+        shrink=shrink,
+        prompt=prompt,
+        temperature=temperature,
+        tokenizer=tokenizer,
+        layer_scale=layer_scale,
+        steps=steps,
+    )

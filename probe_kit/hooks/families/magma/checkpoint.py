@@ -1,0 +1,168 @@
+"""Loading Magma checkpoints: every weight from the file, the layer scales above all, and random twins."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
+
+STATISTICS_FILE = "dataset_statistics.json"
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
+
+
+@dataclass(frozen=True)
+class LoadedMagma:
+    """A loaded network and what belongs to it.
+
+    checkpoint: as asked for. folder: where its other files lie. statistics: per data set, what un-normalises its
+    actions. dtype: of the weights, as the card says it. weights_seed: of a random twin.
+    """
+
+    checkpoint: str
+    network: MagmaNetwork
+    config: MagmaConfig
+    folder: Path
+    statistics: Mapping[str, Any]
+    audit: WeightsAudit
+    dtype: str
+    device: str
+    notes: tuple[str, ...]
+    weights_seed: int | None
+
+
+def load_checkpoint(
+    checkpoint: str,
+    device: str,
+    dtype: str | None,
+    random_weights: bool,
+    *,
+    weights_seed: int = 0,
+    statistics: str | None = None,
+    layer_scale: str = "gamma",
+) -> LoadedMagma:
+    """Load a folder or hub id.
+
+    dtype: float32 or bfloat16; default what the checkpoint says. statistics: a file with action statistics,
+    above the checkpoint's own and ours. layer_scale: `weight` accepts a file that stores them under that name.
+    Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
+    """
+    folder = checkpoint_folder(checkpoint)
+    config = MagmaConfig.from_folder(folder)
+    name = dtype or str(config.dtype or "float32").removeprefix("torch.")
+    if name not in _DTYPES:
+        raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
+    if random_weights:
+        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
+        notes: tuple[str, ...] = ()
+    else:
+        network, audit, notes = _stored(config, folder, _DTYPES[name], layer_scale)
+    network.requires_grad_(False)
+    return LoadedMagma(
+        checkpoint=checkpoint,
+        network=network.to(device),
+        config=config,
+        folder=folder,
+        statistics=_statistics(folder, statistics),
+        audit=audit,
+        dtype=name,
+        device=device,
+        notes=notes,
+        weights_seed=weights_seed if random_weights else None,
+    )
+
+
+def _random(
+    config: MagmaConfig, dtype: torch.dtype, checkpoint: str, seed: int
+) -> tuple[MagmaNetwork, WeightsAudit]:
+    network = build_magma(config, dtype, device="cpu")
+    initialise(network, seed)
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if name.endswith(".gamma"):
+                parameter.fill_(1)  # at timm's 1e-6 the blocks of the trunk would do nothing
+    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+    return network, load_weights(network, weights, weights.tensors)
+
+
+def _stored(
+    config: MagmaConfig, folder: Path, dtype: torch.dtype, layer_scale: str
+) -> tuple[MagmaNetwork, WeightsAudit, tuple[str, ...]]:
+    weights = read_weights(folder, unlisted=UNUSED_WEIGHTS)
+    tensors, notes = _with_layer_scales(weights, layer_scale)
+    unread = [name for name in UNUSED_WEIGHTS if tensors.pop(name, None) is not None]
+    if unread:
+        notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
+    network = build_magma(config, dtype)
+    tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
+    cast = {key: tensor.to(dtype) if tensor.is_floating_point() else tensor for key, tensor in tensors.items()}
+    audit = load_weights(network, weights, cast, tied, assign=True)
+    if tied:
+        network.language_model.tie_weights()
+    if empty := [key for key, tensor in network.state_dict().items() if tensor.is_meta]:
+        raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
+    return network, audit, notes
+
+
+def _with_layer_scales(weights: Weights, layer_scale: str) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    """The tensors under the network's names, and a note if some were stored under another.
+
+    Loaders before transformers 5 rename every `gamma` to `weight`: they find no place for the layer scales, leave
+    timm's initial value, and what they save afterwards holds one or the other.
+    """
+    found = {name: match for name in weights.tensors if (match := _BLOCK.fullmatch(name))}
+    renamed = {name: match["block"] + ".gamma" for name, match in found.items() if match["name"] == "weight"}
+    notes: tuple[str, ...] = ()
+    if renamed and layer_scale != "weight":
+        raise WeightsError(
+            f"damaged checkpoint: weights in {weights.source} hold {len(renamed)} layer scales of the vision "
+            f"tower as .weight instead of .gamma, such as {min(renamed)}. Loaders that rename gamma to weight "
+            "write such files and never use what they hold. Take the original files; only if you know that these "
+            "values are the trained ones, pass -M layer_scale=weight"
+        )
+    if renamed:
+        notes = (f"{len(renamed)} layer scales taken from tensors stored as .weight",)
+    tensors = {renamed.get(name, name): tensor for name, tensor in weights.tensors.items()}
+    if not weights.random:
+        _refuse_initial(tensors, weights.source)
+    return tensors, notes
+
+
+def _refuse_initial(tensors: Mapping[str, Tensor], source: str) -> None:
+    scales = [tensor.float() for name, tensor in tensors.items() if _BLOCK.fullmatch(name)]
+    values = {float(value) for scale in scales for value in (scale.min(), scale.max())}
+    if len(values) == 1:
+        raise WeightsError(
+            f"damaged checkpoint: weights in {source} hold {len(scales)} layer scales of the vision tower, all of "
+            f"them {values.pop():.3g} in every feature, as before training. A loader that could not place the "
+            "trained ones saved this file. Take the original files"
+        )
+
+
+def _statistics(folder: Path, chosen: str | None) -> dict[str, Any]:
+    """Ours, above them those beside the weights, above them those of the file that was asked for."""
+    found = shipped_statistics()
+    if (folder / STATISTICS_FILE).is_file():
+        found |= _read_statistics(folder / STATISTICS_FILE)
+    if chosen is not None:
+        found |= _read_statistics(Path(chosen).expanduser())
+    return found
+
+
+def _read_statistics(file: Path) -> dict[str, Any]:
+    """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; `action` may be left out."""
+    if not file.is_file():
+        raise CheckpointError(f"the file of action statistics {file} does not exist")
+    values = json.loads(file.read_text())
+    entries = values.get("norm_stats", values)
+    return {key: entry if "action" in entry else {"action": entry} for key, entry in entries.items()}

@@ -1,0 +1,149 @@
+"""Magma's chat as ids, from the checkpoint's own `tokenizer.json`, and which of them are the question."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tokenizers import Tokenizer
+
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.models.magma import MagmaConfig, chat_text, conversation, picture_question
+
+_FILE = "tokenizer.json"
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """A whole prompt as ids, and which of them are the question, not the frames around it."""
+
+    ids: tuple[int, ...]
+    question: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class ChatText:
+    """Speaks with Magma: frames, picture placeholder, question.
+
+    user_first: the user's turn stands before the system's, as Act2Answer's release has it.
+    """
+
+    folder: Path
+    config: MagmaConfig
+    user_first: bool = False
+
+    @classmethod
+    def of(cls, folder: Path, config: MagmaConfig, user_first: bool = False) -> "ChatText":
+        """From the tokenizer in `folder`. Raises CheckpointError for missing files and another model's."""
+        if not (folder / _FILE).is_file():
+            raise CheckpointError(
+                f"{_FILE} and tokenizer_config.json are missing in {folder}. They come with the checkpoint: copy "
+                "them from the model's page, or name their folder with -M tokenizer=DIR"
+            )
+        text = cls(folder, config, user_first)
+        text.check()
+        return text
+
+    @cached_property
+    def _tokenizer(self) -> Any:
+        return Tokenizer.from_file(str(self.folder / _FILE))
+
+    @cached_property
+    def _settings(self) -> dict[str, Any]:
+        beside = self.folder / "tokenizer_config.json"
+        return dict(json.loads(beside.read_text())) if beside.is_file() else {}
+
+    @cached_property
+    def _template(self) -> str | None:
+        """The checkpoint's chat template in Jinja, None if it has none."""
+        beside = self.folder / "chat_template.jinja"
+        stored = beside.read_text() if beside.is_file() else self._settings.get("chat_template")
+        if stored is not None and not isinstance(stored, str):
+            raise CheckpointError(
+                f"{self.folder} has {len(stored)} chat templates; expected one. Keep the one the model was "
+                "trained with"
+            )
+        return stored
+
+    @cached_property
+    def _beginning(self) -> dict[str, str]:
+        named = self._settings.get("bos_token")
+        token = named.get("content") if isinstance(named, dict) else named
+        return {"beginning": token} if token else {}
+
+    def check(self) -> None:
+        """Refuse a tokenizer that belongs to another model. Raises CheckpointError."""
+        known = self.vocabulary, self.config.base_vocabulary
+        if known[1] not in (None, known[0]):
+            raise CheckpointError(
+                f"{self.folder / _FILE} has {known[0]} ids before the added ones, config.json says {known[1]} "
+                "(tokenizer_vocab_size): every action would be decoded wrongly. Take the checkpoint's tokenizer"
+            )
+        highest = max(self._tokenizer.get_vocab(with_added_tokens=True).values())
+        if highest >= self.config.text.vocab_size:
+            raise CheckpointError(
+                f"{self.folder / _FILE} has ids up to {highest}; this model has {self.config.text.vocab_size}. "
+                "The tokenizer belongs to another checkpoint"
+            )
+
+    @property
+    def vocabulary(self) -> int:
+        """Number of ids before the added tokens; the last of them name action bins."""
+        return int(self._tokenizer.get_vocab_size(with_added_tokens=False))
+
+    @cached_property
+    def ends(self) -> frozenset[int]:
+        """Ids that end the assistant's turn."""
+        file = self.folder / "generation_config.json"
+        stored = json.loads(file.read_text()).get("eos_token_id") if file.is_file() else None
+        named: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
+        flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
+        return frozenset(int(number) for number in flat if number is not None)
+
+    def prompt(self, question: str, begun: str = "") -> Prompt:
+        """The whole prompt of a question about one picture; `begun`: how the answer has begun already.
+
+        Raises InstructionError for a question that holds a token of the frames.
+        """
+        self._refuse_markers(question + begun)
+        turn = picture_question(question, self.config.image_start_end)
+        frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
+        encoding = self._tokenizer.encode(frames + begun)
+        # Templates strip what a turn says, so the question's own outer spaces may be gone.
+        bare = question.strip()
+        start = frames.rfind(bare)
+        if start < 0:
+            raise CheckpointError(
+                f"the chat template in {self.folder} changes the words of the question: {bare!r} is not in "
+                f"{frames!r}. Take the template the model was trained with"
+            )
+        inside = tuple(
+            not special and first < start + len(bare) and last > start
+            for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
+        )
+        return Prompt(tuple(encoding.ids), inside)
+
+    def _refuse_markers(self, text: str) -> None:
+        for token in self._tokenizer.get_added_tokens_decoder().values():
+            if token.special and token.content in text:
+                raise InstructionError(
+                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
+                    "write it without"
+                )
+
+    def option(self, question: str, begun: str, option: str) -> int:
+        """The id of an option behind a prompt. Raises UsageError unless it is one token there."""
+        before, behind = self.prompt(question, begun).ids, self.prompt(question, begun + option).ids
+        if len(behind) != len(before) + 1 or behind[:-1] != before:
+            raise UsageError(
+                f"the option {option!r} is {len(behind) - len(before)} tokens behind this prompt; options are "
+                "compared by one token. Name the letters, not whole answers"
+            )
+        return int(behind[-1])
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids up to the end of the turn, without special tokens."""
+        end = next((place for place, number in enumerate(ids) if number in self.ends), len(ids))
+        return str(self._tokenizer.decode(list(ids[:end]), skip_special_tokens=True)).strip()

@@ -1,0 +1,124 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.families.magma.adapter import load_magma
+from probe_kit.models.magma import UNUSED_WEIGHTS, shipped_statistics
+from tests.magma_checkpoints import LAYER_SCALE, small_network, weights, write_checkpoint
+
+
+def renamed(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """As a loader that renames every gamma to weight saves it."""
+    return {name.replace(".gamma", ".weight"): tensor for name, tensor in tensors.items()}
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+def test_every_weight_comes_from_the_file(tmp_path: Path, shards: int) -> None:
+    loaded = load_magma(str(write_checkpoint(tmp_path, shards=shards))).loaded
+    expected = small_network(steered=True).state_dict()
+    ours = loaded.network.state_dict()
+    assert ours.keys() == expected.keys()
+    assert all(torch.equal(ours[name], expected[name]) for name in expected)
+    assert loaded.audit.tensors == len(expected)
+    assert any("contrastive head" in note for note in loaded.notes)
+
+
+def test_the_unread_head_may_be_missing_and_nothing_else(tmp_path: Path) -> None:
+    tensors = weights(small_network(), head=False)
+    assert not load_magma(str(write_checkpoint(tmp_path / "without", tensors=tensors))).loaded.notes
+    for name in ("multi_modal_projector.row_seperator", "language_model.lm_head.weight", LAYER_SCALE):
+        lacking = {other: tensor for other, tensor in tensors.items() if other != name}
+        with pytest.raises(WeightsError, match=name):
+            load_magma(str(write_checkpoint(tmp_path / name, tensors=lacking)))
+
+
+def test_the_index_may_leave_the_unread_head_out_and_nothing_else(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path)
+    index = folder / "model.safetensors.index.json"
+    listed = json.loads(index.read_text())["weight_map"]
+    pruned = {name: file for name, file in listed.items() if name not in UNUSED_WEIGHTS}
+    index.write_text(json.dumps({"weight_map": pruned}))
+    load_magma(str(folder))
+    index.write_text(json.dumps({"weight_map": {n: f for n, f in pruned.items() if n != LAYER_SCALE}}))
+    with pytest.raises(WeightsError, match=LAYER_SCALE):
+        load_magma(str(folder))
+
+
+def test_layer_scales_saved_as_weights_are_named_as_damage(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, tensors=renamed(weights(small_network())))
+    with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 5 layer scales .* as \.weight instead of"):
+        load_magma(str(folder))
+
+
+def test_one_renamed_layer_scale_is_damage_too(tmp_path: Path) -> None:
+    tensors = weights(small_network())
+    tensors[LAYER_SCALE.replace(".gamma", ".weight")] = tensors.pop(LAYER_SCALE)
+    with pytest.raises(WeightsError, match="1 layer scales"):
+        load_magma(str(write_checkpoint(tmp_path, tensors=tensors)))
+
+
+def test_renamed_layer_scales_are_taken_on_request_and_the_card_says_so(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, tensors=renamed(weights(small_network())))
+    loaded = load_magma(str(folder), layer_scale="weight")
+    assert torch.equal(loaded.network.state_dict()[LAYER_SCALE], small_network().state_dict()[LAYER_SCALE])
+    assert "5 layer scales taken from tensors stored as .weight" in loaded.card.notes
+    assert loaded.card.settings["layer_scale"] == "weight"
+
+
+def test_layer_scales_left_at_their_initial_value_are_damage(tmp_path: Path) -> None:
+    """What the loader that dropped them saves under the right name."""
+    tensors = weights(small_network())
+    initial = {n: torch.full_like(t, 1e-6) if n.endswith(".gamma") else t for n, t in tensors.items()}
+    with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 5 layer scales .* 1e-06 in every feature"):
+        load_magma(str(write_checkpoint(tmp_path, tensors=initial)))
+
+
+def test_a_random_twin_differs_by_its_seed_and_its_trunk_does_something(tmp_path: Path) -> None:
+    folder = str(write_checkpoint(tmp_path))
+    first, again, other = (load_magma(folder, random_weights=True, weights_seed=seed) for seed in (0, 0, 1))
+    assert first.card.weights_sha256 == again.card.weights_sha256 != other.card.weights_sha256
+    assert (first.card.random_weights, first.card.weights_seed, other.card.weights_seed) == (True, 0, 1)
+    assert float(first.network.state_dict()[LAYER_SCALE].min()) == 1
+
+
+def test_weights_are_as_the_file_says_or_as_asked(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, torch_dtype="bfloat16")
+    assert load_magma(str(folder)).card.dtype == "bfloat16"
+    wide = load_magma(str(folder), dtype="float32")
+    assert {parameter.dtype for parameter in wide.network.parameters()} == {torch.float32}
+    with pytest.raises(UsageError, match="float16"):
+        load_magma(str(folder), dtype="float16")
+
+
+def test_damaged_numbers_are_refused_by_name(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path, shards=1)
+    tensors = load_file(folder / "model.safetensors")
+    tensors[LAYER_SCALE][0] = float("nan")
+    save_file(tensors, folder / "model.safetensors")
+    with pytest.raises(WeightsError, match=LAYER_SCALE):
+        load_magma(str(folder))
+
+
+def entry(scale: float) -> dict[str, list[float]]:
+    return {"q01": [-scale] * 7, "q99": [scale] * 7, "mask": [True] * 6 + [False]}
+
+
+def test_statistics_come_from_us_the_checkpoint_or_a_file_the_later_the_stronger(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path / "model")
+    ours = load_magma(str(folder)).statistics
+    assert ours.low.tolist() == shipped_statistics()["bridge_orig"]["action"]["q01"]
+    (folder / "dataset_statistics.json").write_text(json.dumps({"bridge_orig": {"action": entry(2)}}))
+    assert load_magma(str(folder)).statistics.high[0] == 2
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({"norm_stats": {"bridge_orig": entry(3), "mine": entry(4)}}))
+    assert load_magma(str(folder), statistics=str(file)).statistics.high[0] == 3
+    mine = load_magma(str(folder), statistics=str(file), unnorm_key="mine")
+    assert (mine.statistics.key, mine.statistics.high[0]) == ("mine", 4)
+    with pytest.raises(UsageError, match="choose"):
+        load_magma(str(folder), unnorm_key="fractal")
+    with pytest.raises(CheckpointError, match="does not exist"):
+        load_magma(str(folder), statistics=str(tmp_path / "nowhere.json"))
