@@ -26,7 +26,17 @@ BINS: dict[str, Any] = {
 }
 _LIMITS = {"theta": (0, np.pi), "phi": (-np.pi, np.pi), "r": (0, 3**0.5)}
 _LETTERS = [chr(code) for code in range(ord("!"), ord("~") + 1)]
-_MERGES = [("▁", "t"), ("h", "e"), ("▁t", "he"), ("c", "u"), ("b", "e"), ("cu", "be"), ("▁", "cube"), ("o", "n")]
+_MERGES = [
+    ("▁", "t"),
+    ("h", "e"),
+    ("▁t", "he"),
+    ("c", "u"),
+    ("b", "e"),
+    ("cu", "be"),
+    ("▁", "cube"),
+    ("o", "n"),
+    ("\n", "\n"),
+]
 _SPECIAL = ["<pad>", "<eos>", "<bos>", "<unk>"]
 _BYTES = [f"<0x{byte:02X}>" for byte in range(256)]
 WORDS = [*_SPECIAL, "\n", *_BYTES, "▁", *_LETTERS, *(left + right for left, right in _MERGES)]
@@ -171,9 +181,11 @@ def preprocessor_values(side: int = SIDE, **fields: Any) -> dict[str, Any]:
 
 
 def network(seed: int = 1, **fields: Any) -> SpatialVLANetwork:
-    """A network with random weights, its action ids not yet embedded."""
+    """A network with random weights that prefers action ids, as a trained one does, its own not yet embedded."""
     built = build_spatialvla(SpatialVLAConfig.from_json(config_values(**fields)), torch.float32, device="cpu")
     initialise(built, seed)
+    with torch.no_grad():
+        built.language_model.lm_head.weight[:FIRST_ACTION] *= 0.2
     return built
 
 
@@ -208,8 +220,8 @@ def write_checkpoint(
     return folder
 
 
-def write_tokenizer(folder: Path, actions: int = BINS["total"]) -> Path:
-    """A byte-fallback BPE tokenizer with the released files' added tokens, as small as they allow."""
+def write_tokenizer(folder: Path, actions: int = BINS["total"], more: tuple[str, ...] = ()) -> Path:
+    """A byte-fallback BPE tokenizer with the released files' added tokens, and `more` before the actions."""
     tokenizer = Tokenizer(
         BPE(
             {word: index for index, word in enumerate(WORDS)},
@@ -221,7 +233,7 @@ def write_tokenizer(folder: Path, actions: int = BINS["total"]) -> Path:
     )
     tokenizer.normalizer = Replace(" ", "▁")
     tokenizer.decoder = Decoders([Unreplace("▁", " "), ByteFallback(), Fuse()])
-    added = ["<image>", *(f"<ACTION{index:05d}>" for index in range(actions))]
+    added = ["<image>", *more, *(f"<ACTION{index:05d}>" for index in range(actions))]
     tokenizer.add_special_tokens([AddedToken(token, normalized=False) for token in (*_SPECIAL, *added)])
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))

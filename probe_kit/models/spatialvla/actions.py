@@ -79,7 +79,7 @@ class ActionBins:
         )
 
     @property
-    def sha256_content(self) -> list[Any]:
+    def content(self) -> list[Any]:
         """What an identity of these bins is computed over."""
         return [self.first, [edges.tolist() for edges in self.edges], self.spherical]
 

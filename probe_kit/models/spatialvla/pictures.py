@@ -81,7 +81,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> ND
 class Intrinsics:
     """A pinhole camera: its matrix (3, 3) in pixels, for pictures of `width` × `height`."""
 
-    matrix: NDArray[np.float64]
+    matrix: NDArray[np.floating[Any]]
     width: int
     height: int
 

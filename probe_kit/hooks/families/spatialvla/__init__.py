@@ -1,0 +1,32 @@
+"""SpatialVLA, native."""
+
+from probe_kit.hooks.families.prismatic import TOKENIZER
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "spatialvla",
+        "SpatialVLA (SigLIP + ZoeDepth, Gemma 2 2B, three action tokens per step), native; sees depth",
+        "IPEC-COMMUNITY/spatialvla-4b-224-pt",
+        "probe_kit.hooks.families.spatialvla.adapter:load_spatialvla",
+        streams="backbone 27 layers, action 27 layers x 3 action tokens; no action expert",
+        embodiment="as the data set of -M unnorm_key; bridge_orig/1.0.0: WidowX end-effector delta at 5 Hz",
+        notes="MIT, Gemma licence; weights 8.1 GB in bfloat16; also …-mix-224-pt, …-sft-bridge, …-sft-fractal",
+        verifier="probe_kit.hooks.families.spatialvla.verify:verify_spatialvla",
+        full_size="probe_kit.models.spatialvla:full_size_spatialvla",
+        options=(
+            Option(
+                "unnorm_key", str, "Data set whose units the actions get.", "bridge_orig/1.0.0, or the only one"
+            ),
+            Option("prompt", str, "bare, question or a template with {instruction}.", "bare"),
+            Option("lowercase", bool, "Instruction in lower case, as in training.", "true"),
+            Option("camera", str, "scene, or a data set of the checkpoint whose camera is taken for it.", "scene"),
+            Option(
+                "iterations", str, "Tokens listened to: of a step (3) or of the chunk.", "step", ("step", "chunk")
+            ),
+            Option("constrained", bool, "Decode every token within its slot; not the original's way.", "false"),
+            TOKENIZER,
+        ),
+    ),
+)

@@ -1,0 +1,346 @@
+"""The adapter for SpatialVLA: packing, streams, taps, roles, cameras, actions.
+
+Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack serves two streams, told
+apart by position: `backbone` is the prompt without the new line, `action` the positions whose logits choose an
+action token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
+"""
+
+import warnings
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.openvla.actions import ActionStatistics
+from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
+from probe_kit.hooks.families.spatialvla.speech import Speech
+from probe_kit.hooks.model import Policy, Tap
+from probe_kit.hooks.observation import Observation, checked_picture
+from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.views import PADDING
+from probe_kit.identity import sha256_json
+from probe_kit.models.packing import Packed
+from probe_kit.models.spatialvla import (
+    STEP_TOKENS,
+    ActionBins,
+    Decoded,
+    Intrinsics,
+    PictureSettings,
+    known_cameras,
+    prepare_picture,
+)
+
+CAMERA = "primary"
+DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
+BRIDGE = "bridge_orig/1.0.0"
+"""The data set of the WidowX arm that Act2Answer imitates."""
+SCENE = "scene"
+"""Asks for the camera of the observation."""
+_GRIPPER_OPEN = 0.5
+_PROMPT, _LAST = slice(None, -1), slice(-1, None)
+
+
+class SpatialVLA(Policy):
+    """A loaded SpatialVLA.
+
+    steps: greedy tokens per inference. heard: how many of them the stream `action` has.
+    """
+
+    family: ClassVar[str] = "spatialvla"
+
+    def __init__(
+        self,
+        loaded: LoadedSpatialVLA,
+        speech: Speech,
+        statistics: ActionStatistics,
+        camera: str,
+        steps: int,
+        heard: int,
+        constrained: bool,
+    ) -> None:
+        self.loaded, self.speech, self.statistics = loaded, speech, statistics
+        self.network, self.config = loaded.network, loaded.config
+        self.camera, self.steps, self.constrained = camera, steps, constrained
+        self.bins = ActionBins.of(
+            loaded.processor, self.config.first_action, self.config.actions, loaded.processor_file
+        )
+        self._preset = _preset(loaded, camera)
+        self.decoder: Any = self.network.language_model.model
+        self.tower: Any = self.network.vision_tower.vision_model
+        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        self.streams = {
+            "backbone": Stream("backbone", layers, width),
+            "action": Stream("action", layers, width, heard, part="action"),
+        }
+        seeing = len(self.tower.encoder.layers) + 1
+        self.further_streams = {
+            "vision": Stream("vision", seeing, int(self.config.vision.hidden_size), part="vision")
+        }
+        self.role_names = {
+            "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
+            "action": ("action",),
+        }
+        self.card = self._card()
+
+    def _card(self) -> Card:
+        loaded, needed = self.loaded, self.config.depth is not None and self._preset is None
+        return Card(
+            family=self.family,
+            checkpoint=loaded.checkpoint,
+            weights_sha256=loaded.audit.sha256,
+            random_weights=loaded.audit.random,
+            parameters=loaded.audit.parameters,
+            dtype=loaded.dtype,
+            device=loaded.device,
+            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {self.statistics.key}",
+            cameras=(CAMERA,),
+            chunk=self.steps // STEP_TOKENS,
+            execute=1,
+            notes=self._notes(),
+            audit=loaded.audit.to_json(),
+            settings=self._settings(),
+            weights_seed=loaded.weights_seed,
+            needs=frozenset({"intrinsics"}) if needed else frozenset(),
+        )
+
+    def _settings(self) -> dict[str, str]:
+        """By content: what lies beside the weights, a tokenizer from elsewhere, and every choice."""
+        files, chosen = side_files(self.loaded.folder), self.speech.tokenizer_choice
+        if chosen is not None and Path(chosen).is_dir():
+            files |= side_files(Path(chosen), "tokenizer/")
+        return {
+            **content_hashes(files),
+            "tokenizer": chosen or "the checkpoint's",
+            "unnorm_key": self.statistics.key,
+            "action_statistics": self.statistics.sha256,
+            "action_bins": sha256_json(self.bins.content),
+            "prompt": self.speech.template,
+            "lowercase": str(self.speech.lowercase),
+            "camera": self.camera,
+            "constrained": str(self.constrained),
+            "steps": str(self.steps),
+            "iterations": str(self.streams["action"].iterations),
+        }
+
+    def _notes(self) -> tuple[str, ...]:
+        notes = [
+            f"actions in the units and at the rate of {self.statistics.key}",
+            f"prompt: {self.speech.template!r}{', lower case' if self.speech.lowercase else ''}",
+        ]
+        if self.constrained:
+            notes.append("decoding limited to the slot of every token, which the original does not do")
+        if self._preset is not None:
+            notes.append(f"camera: that of {self.camera}, whatever takes the picture")
+        if self.speech.tokenizer_choice == BYTES:
+            notes.append("development tokenizer: bytes, which no model was trained with")
+        return tuple(notes)
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def picture_settings(self) -> PictureSettings:
+        """How pictures are resized."""
+        return PictureSettings.of(self.config, self.loaded.folder)
+
+    def pictures(self, seen: Sequence[Observation]) -> Tensor:
+        """(B, 3, S, S) float32 in [0, 1]. Raises ObservationError."""
+        rows = [prepare_picture(checked_picture(one.image), self.picture_settings) for one in seen]
+        return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
+
+    def cameras(self, seen: Sequence[Observation]) -> Tensor:
+        """(B, 3, 3) float32 intrinsics for the pictures as the model sees them. Raises ObservationError."""
+        rows = [self._camera(one).at(self.config.side) for one in seen]
+        return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
+
+    def _camera(self, seen: Observation) -> Intrinsics:
+        if self._preset is not None:
+            return self._preset
+        height, width = seen.image.shape[:2]
+        if seen.intrinsics is None:  # only a model without depth gets this far
+            return Intrinsics(np.eye(3), width, height)
+        matrix = np.asarray(seen.intrinsics)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
+            raise ObservationError(f"intrinsics are {matrix.tolist()}; expected an invertible 3 × 3 matrix")
+        return Intrinsics(matrix, width, height)
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of a whole prompt, places for the picture first; see `Speech.prompt`."""
+        return self.speech.prompt(instruction)
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt behind the picture."""
+        return [tuple(self.prompt(instruction)[self.config.patches :]) for instruction in instructions]
+
+    def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
+        """Prompts of ids as a batch. Raises InstructionError for one that is too long."""
+        text = self.config.text
+        limit = min(int(text.max_position_embeddings), int(text.sliding_window or text.max_position_embeddings))
+        if (longest := max(map(len, rows)) + self.steps) > limit:
+            raise InstructionError(f"a prompt makes {longest} positions; this model has {limit}. Shorten it")
+        return Packed.of(rows, self.config.padding)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """A chunk per observation; decoding is greedy, so the seeds change nothing. See the contract."""
+        self.check(seen, seeds)
+        rows = [self.prompt(observation.instruction) for observation in seen]
+        ids = self.generate(self.pictures(seen), self.cameras(seen), rows).ids.cpu().numpy()
+        ids = ids.reshape(len(seen), -1, STEP_TOKENS)
+        self._say_unknown(ids)
+        actions = self.actions(ids)
+        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
+        return actions.astype(np.float32)
+
+    def actions(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(…, 7) in the data set's units, the gripper as decoded, of ids (…, 3)."""
+        return self.statistics.restore(self.bins.values(ids))
+
+    def generate(
+        self, pictures: Tensor, cameras: Tensor, rows: Sequence[Sequence[int]], fed: Tensor | None = None
+    ) -> Decoded:
+        """`steps` greedy tokens behind every prompt; one inference, as `capture` counts it.
+
+        fed: (B, steps - 1) ids that are fed back instead of those chosen.
+        """
+        packed, device = self.pack(rows), self.loaded.device
+        slots = [self.bins.slots[step % STEP_TOKENS] for step in range(self.steps)] if self.constrained else None
+        with torch.inference_mode():
+            features = self.network.look(pictures, cameras).features
+            return self.network.decode(
+                packed.ids.to(device), packed.mask.to(device), features, self.steps, slots, fed
+            )
+
+    def _say_unknown(self, ids: NDArray[np.int64]) -> None:
+        if not self.bins.known(ids).all():
+            warnings.warn(
+                "the model put out tokens that name no action; they count as the nearest bin, as in the original "
+                "software. Random weights do this; if trained ones do, prompt or tokenizer are wrong",
+                stacklevel=3,
+            )
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Patches, beginning of sequence, text; padding behind it where another prompt is longer."""
+        rows = [self.prompt(observation.instruction)[:-1] for observation in seen]
+        longest = max(map(len, rows))
+        return {
+            "backbone": [Roles.from_labels(self._labels(row) + [PADDING] * (longest - len(row))) for row in rows],
+            "action": [Roles.from_labels(["action"])] * len(rows),
+        }
+
+    def _labels(self, row: Sequence[int]) -> list[str]:
+        special = self.speech.tokenizer.special
+        picture = [f"image.{CAMERA}"] * self.config.patches
+        return picture + ["special" if number in special else "language" for number in row[len(picture) :]]
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or what a block adds.
+
+        Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not.
+        """
+        stream = self.stream_of(site)
+        if stream.part == "vision":
+            return _vision_tap(self.tower, site)
+        tokens = _PROMPT if stream.part == "backbone" else _LAST
+        if site.quantity == "final_norm":
+            return Tap(self.decoder.norm, self.steps, "output", tokens)
+        if site.layer == len(self.decoder.layers):
+            return Tap(self.decoder.norm, self.steps, tokens=tokens)
+        block = self.decoder.layers[site.layer]
+        if site.quantity == "residual":
+            return Tap(block.input_layernorm, self.steps, tokens=tokens)
+        added = (
+            block.post_attention_layernorm if site.quantity == "attention" else block.post_feedforward_layernorm
+        )
+        return Tap(added, self.steps, "output", tokens)
+
+
+def _vision_tap(tower: Any, site: Site) -> Tap:
+    if site.quantity == "final_norm":
+        return Tap(tower.post_layernorm, 1, "output")
+    if site.layer == len(tower.encoder.layers):
+        return Tap(tower.post_layernorm, 1)
+    block = tower.encoder.layers[site.layer]
+    if site.quantity == "residual":
+        return Tap(block.layer_norm1, 1)
+    return Tap(block.self_attn.out_proj if site.quantity == "attention" else block.mlp, 1, "output")
+
+
+def _preset(loaded: LoadedSpatialVLA, camera: str) -> Intrinsics | None:
+    if camera == SCENE:
+        return None
+    known = known_cameras(loaded.processor, loaded.processor_file)
+    if camera not in known:
+        raise UsageError(f"camera {camera!r} is neither {SCENE} nor one of the checkpoint's: {', '.join(known)}")
+    return known[camera]
+
+
+def load_spatialvla(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    unnorm_key: str | None = None,
+    prompt: str | None = None,
+    lowercase: bool = True,
+    camera: str = SCENE,
+    iterations: str = "step",
+    constrained: bool = False,
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> SpatialVLA:
+    """Load SpatialVLA or one of its fine-tunes from a folder or hub id.
+
+    unnorm_key: data set whose units the actions get; default bridge_orig/1.0.0, or the only one there is. prompt:
+    `bare`, `question` or a template with {instruction}. lowercase: the instruction as in training. camera: `scene`
+    for the observation's intrinsics, or a data set of the checkpoint whose camera is taken for the scene's.
+    iterations: listen to the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
+    within its slot, which the original does not. tokenizer: folder of another tokenizer, or `bytes`.
+    Raises UsageError, and what `load_checkpoint` raises.
+    """
+    if iterations not in ("step", "chunk"):
+        raise UsageError(f"iterations is {iterations!r}; expected step or chunk")
+    loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, weights_seed)
+    steps = STEP_TOKENS * loaded.chunk
+    return SpatialVLA(
+        loaded,
+        Speech.of(loaded.config, loaded.folder, prompt, lowercase, tokenizer),
+        choose_statistics(loaded, unnorm_key),
+        camera,
+        steps,
+        STEP_TOKENS if iterations == "step" else steps,
+        constrained,
+    )
+
+
+def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatistics:
+    """Those of data set `key`; without one, of bridge_orig/1.0.0, or of the only data set there is.
+
+    Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
+    """
+    known = loaded.processor.get("statistics") or {}
+    if not known:
+        raise CheckpointError(
+            f"{loaded.processor_file} has no statistics: its actions have no physical unit. Copy the file from "
+            "the model's page, or take the one that fine-tuning wrote"
+        )
+    statistics = ActionStatistics.choose(known, key or (BRIDGE if BRIDGE in known else None))
+    if len(statistics.low) != 7:
+        raise CheckpointError(
+            f"{statistics.key} has actions of {len(statistics.low)} dimensions; SpatialVLA's tokens name 7. "
+            "Choose another -M unnorm_key"
+        )
+    return statistics

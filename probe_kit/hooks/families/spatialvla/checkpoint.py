@@ -1,0 +1,116 @@
+"""Loading SpatialVLA checkpoints: the released ones, their fine-tunes in the same layout, random twins."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.models.initialisation import initialise
+from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
+
+PROCESSOR_FILE = "processor_config.json"
+_ADAPTER_FILE = "adapter_config.json"
+_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+@dataclass(frozen=True)
+class LoadedSpatialVLA:
+    """A loaded network and what belongs to it.
+
+    checkpoint: as asked for. processor: the content of `processor_config.json`: bins, statistics, cameras.
+    dtype: of the weights, as the card says it. weights_seed: of a random twin.
+    """
+
+    checkpoint: str
+    network: SpatialVLANetwork
+    folder: Path
+    processor: Mapping[str, Any]
+    audit: WeightsAudit
+    dtype: str
+    device: str
+    weights_seed: int | None
+
+    @property
+    def config(self) -> SpatialVLAConfig:
+        """The network's."""
+        return self.network.config
+
+    @property
+    def processor_file(self) -> str:
+        """What errors about bins, statistics and cameras name."""
+        return str(self.folder / PROCESSOR_FILE)
+
+    @property
+    def chunk(self) -> int:
+        """Steps that one inference plans. Raises CheckpointError for none."""
+        steps = int(self.processor.get("action_chunk_size", 1))
+        if steps < 1:
+            raise CheckpointError(f"{self.processor_file}: action_chunk_size is {steps}; expected at least 1")
+        return steps
+
+
+def load_checkpoint(
+    checkpoint: str, device: str, dtype: str | None, random_weights: bool, weights_seed: int = 0
+) -> LoadedSpatialVLA:
+    """Load a folder or hub id.
+
+    dtype: float32 or bfloat16; default what the checkpoint says. Raises CheckpointError, WeightsError, UsageError
+    for another dtype.
+    """
+    folder = checkpoint_folder(checkpoint)
+    if (folder / _ADAPTER_FILE).is_file():
+        raise CheckpointError(
+            f"{folder} holds a LoRA adapter, not a SpatialVLA; merge it into its base with peft first"
+        )
+    config = SpatialVLAConfig.from_folder(folder)
+    name = str(dtype or config.dtype or "float32").removeprefix("torch.")
+    if name not in _DTYPES:
+        raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
+    processor = _processor(folder)
+    if random_weights:
+        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
+    else:
+        network, audit = _stored(config, _DTYPES[name], folder)
+    network.requires_grad_(False)
+    network.embed_actions()
+    return LoadedSpatialVLA(
+        checkpoint=checkpoint,
+        network=network.to(device),
+        folder=folder,
+        processor=processor,
+        audit=audit,
+        dtype=name,
+        device=device,
+        weights_seed=weights_seed if random_weights else None,
+    )
+
+
+def _processor(folder: Path) -> dict[str, Any]:
+    file = folder / PROCESSOR_FILE
+    if not file.is_file():
+        raise CheckpointError(
+            f"{file} is missing: it holds the action bins, statistics and cameras. Copy it from the model's page"
+        )
+    return dict(json.loads(file.read_text()))
+
+
+def _random(
+    config: SpatialVLAConfig, dtype: torch.dtype, checkpoint: str, seed: int
+) -> tuple[SpatialVLANetwork, WeightsAudit]:
+    network = build_spatialvla(config, dtype, device="cpu")
+    initialise(network, seed)
+    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+    return network, load_weights(network, weights, weights.tensors)
+
+
+def _stored(config: SpatialVLAConfig, dtype: torch.dtype, folder: Path) -> tuple[SpatialVLANetwork, WeightsAudit]:
+    weights = read_weights(folder)
+    network = build_spatialvla(config, dtype)
+    tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in weights.tensors.items()}
+    return network, load_weights(network, weights, tensors, assign=True)

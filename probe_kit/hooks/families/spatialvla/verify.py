@@ -1,0 +1,217 @@
+"""What SpatialVLA can be compared in, under the names of its golden reference.
+
+B batch, P patches, T prompt tokens with the picture's, L blocks, N output tokens.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.families.spatialvla.adapter import SCENE, SpatialVLA, choose_statistics
+from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
+from probe_kit.hooks.families.spatialvla.speech import Speech
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.sites import Site
+from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.models.spatialvla import STEP_TOKENS, Decoded, Seen, depth_input, point_places, prepare_picture
+
+TOLERANCE = 5e-5
+Arrays = Mapping[str, NDArray[Any]]
+_INPUTS = (
+    "image_uint8", "intrinsic_raw", "input_ids", "attention_mask", "batch_input_ids", "batch_attention_mask",
+    "batch_pixel_values", "batch_intrinsic", "forced_ids", "tok_actions",
+)  # fmt: skip
+
+
+def verify_spatialvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
+    """Compare a reference of a policy, at the tolerance that ZoeDepth's long chain of convolutions needs."""
+    loaded = load_checkpoint(str(folder / "checkpoint"), "cpu", "float32", random_weights=False)
+    reference = _Reference(loaded, recorded)
+    outputs = {name: values for name, values in recorded.items() if name not in _INPUTS}
+    valid: dict[str, NDArray[np.bool_]] = {}
+    if "batch_attention_mask" in recorded:
+        mask = recorded["batch_attention_mask"].astype(bool)
+        valid = dict.fromkeys(("batch_hidden_states", "batch_logits"), mask)
+    return compare(outputs, reference.produced(), TOLERANCE, valid)
+
+
+class _Reference:
+    """The recorded inputs, run through the adapter."""
+
+    def __init__(self, loaded: LoadedSpatialVLA, recorded: Arrays) -> None:
+        self.loaded, self.recorded = loaded, recorded
+        generated = recorded.get("generated_ids")
+        self.policy = self._policy(STEP_TOKENS * loaded.chunk if generated is None else generated.size)
+        self.seen = [
+            Observation(recorded["image_uint8"], np.zeros(8, np.float32), "", recorded.get("intrinsic_raw"))
+        ]
+        self.prompt: list[int] = recorded["input_ids"].ravel().tolist()
+        self.pictures, self.cameras = self.policy.pictures(self.seen), self.policy.cameras(self.seen)
+
+    def _policy(self, steps: int) -> SpatialVLA:
+        """The ordinary adapter, listening to every one of `steps` tokens."""
+        loaded = self.loaded
+        speech = Speech.of(loaded.config, loaded.folder, None, lowercase=True, tokenizer=None)
+        return SpatialVLA(loaded, speech, choose_statistics(loaded, None), SCENE, steps, steps, constrained=False)
+
+    def produced(self) -> dict[str, Produce]:
+        """How to make every output the adapter can make, whether recorded or not."""
+        return {**self._sight(), **self._language(), **self._tokens()}
+
+    # -- picture, depth, space ---------------------------------------------------------------------------
+
+    @cached_property
+    def _seen(self) -> Seen:
+        with torch.inference_mode():
+            return self.policy.network.look(self.pictures, self.cameras)
+
+    def _sight(self) -> dict[str, Produce]:
+        config, settings = self.policy.config, self.policy.picture_settings
+        image, patch = self.recorded["image_uint8"], int(self.policy.config.vision.patch_size)
+        produced: dict[str, Produce] = {
+            "pixel_values": lambda: _numpy(self.pictures),
+            "pixel_values_224": lambda: prepare_picture(image, replace(settings, side=224))[None],
+            "intrinsic": lambda: _numpy(self.cameras[0]),
+            "siglip_hidden_states": lambda: _numpy(self._tower_states()),
+            "siglip_last_hidden_state": lambda: _numpy(self._seen.tower),
+            # The original divides by what Gemma-2 multiplies with; see `SpatialVLANetwork.embed`.
+            "image_features": lambda: _numpy(self._seen.features) / np.sqrt(config.text.hidden_size),
+        }
+        if config.depth is None:
+            return produced
+        return produced | {
+            "zoe_pixel_values_sub": lambda: self._thinned(depth_input(self.pictures), "zoe_pixel_values_sub"),
+            "depth_raw_sub": lambda: self._thinned(self._depth().raw, "depth_raw_sub"),
+            "domain_logits": lambda: _numpy(self._depth().domains),
+            "depth": lambda: _numpy(self._depth().metres),
+            "uv_h": lambda: _numpy(point_places(config.side, patch, config.points)),
+            "xyz": lambda: _numpy(self._seen.points),
+            "position_embedding_3d": lambda: _numpy(self._seen.place),
+        }
+
+    def _depth(self) -> Any:
+        return self._seen.depth
+
+    def _thinned(self, whole: Tensor, name: str) -> NDArray[Any]:
+        """Of a large map only every n-th pixel is recorded."""
+        every = max(1, round(whole.shape[-1] / self.recorded[name].shape[-1]))
+        return _numpy(whole[..., ::every, ::every])
+
+    def _tower_states(self) -> Tensor:
+        sites = self.policy.further_streams["vision"].sites()
+        with capture(self.policy, sites) as tape:
+            self._generate(self.policy)
+        return torch.stack([tape[site] for site in sites])
+
+    # -- language model ----------------------------------------------------------------------------------
+
+    def _generate(self, policy: SpatialVLA, fed: Tensor | None = None) -> Decoded:
+        return policy.generate(self.pictures, self.cameras, [self.prompt], fed)
+
+    @cached_property
+    def _spoken(self) -> tuple[Decoded, Tape]:
+        with capture(self.policy, [*self.policy.sites(), *self.policy.sites("final_norm")]) as tape:
+            return self._generate(self.policy), tape
+
+    @cached_property
+    def _forced(self) -> tuple[Decoded, Tape]:
+        fed = torch.from_numpy(self.recorded["forced_ids"].reshape(1, -1))
+        policy = self._policy(fed.shape[1] + 1)
+        with capture(policy, [*policy.sites("residual"), *policy.sites("final_norm")]) as tape:
+            return self._generate(policy, fed), tape
+
+    def _language(self) -> dict[str, Produce]:
+        return {
+            "hidden_states": lambda: _numpy(self._prompt_states()),
+            "logits": lambda: self._prompt_logits(),
+            "batch_hidden_states": lambda: self._batch[0],
+            "batch_logits": lambda: self._batch[1],
+            "generated_ids": lambda: self._spoken[0].ids[0].numpy(),
+            "generated_step_logits": lambda: _numpy(self._spoken[0].logits[0]),
+            "generated_step_hidden": lambda: _steps(self._spoken, self.policy),
+            "forced_step_logits": lambda: _numpy(self._forced[0].logits[0]),
+            "forced_step_hidden": lambda: _steps(self._forced, self.policy),
+        }
+
+    def _prompt_states(self) -> Tensor:
+        """(L+1, 1, T, D): every prompt position, from the two streams that share the stack."""
+        tape = self._spoken[1]
+        return torch.cat(
+            [_column(tape, self.policy, "backbone", None), _column(tape, self.policy, "action", 0)], 2
+        )
+
+    @torch.inference_mode()
+    def _prompt_logits(self) -> NDArray[Any]:
+        packed = self.policy.pack([self.prompt])
+        embeddings = self.policy.network.embed(packed.ids, self._seen.features)
+        return _numpy(self.policy.network(embeddings, packed.mask).logits)
+
+    @cached_property
+    @torch.inference_mode()
+    def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Hidden states and logits of the recorded batch, packed as the adapter packs it.
+
+        Put into the recorded layout, in which padding stands elsewhere. One head measures the depth of all rows,
+        as when it was recorded.
+        """
+        recorded, network = self.recorded, self.policy.network
+        mask = recorded["batch_attention_mask"].astype(bool)
+        rows = [ids[seen].tolist() for ids, seen in zip(recorded["batch_input_ids"], mask, strict=True)]
+        packed = self.policy.pack(rows)
+        pictures, cameras = (torch.from_numpy(recorded[f"batch_{n}"]) for n in ("pixel_values", "intrinsic"))
+        features = network.look(pictures, cameras, vote=True).features
+        output = network(network.embed(packed.ids, features), packed.mask)
+        ours = _numpy(torch.stack(output.hidden_states)), _numpy(output.logits)
+        states = np.zeros((len(ours[0]), *mask.shape, ours[0].shape[-1]), np.float32)
+        logits = np.zeros((*mask.shape, ours[1].shape[-1]), np.float32)
+        states[:, mask], logits[mask] = ours[0][:, packed.mask.numpy()], ours[1][packed.mask.numpy()]
+        return states, logits
+
+    # -- actions -----------------------------------------------------------------------------------------
+
+    def _tokens(self) -> dict[str, Produce]:
+        bins, policy = self.policy.bins, self.policy
+        every = np.repeat(np.arange(policy.config.text.vocab_size)[:, None], STEP_TOKENS, axis=1)
+        produced: dict[str, Produce] = {
+            "decode_table": lambda: bins.values(every),
+            "actions_from_generated": lambda: policy.actions(
+                self._spoken[0].ids[0].numpy().reshape(-1, STEP_TOKENS)
+            ),
+        }
+        if "tok_actions" in self.recorded:
+            ids = bins.ids(self.recorded["tok_actions"])
+            chunk = ids[: self.loaded.chunk]
+            produced |= {
+                "tok_ids": lambda: ids,
+                "tok_decoded": lambda: bins.values(ids),
+                "action_ids_from_tok": lambda: chunk,
+                "actions_from_tok_ids": partial(policy.actions, chunk),
+            }
+        return produced
+
+
+def _steps(spoken: tuple[Decoded, Tape], policy: SpatialVLA) -> NDArray[Any]:
+    """(N, L+1, D) of every output token."""
+    decoded, tape = spoken
+    steps = range(decoded.ids.shape[1])
+    return _numpy(torch.stack([_column(tape, policy, "action", step)[:, 0, 0] for step in steps]))
+
+
+def _column(tape: Tape, policy: SpatialVLA, stream: str, iteration: int | None) -> Tensor:
+    """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
+    blocks = policy.streams[stream].layers - 1
+    layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]
+    return torch.stack([*layers, tape[Site(stream, blocks, "final_norm", iteration)]])
+
+
+def _numpy(tensor: Tensor | None) -> NDArray[Any]:
+    """NaN for what is not there, which equals nothing."""
+    return np.full(1, np.nan) if tensor is None else np.array(tensor.float().cpu().numpy())

@@ -1,0 +1,67 @@
+"""A policy that sees depth, through environment, store, probes and tables, beside the other families."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.hooks import Site
+from probe_kit.retention import retention
+from probe_kit.suite import Suite
+from probe_kit.train import train_probes
+from tests.prismatic_checkpoints import write_checkpoint as write_openvla
+from tests.spatialvla_checkpoints import write_checkpoint
+
+pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
+
+
+@pytest.fixture(scope="module")
+def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> ExtractSettings:
+    return ExtractSettings(
+        "spatialvla",
+        str(write_checkpoint(tmp_path_factory.mktemp("spatialvla"))),
+        suite=small_suite.folder,
+        categories=("color",),
+        items=12,
+        scene=SceneSpec(max_steps=1),
+    )
+
+
+def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: Path) -> None:
+    openvla = replace(
+        settings,
+        model="openvla",
+        checkpoint=str(write_openvla(tmp_path / "openvla")),
+        options={"tokenizer": "bytes"},
+    )
+    tiny = replace(settings, model="pi0-tiny", checkpoint=None)
+    runs = [extract_run(one, tmp_path / f"run-{one.model}") for one in (settings, openvla, tiny)]
+    run = runs[0]
+    assert list(run.streams) == ["backbone", "action"]
+    assert len(run.sites("action")) == 4 * 3
+    assert run.certificate["hooks_on_equals_hooks_off"]
+    assert run.settings["policy"]["camera"] == "scene"
+    for site, views in ((Site("backbone", 2), ("mean", "mean:image.primary", "mean:language")),
+                        (Site("action", 3, iteration=2), ("mean", "mean:action"))):  # fmt: skip
+        for view in views:
+            column = np.asarray(run.column(site, view))
+            assert column.shape == (24, 32)
+            assert np.isfinite(column).all()
+            assert column.std(axis=0).max() > 0
+    for one in runs:
+        train_probes(one, permutations=1, jobs=1)
+    rows = retention(runs).rows
+    assert [row.model for row in rows] == ["spatialvla", "openvla", "pi0-tiny"]
+    assert [row.action_stream for row in rows] == ["action", "action", "expert"]
+    assert all(row.n_items == 12 for row in rows)
+
+
+def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path) -> None:
+    small = replace(settings, items=2)
+    extract_run(small, tmp_path / "run")
+    with pytest.raises(SettingsMismatchError, match=r"policy\.camera: stored 'scene', asked 'default'"):
+        extract_run(replace(small, options={"camera": "default"}), tmp_path / "run")

@@ -1,0 +1,285 @@
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
+from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
+from probe_kit.hooks.testing import AdapterContract, example_observations
+from tests.spatialvla_checkpoints import BINS, SIDE, edges, processor_values, write_checkpoint
+
+pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
+
+SCENE = np.array([[70, 0, 32], [0, 72, 24], [0, 0, 1]], np.float32)
+FRACTAL = "fractal20220817_data/0.1.0"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"))
+
+
+@pytest.fixture(scope="module")
+def plain(folder: Path) -> SpatialVLA:
+    return load_spatialvla(str(folder))
+
+
+@pytest.fixture(scope="module")
+def chunked(folder: Path) -> SpatialVLA:
+    return load_spatialvla(str(folder), iterations="chunk", constrained=True, camera="bridge_orig/1.0.0")
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory: pytest.TempPathFactory) -> SpatialVLA:
+    where = tmp_path_factory.mktemp("flat")
+    return load_spatialvla(str(write_checkpoint(where, use_vision_zoe=False, vision_zoe_config=None)))
+
+
+@pytest.fixture
+def seen() -> list[Observation]:
+    """Two cameras, two instructions of different length."""
+    examples = example_observations(["Put the cube on the star", "Put the cube on the red shape"])
+    return [replace(one, intrinsics=SCENE * [[1 + row], [1], [1]]) for row, one in enumerate(examples)]
+
+
+class TestOneStepHeard(AdapterContract):
+    @pytest.fixture
+    def policy(self, plain: SpatialVLA) -> SpatialVLA:
+        return plain
+
+    @pytest.fixture
+    def observations(self, seen: list[Observation]) -> list[Observation]:
+        return seen
+
+
+class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(AdapterContract):
+    @pytest.fixture
+    def policy(self, chunked: SpatialVLA) -> SpatialVLA:
+        return chunked
+
+
+class TestWithoutDepth(AdapterContract):
+    @pytest.fixture
+    def policy(self, flat: SpatialVLA) -> SpatialVLA:
+        return flat
+
+
+# -- listening -------------------------------------------------------------------------------------------------
+
+
+def test_what_a_block_adds_is_what_the_residual_stream_gains(plain: SpatialVLA, seen: list[Observation]) -> None:
+    """Of every stream: Gemma-2 norms what it adds, SigLIP does not."""
+    streams = [*plain.streams.values(), *plain.further_streams.values()]
+    sites = [site for s in streams for quantity in ("residual", "attention", "mlp") for site in s.sites(quantity)]
+    with capture(plain, sites) as tape:
+        plain.act(seen, [0, 1])
+    for stream in streams:
+        for site in stream.sites("mlp"):
+            before = tape[replace(site, quantity="residual")]
+            after = tape[replace(site, quantity="residual", layer=site.layer + 1)]
+            gained = tape[replace(site, quantity="attention")] + tape[site]
+            torch.testing.assert_close(before + gained, after, rtol=0, atol=1e-5)
+
+
+def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_heard(
+    folder: Path, plain: SpatialVLA, seen: list[Observation]
+) -> None:
+    whole = load_spatialvla(str(folder), iterations="chunk")
+    assert (plain.streams["action"].iterations, whole.streams["action"].iterations) == (3, 12)
+    tapes = []
+    for policy in (plain, whole):
+        with capture(policy, policy.sites()) as tape:
+            policy.act(seen, [0, 1])
+        tapes.append(tape)
+    for site in plain.sites():
+        assert torch.equal(tapes[0][site], tapes[1][site])
+    assert (tapes[1][Site("action", 2, iteration=11)] - tapes[1][Site("action", 2, iteration=2)]).abs().max() > 0
+
+
+def test_picture_positions_know_the_instruction(plain: SpatialVLA, seen: list[Observation]) -> None:
+    """Attention goes both ways over the prompt; docs/spatialvla.md says what that means for probes."""
+    kept = []
+    for text in ("put the cube on the star", "take it away"):
+        with capture(plain, plain.sites()) as tape:
+            plain.act([replace(seen[0], instruction=text)], [0])
+        kept.append(tape[Site("backbone", 2)][:, : plain.config.patches])
+    assert (kept[0] - kept[1]).abs().max() > 1e-3
+
+
+def test_every_position_has_its_role(plain: SpatialVLA, seen: list[Observation]) -> None:
+    short, long = plain.roles(seen)["backbone"]
+    patches = plain.config.patches
+    assert [span.role for span in long.spans] == ["image.primary", "special", "language"]
+    assert [span.role for span in short.spans] == ["image.primary", "special", "language", "padding"]
+    assert (long.spans[0].stop, long.spans[1].stop) == (patches, patches + 1)
+    ids = plain.token_ids([one.instruction for one in seen])
+    assert len(long) == patches + len(ids[1]) - 1
+    assert len(ids[0]) < len(ids[1])
+
+
+# -- cameras ---------------------------------------------------------------------------------------------------
+
+
+def test_a_picture_without_intrinsics_is_refused_by_name(plain: SpatialVLA, seen: list[Observation]) -> None:
+    assert plain.card.needs == {"intrinsics"}
+    with pytest.raises(ObservationError, match="no intrinsics"):
+        plain.act([replace(seen[0], intrinsics=None)], [0])
+    with pytest.raises(ObservationError, match="invertible"):
+        plain.act([replace(seen[0], intrinsics=np.zeros((3, 3), np.float32))], [0])
+
+
+def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_picture(
+    plain: SpatialVLA, seen: list[Observation]
+) -> None:
+    height, width = seen[0].image.shape[:2]
+    expected = SCENE * np.array([[SIDE / width], [SIDE / height], [1]])
+    np.testing.assert_allclose(plain.cameras(seen)[0].numpy(), expected, rtol=1e-6)
+    residuals = []
+    for matrix in (SCENE, SCENE * [[2], [2], [1]]):
+        with capture(plain, plain.sites()) as tape:
+            plain.act([replace(seen[0], intrinsics=matrix.astype(np.float32))], [0])
+        residuals.append(tape[Site("backbone", 0)])
+    patches = plain.config.patches
+    assert (residuals[0] - residuals[1])[:, :patches].abs().max() > 1e-3
+    assert torch.equal(residuals[0][:, patches:], residuals[1][:, patches:])
+
+
+def test_the_training_camera_may_stand_in_for_the_scenes(
+    folder: Path, plain: SpatialVLA, seen: list[Observation]
+) -> None:
+    preset = load_spatialvla(str(folder), camera="default")
+    assert preset.card.needs == frozenset()
+    assert preset.card.settings["camera"] == "default"
+    camera = processor_values()["intrinsic_config"]["default"]
+    height, width = seen[0].image.shape[:2]
+    scale = [[width / camera["width"]], [height / camera["height"]], [1]]
+    same = replace(seen[0], intrinsics=np.array(camera["intrinsic"]) * scale)
+    np.testing.assert_allclose(preset.cameras(seen[:1]), plain.cameras([same]), rtol=1e-6)
+    np.testing.assert_array_equal(preset.act([replace(seen[0], intrinsics=None)], [0]), plain.act([same], [0]))
+    with pytest.raises(
+        UsageError, match=r"neither scene nor one of the checkpoint's: bridge_orig/1\.0\.0, default"
+    ):
+        load_spatialvla(str(folder), camera="wrist")
+
+
+def test_a_model_without_depth_needs_no_camera(flat: SpatialVLA) -> None:
+    assert flat.card.needs == frozenset()
+
+
+# -- actions ---------------------------------------------------------------------------------------------------
+
+
+def test_a_chunk_is_in_units_of_the_data_and_one_step_of_it_is_executed(
+    plain: SpatialVLA, seen: list[Observation]
+) -> None:
+    actions = plain.act(seen, [0, 1])
+    assert actions.shape == (2, 4, 7)
+    assert (plain.card.chunk, plain.card.execute) == (4, 1)
+    assert (np.abs(actions[..., :6]) <= 0.03).all()
+    assert set(np.unique(actions[..., 6])) <= {0, 1}
+
+
+def test_tokens_that_name_no_action_are_said_and_slots_prevent_them(
+    plain: SpatialVLA, chunked: SpatialVLA, seen: list[Observation]
+) -> None:
+    with pytest.warns(UserWarning, match="name no action"):
+        plain.act(seen, [0, 1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        chunked.act(seen, [0, 1])
+    assert any("original does not" in note for note in chunked.card.notes)
+    assert (plain.card.settings["constrained"], chunked.card.settings["constrained"]) == ("False", "True")
+
+
+@pytest.fixture
+def variants(tmp_path: Path) -> dict[str, SpatialVLA]:
+    """The four released checkpoints as they differ: in bins and statistics, and in nothing else."""
+    wide = {"q01": [-0.3] * 6 + [0.0], "q99": [0.5] * 6 + [1.0], "mask": [True] * 6 + [False]}
+    even = edges()
+    even["translation"]["r_bins"][1] = 1.6
+    changes: dict[str, dict[str, Any]] = {
+        "pt": {},
+        "mix": {"statistics": {**processor_values()["statistics"], FRACTAL: {"action": wide}}},
+        "sft-bridge": {"bin_policy": even},
+        "sft-fractal": {"bin_policy": even, "statistics": {FRACTAL: {"action": wide}}},
+    }
+    return {
+        name: load_spatialvla(str(write_checkpoint(tmp_path / name, processor=change)), constrained=True)
+        for name, change in changes.items()
+    }
+
+
+def test_the_released_variants_differ_in_bins_and_statistics_only(
+    variants: dict[str, SpatialVLA], seen: list[Observation]
+) -> None:
+    assert len({policy.card.weights_sha256 for policy in variants.values()}) == 1
+    keys = [policy.statistics.key for policy in variants.values()]
+    assert keys == ["bridge_orig/1.0.0", "bridge_orig/1.0.0", "bridge_orig/1.0.0", FRACTAL]
+    actions = {name: policy.act(seen, [0, 1]) for name, policy in variants.items()}
+    np.testing.assert_array_equal(actions["pt"], actions["mix"])
+    assert np.abs(actions["pt"] - actions["sft-bridge"])[..., :3].max() > 1e-3
+    np.testing.assert_array_equal(actions["pt"][..., 3:6], actions["sft-bridge"][..., 3:6])
+    values = (actions["sft-bridge"][..., :6] + 0.03) / 0.06
+    np.testing.assert_allclose(actions["sft-fractal"][..., :6], values * 0.8 - 0.3, atol=1e-6)
+    settings = [policy.card.settings for policy in variants.values()]
+    assert (
+        len({(s["action_bins"], s["action_statistics"], s["file processor_config.json"]) for s in settings}) == 4
+    )
+    assert len({s["action_bins"] for s in settings}) == 2
+
+
+def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> None:
+    own = processor_values()["statistics"]["bridge_orig/1.0.0"]
+    checkpoint = str(write_checkpoint(tmp_path, processor={"statistics": {"my_arm": own, FRACTAL: own}}))
+    assert load_spatialvla(checkpoint, unnorm_key=FRACTAL).statistics.key == FRACTAL
+    with pytest.raises(UsageError, match="Did you mean my_arm"):
+        load_spatialvla(checkpoint, unnorm_key="my_arms")
+    with pytest.raises(UsageError, match="choose"):
+        load_spatialvla(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("statistics", "said"),
+    [({}, "has no statistics"), ({"arm": {"action": {"q01": [0.0] * 8, "q99": [1.0] * 8}}}, "8 dimensions")],
+)
+def test_statistics_that_cannot_be_used_are_refused(tmp_path: Path, statistics: Any, said: str) -> None:
+    with pytest.raises(CheckpointError, match=said):
+        load_spatialvla(str(write_checkpoint(tmp_path, processor={"statistics": statistics})))
+
+
+def test_a_longer_chunk_has_more_tokens(tmp_path: Path, seen: list[Observation]) -> None:
+    checkpoint = str(write_checkpoint(tmp_path, processor={"action_chunk_size": 2}))
+    policy = load_spatialvla(checkpoint, iterations="chunk")
+    assert (policy.steps, policy.streams["action"].iterations) == (6, 6)
+    assert policy.act(seen, [0, 1]).shape == (2, 2, 7)
+    with pytest.raises(CheckpointError, match="action_chunk_size is 0"):
+        load_spatialvla(str(write_checkpoint(tmp_path / "none", processor={"action_chunk_size": 0})))
+
+
+def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, seen: list[Observation]) -> None:
+    with pytest.raises(InstructionError, match="this model has 4096"):
+        plain.act([replace(seen[0], instruction="x " * 4096)], [0])
+
+
+def test_options_are_declared_and_checked(folder: Path) -> None:
+    policy = load_policy("spatialvla", str(folder), lowercase="false", iterations="chunk")
+    assert policy.card.settings["lowercase"] == "False"
+    for wrong in ({"iterations": "all"}, {"lowercase": "perhaps"}, {"lower_case": "true"}):
+        with pytest.raises(UsageError):
+            load_policy("spatialvla", str(folder), **wrong)
+
+
+def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:
+    choices: list[dict[str, Any]] = [
+        {"lowercase": False}, {"prompt": "question"}, {"camera": "default"}, {"constrained": True},
+        {"iterations": "chunk"}, {"tokenizer": "bytes"},
+    ]  # fmt: skip
+    for choice in choices:
+        assert load_spatialvla(str(folder), **choice).card.settings != plain.card.settings
+    assert {"file config.json", "file tokenizer.json"} <= set(plain.card.settings)
+    assert BINS["total"] == plain.config.actions

@@ -1,0 +1,92 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
+from probe_kit.hooks.weights import read_weights
+from tests.spatialvla_checkpoints import FIRST_ACTION, write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"), shards=3)
+
+
+def load(folder: Path, dtype: str | None = None, random_weights: bool = False, seed: int = 0) -> LoadedSpatialVLA:
+    return load_checkpoint(str(folder), "cpu", dtype, random_weights, seed)
+
+
+def test_every_tensor_of_every_shard_arrives_and_names_the_files(folder: Path) -> None:
+    loaded = load(folder)
+    stored = read_weights(folder)
+    assert loaded.audit.tensors == len(stored.tensors) == len(loaded.network.state_dict())
+    assert loaded.audit.sha256 == stored.sha256()
+    state = loaded.network.state_dict()
+    table = "language_model.model.embed_tokens.weight"
+    assert all(torch.equal(state[name], tensor) for name, tensor in stored.tensors.items() if name != table)
+    assert torch.equal(state[table][:FIRST_ACTION], stored.tensors[table][:FIRST_ACTION])
+
+
+def test_the_stale_rows_of_action_ids_are_overwritten_and_the_output_layer_stays(folder: Path) -> None:
+    stored, network = read_weights(folder).tensors, load(folder).network
+    rows = network.language_model.model.embed_tokens.weight[FIRST_ACTION:]
+    assert torch.equal(rows, stored["spatial_embed_tokens.weight"])
+    assert not torch.equal(rows, stored["language_model.model.embed_tokens.weight"][FIRST_ACTION:])
+    head = network.language_model.lm_head.weight
+    assert torch.equal(head, stored["language_model.lm_head.weight"])
+    assert head.data_ptr() != network.language_model.model.embed_tokens.weight.data_ptr()
+
+
+def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path) -> None:
+    rounded, exact = load(folder, "bfloat16").network, load(folder).network.state_dict()
+    for name, tensor in rounded.state_dict().items():
+        assert torch.equal(tensor, exact[name].to(torch.bfloat16))
+    with pytest.raises(UsageError, match="float16"):
+        load(folder, "float16")
+
+
+def test_random_twins_are_named_by_their_seed(folder: Path) -> None:
+    twins = [load(folder, random_weights=True, seed=seed) for seed in (0, 0, 1)]
+    hashes = [twin.audit.sha256 for twin in twins]
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert [twin.weights_seed for twin in twins] == [0, 0, 1]
+    assert all(twin.audit.random for twin in twins)
+
+
+@pytest.mark.parametrize("damage", ["missing", "extra", "shape", "nan"])
+def test_weights_that_are_not_the_models_are_refused_by_name(folder: Path, tmp_path: Path, damage: str) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "damaged"))
+    name = "position_embedding_3d.position_embedding_head.3.bias"
+    index = json.loads((copy / "model.safetensors.index.json").read_text())
+    shard = copy / index["weight_map"][name]
+    tensors = load_file(shard)
+    if damage == "missing":
+        del tensors[name], index["weight_map"][name]
+    elif damage == "extra":
+        name = "position_embedding_3d.more"
+        tensors[name] = torch.zeros(2)
+        index["weight_map"][name] = shard.name
+    elif damage == "shape":
+        tensors[name] = torch.zeros(5)
+    else:
+        tensors[name] = torch.full_like(tensors[name], np.nan)
+    save_file(tensors, shard)
+    (copy / "model.safetensors.index.json").write_text(json.dumps(index))
+    with pytest.raises(WeightsError, match=name):
+        load(copy)
+
+
+def test_files_that_are_missing_or_of_another_kind_are_named(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "bare"))
+    (copy / "processor_config.json").unlink()
+    with pytest.raises(CheckpointError, match=r"processor_config\.json is missing: it holds the action bins"):
+        load(copy)
+    (copy / "adapter_config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match="LoRA adapter"):
+        load(copy)

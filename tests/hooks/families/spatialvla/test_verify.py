@@ -1,0 +1,136 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from probe_kit.hooks.families.spatialvla.checkpoint import load_checkpoint
+from probe_kit.hooks.verify import verify_keys, verify_reference
+from probe_kit.models.spatialvla import ActionBins, PictureSettings, depth_input, prepare_picture
+from tests.spatialvla_checkpoints import FIRST_ACTION, IMAGE, config_values, write_checkpoint
+
+OTHER_BINS = {
+    "translation": {"theta_bins": 2, "phi_bins": 3, "r_bins": 3},
+    "rotation": {"roll_bins": 3, "pitch_bins": 2, "yaw_bins": 2},
+    "gripper": 2,
+    "total": 32,
+}
+
+
+def test_the_golden_reference_is_reproduced_in_every_output(golden_spatialvla: Path) -> None:
+    verification = verify_reference("spatialvla", golden_spatialvla)
+    assert verification.passed
+    assert {c.status for c in verification.comparisons} == {"ok"}
+    assert len(verification.comparisons) == 28
+    assert max(c.error or 0 for c in verification.comparisons) < 5e-5
+
+
+@pytest.mark.parametrize("output", ["generated_step_hidden", "xyz", "batch_hidden_states", "decode_table"])
+def test_one_wrong_number_in_the_reference_is_noticed(
+    golden_spatialvla: Path, tmp_path: Path, output: str
+) -> None:
+    copy = Path(shutil.copytree(golden_spatialvla, tmp_path / "golden"))
+    with np.load(copy / "reference.npz") as arrays:
+        recorded = {name: arrays[name] for name in arrays.files}
+    recorded[output][(-1,) * recorded[output].ndim] += 0.01
+    recorded["something_else"] = np.zeros(1)
+    np.savez(copy / "reference.npz", **recorded)
+    status = {c.output: c.status for c in verify_reference("spatialvla", copy).comparisons}
+    assert [name for name, found in status.items() if found == "over"] == [output]
+    assert status["something_else"] == "not compared"
+
+
+def test_full_size_keys_are_equal(golden_spatialvla: Path) -> None:
+    assert verify_keys("spatialvla", golden_spatialvla / "real_keys.json.gz").passed
+
+
+def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path) -> None:
+    """Other patches, points, bins, chunk, tokens and padding, recorded from the network itself."""
+    vision = {**config_values()["vision_config"], "image_size": 64, "patch_size": 16, "num_hidden_layers": 3}
+    write_checkpoint(
+        tmp_path / "checkpoint",
+        shards=1,
+        bins=OTHER_BINS,
+        processor={"action_chunk_size": 2},
+        tokenizer=False,
+        vision_config=vision,
+        ego3d_patch_reso=4,
+        n_freqs=5,
+    )
+    recorded = _record(tmp_path / "checkpoint")
+    np.savez(tmp_path / "reference.npz", **recorded)
+    verification = verify_reference("spatialvla", tmp_path)
+    assert {c.output: c.status for c in verification.comparisons} == dict.fromkeys(
+        set(recorded)
+        - {"image_uint8", "intrinsic_raw", "input_ids", "batch_input_ids", "batch_attention_mask", "forced_ids"}
+        - {"batch_pixel_values", "batch_intrinsic", "tok_actions"},
+        "ok",
+    )
+
+
+@torch.inference_mode()
+def _record(checkpoint: Path) -> dict[str, NDArray[np.generic]]:
+    loaded = load_checkpoint(str(checkpoint), "cpu", None, random_weights=False)
+    network, config = loaded.network, loaded.config
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (50, 80, 3), dtype=np.uint8)
+    camera = np.array([[90, 0, 41], [0, 80, 26], [0, 0, 1]], np.float32)
+    pixels = torch.from_numpy(prepare_picture(image, PictureSettings(config.side)))[None]
+    scaled = torch.from_numpy((camera * [[64 / 80], [64 / 50], [1]]).astype(np.float32))
+    seen = network.look(pixels, scaled)
+    assert seen.depth is not None
+    assert seen.points is not None
+    rows = [[IMAGE] * config.patches + [2, 7, 8, 9, 4], [IMAGE] * config.patches + [2, 9, 4, 0, 0]]
+    ids = torch.tensor(rows)
+    mask = torch.tensor([[True] * len(rows[0]), [True] * (len(rows[0]) - 2) + [False] * 2])
+    both = network.look(pixels.repeat(2, 1, 1, 1), scaled.repeat(2, 1, 1), vote=True)
+    output = network(network.embed(ids, both.features), mask)
+    forced = np.array([FIRST_ACTION + 5, FIRST_ACTION + 20])
+    decoded = network.decode(ids[:1], mask[:1], seen.features, 6)
+    fed = network.decode(ids[:1], mask[:1], seen.features, 3, fed=torch.from_numpy(forced)[None])
+    bins = ActionBins.of(loaded.processor, FIRST_ACTION, OTHER_BINS["total"], "test")
+    actions = rng.uniform(-1, 1, (5, 7))
+    statistics = loaded.processor["statistics"]["bridge_orig/1.0.0"]["action"]
+    low, high = (np.array(statistics[name]) for name in ("q01", "q99"))
+    values = bins.values(bins.ids(actions)[:2])
+    return {
+        "image_uint8": image,
+        "intrinsic_raw": camera,
+        "input_ids": ids[:1].numpy(),
+        "forced_ids": forced,
+        "batch_input_ids": ids.numpy(),
+        "batch_attention_mask": mask.numpy().astype(np.int64),
+        "batch_pixel_values": pixels.repeat(2, 1, 1, 1).numpy(),
+        "batch_intrinsic": scaled.repeat(2, 1, 1).numpy(),
+        "pixel_values": pixels.numpy(),
+        "intrinsic": scaled.numpy(),
+        "zoe_pixel_values_sub": depth_input(pixels)[..., ::12, ::12].numpy(),
+        "depth_raw_sub": seen.depth.raw[..., ::6, ::6].numpy(),
+        "depth": seen.depth.metres.numpy(),
+        "xyz": seen.points.numpy(),
+        "image_features": (seen.features / 32**0.5).numpy(),
+        "hidden_states": torch.stack(output.hidden_states)[:, :1].numpy(),
+        "logits": output.logits[:1].numpy(),
+        "batch_hidden_states": torch.stack(output.hidden_states).numpy(),
+        "batch_logits": output.logits.numpy(),
+        "generated_ids": decoded.ids[0].numpy(),
+        "generated_step_logits": decoded.logits[0].numpy(),
+        "forced_step_logits": fed.logits[0].numpy(),
+        "tok_actions": actions,
+        "tok_ids": bins.ids(actions),
+        "decode_table": bins.values(np.repeat(np.arange(config.text.vocab_size)[:, None], 3, axis=1)),
+        "actions_from_tok_ids": np.where(statistics["mask"], (values + 1) / 2 * (high - low) + low, values),
+        "action_ids_from_tok": bins.ids(actions)[:2],
+    }
+
+
+def test_the_record_of_the_test_itself_is_in_the_layout_of_the_golden_one(golden_spatialvla: Path) -> None:
+    """So that the sizes above differ, and nothing else."""
+    ours = config_values()
+    theirs = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text())
+    assert set(ours) - set(theirs) == set()
+    for part in ("text_config", "vision_config", "vision_zoe_config"):
+        assert set(ours[part]) - set(theirs[part]) == set()
