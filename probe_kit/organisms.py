@@ -18,7 +18,7 @@ from probe_kit.train import ProbeResults, train_probes
 from probe_kit.train.controls import SIGNIFICANCE
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from probe_kit.fitting_tables import Cell, FittingTable
 
 Verdict = Literal["used", "encoded, unused", "absent", "acted on, not found"]
 NamedProgress = Callable[[str], Callable[..., None]]
@@ -105,33 +105,45 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
     ]
 
 
-def to_rich(findings: Sequence[Finding]) -> "Table":
+def to_rich(findings: Sequence[Finding]) -> "FittingTable":
     """One line per organism and category: the truth, the verdict, and the numbers behind it."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
+    from probe_kit.fitting_tables import FittingTable, Part
 
-    table = Table(
-        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title="Model organisms", title_justify="left"
-    )
-    for name in ("policy", "category", "expected", "measured", "", "SR %", "Δ", "backbone", "p", "expert"):
-        table.add_column(name, no_wrap=name not in ("expected", "measured"))
-    table.add_column("retention [95 %]", no_wrap=True)
-    for finding in findings:
-        row = finding.row
-        table.add_row(
-            finding.organism,
-            finding.category,
-            finding.expected,
-            finding.measured,
-            "[green]✓[/]" if finding.agrees else "[red]✗[/]",
-            percent(row.sr),
-            percent(row.delta),
-            percent(row.prefix_accuracy),
-            number(row.prefix_p_fwe, 3),
-            percent(row.action_accuracy),
-            debiased_value(row),
-        )
     agree = sum(finding.agrees for finding in findings)
-    table.caption = f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention debiased"
-    table.caption_justify = "left"
-    return table
+    return FittingTable(
+        title="Model organisms",
+        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention debiased",
+        name="policy",
+        names=tuple(finding.organism for finding in findings),
+        styles=("",) * len(findings),
+        parts=(
+            Part(
+                "Verdicts",
+                ("category", "expected", "measured", ""),
+                tuple(map(_verdict_cells, findings)),
+            ),
+            Part(
+                "What they rest on",
+                ("SR %", "± Δ", "backbone", "p", "action", "retention [95 %]"),
+                tuple(map(_number_cells, findings)),
+            ),
+        ),
+    )
+
+
+def _verdict_cells(finding: Finding) -> "tuple[Cell, ...]":
+    from probe_kit.fitting_tables import Cell
+
+    mark = Cell("✓", "green") if finding.agrees else Cell("✗", "red")
+    return Cell(finding.category), Cell(finding.expected), Cell(finding.measured), mark
+
+
+def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
+    from probe_kit.fitting_tables import Cell
+
+    row = finding.row
+    texts = (
+        percent(row.sr), percent(row.delta), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
+        percent(row.action_accuracy), debiased_value(row),
+    )  # fmt: skip
+    return tuple(map(Cell, texts))

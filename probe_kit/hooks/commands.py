@@ -40,6 +40,8 @@ def _print_verification(verification: "Verification") -> None:
 
     colours = {"ok": "green", "over": "red", "not compared": "yellow"}
     table = Table("output", "max abs error", "tolerance", "", "note", title=f"{verification.family}")
+    for column in table.columns:
+        column.overflow = "fold"
     for c in verification.comparisons:
         error = "-" if c.error is None else f"{c.error:.2e}"
         status = f"[{colours[c.status]}]{c.status}[/]"

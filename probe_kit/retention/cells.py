@@ -10,9 +10,9 @@ Column = tuple[str, Callable[[RetentionRow], str]]
 """Heading, and what a row shows under it."""
 
 
-def percent(value: float | None) -> str:
-    """A share as a percentage with one decimal; a dash for None."""
-    return "–" if value is None else f"{100 * value:.1f}"
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share as a percentage, with one decimal unless told otherwise; a dash for None."""
+    return "–" if value is None else f"{100 * value:.{digits}f}"
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -28,7 +28,7 @@ def model_name(row: RetentionRow) -> str:
 
 def with_limits(value: str, limits: Limits | None, write: Callable[[float | None], str]) -> str:
     """A value with its interval, if it has one."""
-    if limits is None:
+    if limits is None or value == "–":
         return value
     low, high = limits
     return f"{value} [unbounded]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
@@ -53,9 +53,11 @@ def debiased_value(row: RetentionRow) -> str:
     return with_limits(number(row.retention_debiased), row.retention_ci, number)
 
 
-def peak(depth: float | None, iteration: int | None = None) -> str:
-    """Depth of the best layer, with the iteration where the stream has several."""
-    return number(depth) if iteration is None else f"{number(depth)} @{iteration}"
+def place(layer: int | None, iteration: int | None = None) -> str:
+    """Where the best site is: its layer, and after @ the iteration where the stream has several."""
+    if layer is None:
+        return "–"
+    return str(layer) if iteration is None else f"{layer} @{iteration}"
 
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -89,22 +91,27 @@ def baseline(name: str) -> Callable[[RetentionRow], str]:
     return cell
 
 
+CONTROL_PARTS: dict[str, Sequence[Column]] = {
+    "What gives the answer away without the model": [
+        ("position", baseline("position")),
+        ("instruction", baseline("instruction")),
+        ("pixels", baseline("pixels")),
+    ],
+    "Selectivity": [
+        ("selectivity: backbone", lambda row: percent(row.prefix_selectivity)),
+        ("action", lambda row: percent(row.action_selectivity)),
+    ],
+    "Against the twin": [
+        ("backbone − twin", lambda row: with_limits(percent(row.prefix_twin), row.prefix_twin_ci, percent)),
+        ("action − twin", lambda row: with_limits(percent(row.action_twin), row.action_twin_ci, percent)),
+    ],
+}
+"""Columns of the controls, by the question they answer."""
+
 CONTROL_COLUMNS: list[Column] = [
     ("category", lambda row: row.category),
-    ("position", baseline("position")),
-    ("instruction", baseline("instruction")),
-    ("pixels", baseline("pixels")),
-    ("selectivity", lambda row: f"{percent(row.prefix_selectivity)} / {percent(row.action_selectivity)}"),
-    ("backbone − twin", lambda row: with_limits(percent(row.prefix_twin), row.prefix_twin_ci, percent)),
-    ("expert − twin", lambda row: with_limits(percent(row.action_twin), row.action_twin_ci, percent)),
+    *(column for columns in CONTROL_PARTS.values() for column in columns),
 ]
-
-
-def headed_for(columns: Sequence[Column], rows: Sequence[RetentionRow]) -> list[Column]:
-    """The same columns; where no row has an expert, headings say `action` instead."""
-    streams = {row.action_stream for row in rows} - {None}
-    name = "/".join(sorted(stream for stream in streams if stream)) or "expert"
-    return [(heading.replace("expert", name), cell) for heading, cell in columns]
 
 
 def controlled(rows: Sequence[RetentionRow]) -> bool:
@@ -115,13 +122,13 @@ def controlled(rows: Sequence[RetentionRow]) -> bool:
 # -- differences ---------------------------------------------------------------------------------------------
 
 DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
-    ("category", lambda row: row.category),
     ("view", lambda row: row.view or "–"),
-    ("SR %", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
-    ("prefix %", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
-    ("action %", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
-    ("debiased retention", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
+    ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+    ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+    ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+    ("debiased retention [95 %]", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
 ]
+"""Beside the category."""
 
 
 def difference_title(row: Difference) -> str:

@@ -1,25 +1,26 @@
-"""Retention tables on a console: one block per run, narrow enough for 80 columns."""
+"""Retention tables on a console: one block per run, whole at any width."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit.fitting_tables import Cell, FittingTable, Part
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
-    CONTROL_COLUMNS,
+    CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
     Column,
     controlled,
     debiased_value,
     difference_title,
-    headed_for,
     model_name,
     number,
     once_per_category,
     percent,
+    place,
     probed,
-    success_interval,
+    with_limits,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import MEAN, RetentionRow
@@ -27,8 +28,6 @@ from probe_kit.retention.success import Regime
 
 if TYPE_CHECKING:
     from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
 
 _REGIMES: dict[str | None, str] = {
     Regime.KNOWLEDGE: "knowledge",
@@ -44,108 +43,106 @@ def rich_tables(
     from rich.console import Group
     from rich.text import Text
 
-    tables: list[Table] = []
+    tables: list[FittingTable] = []
     for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
         found = list(of_run)
-        tables.append(_table("Success rate", once_per_category(found), _SUCCESS_COLUMNS, [_OUTCOME_LEGEND]))
+        tables.append(_of_run("Success rate", once_per_category(found), _SUCCESS, [_OUTCOME_LEGEND]))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
             reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
-            legend = ["@ depth of the best layer/iteration", *reasons]
-            tables.append(_table(f"Retention, view {view}", shown, _RETENTION_COLUMNS, legend))
+            tables.append(_of_run(f"Retention, view {view}", shown, _RETENTION, [_SITE_LEGEND, *reasons]))
             if controlled(shown):
-                tables.append(_table(f"Controls, view {view}", shown, CONTROL_COLUMNS, [_control_legend(shown)]))
+                tables.append(_of_run(f"Controls, view {view}", shown, _CONTROLS, [_control_legend(shown)]))
     for title, of_pair in groupby(differences, key=difference_title):
-        tables.append(_difference_table(title, list(of_pair)))
+        tables.append(_fitting(title, "", list(of_pair), {"Difference": DIFFERENCE_COLUMNS}))
     return Group(*tables, *(Text(note, style="yellow") for note in notes))
-
-
-def _whole(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.0f}"
 
 
 def _regime(row: RetentionRow) -> str:
     return f"score {number(row.normalised_score, 1)}" if row.category == MEAN else _REGIMES[row.regime]
 
 
-def _peak(accuracy: float | None, *places: float | None) -> str:
-    """Accuracy in percent, then where: depth, and the iteration of a stream that has several."""
-    known = [f"{place:.2f}" if isinstance(place, float) else str(place) for place in places if place is not None]
-    return percent(accuracy) + (f" @{'/'.join(known)}" if known else "")
+def _sides(row: RetentionRow) -> str:
+    return f"{percent(row.sr_left, 0)} / {percent(row.sr_right, 0)}"
 
 
 def _retention(row: RetentionRow) -> str:
     return number(row.retention) if row.retention_defined else "n/a"
 
 
-def _outside(row: RetentionRow) -> str:
-    """Out of bounds, and in brackets where the cube never moved; both of all episodes."""
-    return percent(row.p_oob) + ("" if row.p_never_moved is None else f" ({percent(row.p_never_moved)})")
+_OUTCOME_LEGEND = "wrong, outside, never moved (part of outside): each in % of all episodes"
+_SITE_LEGEND = "layer: the first of the best; after @ the iteration (flow step or action token); p family-wise"
+
+_SUCCESS: dict[str, Sequence[Column]] = {
+    "Does it act on the answer?": [
+        ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+        ("± Δ", lambda row: percent(row.delta)),
+        ("regime", _regime),
+        ("left / right", _sides),
+    ],
+    "Where the cube ended": [
+        ("wrong", lambda row: percent(row.p_wrong)),
+        ("outside", lambda row: percent(row.p_oob)),
+        ("never moved", lambda row: percent(row.p_never_moved)),
+    ],
+}
+_RETENTION: dict[str, Sequence[Column]] = {
+    "In the backbone": [
+        ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+        ("layer", lambda row: place(row.prefix_layer)),
+        ("p", lambda row: number(row.prefix_p_fwe, 3)),
+    ],
+    "Where the action is made": [
+        ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+        ("layer", lambda row: place(row.action_layer, row.action_iteration)),
+        ("p", lambda row: number(row.action_p_fwe, 3)),
+    ],
+    "What is retained": [
+        ("retention", _retention),
+        ("debiased [95 %]", debiased_value),
+        ("gap", lambda row: percent(row.gap)),
+    ],
+}
+_CONTROLS: dict[str, Sequence[Column]] = CONTROL_PARTS
 
 
-_OUTCOME_LEGEND = "wrong, oob (out of bounds) and, in brackets, cube never moved: each in % of all episodes"
-
-_SUCCESS_COLUMNS: list[Column] = [
-    ("category", lambda row: row.category),
-    ("SR % [95 %]", success_interval),
-    ("Δ", lambda row: percent(row.delta)),
-    ("wrong", lambda row: percent(row.p_wrong)),
-    ("oob (never moved)", _outside),
-    ("left/right", lambda row: f"{_whole(row.sr_left)} / {_whole(row.sr_right)}"),
-    ("regime", _regime),
-]
-
-_RETENTION_COLUMNS: list[Column] = [
-    ("category", lambda row: row.category),
-    ("backbone", lambda row: _peak(row.prefix_accuracy, row.prefix_depth)),
-    ("p", lambda row: number(row.prefix_p_fwe, 3)),
-    ("expert", lambda row: _peak(row.action_accuracy, row.action_depth, row.action_iteration)),
-    ("retention", _retention),
-    ("debiased [95 %]", debiased_value),
-    ("gap", lambda row: _whole(row.gap)),
-]
+def _of_run(
+    what: str, rows: Sequence[RetentionRow], parts: dict[str, Sequence[Column]], notes: Sequence[str]
+) -> FittingTable:
+    title = f"{what}: {model_name(rows[0])} on {rows[0].suite}"
+    return _fitting(title, "; ".join([_sizes(rows), *notes]), rows, parts)
 
 
-def _table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column], notes: Sequence[str]) -> "Table":
-    from rich.box import SIMPLE_HEAD
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    table.title, table.title_justify = escape(f"{what}: {model_name(rows[0])} on {rows[0].suite}"), "left"
-    table.caption, table.caption_justify = escape("; ".join([_sizes(rows), *notes])), "left"
-    for name, _ in headed_for(columns, rows):
-        table.add_column(escape(name), no_wrap=columns is not CONTROL_COLUMNS, overflow="fold")
-    for row in rows:
-        table.add_row(*(_coloured(cell(row)) for _, cell in columns), style=_style(row.category))
-    return table
-
-
-def _difference_table(title: str, rows: Sequence[Difference]) -> "Table":
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=title, title_justify="left")
-    for name, _ in DIFFERENCE_COLUMNS:
-        table.add_column(name, overflow="fold")
-    for row in rows:
-        table.add_row(*(_coloured(cell(row)) for _, cell in DIFFERENCE_COLUMNS), style=_style(row.category))
-    return table
+def _fitting[Row: (RetentionRow, Difference)](
+    title: str,
+    caption: str,
+    rows: Sequence[Row],
+    parts: dict[str, Sequence[tuple[str, Callable[[Row], str]]]],
+) -> FittingTable:
+    """Columns in which no row has anything to show are left out."""
+    found = []
+    for question, columns in parts.items():
+        shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]
+        cells = tuple(tuple(_coloured(cell(row)) for _, cell in shown) for row in rows)
+        if shown:
+            found.append(Part(question, tuple(heading for heading, _ in shown), cells))
+    return FittingTable(
+        title=title,
+        caption=caption,
+        name="category",
+        names=tuple(row.category for row in rows),
+        styles=tuple("bold" if row.category == MEAN else "" for row in rows),
+        parts=tuple(found),
+    )
 
 
-def _coloured(cell: str) -> "Text":
-    from rich.text import Text
-
-    return Text(cell, style="bold red" if cell.endswith(ABOVE_CHANCE) else "")
-
-
-def _style(category: str) -> str | None:
-    return "bold" if category == MEAN else None
+def _coloured(cell: str) -> Cell:
+    return Cell(cell, "bold red" if cell.endswith(ABOVE_CHANCE) else "")
 
 
 def _control_legend(rows: Sequence[RetentionRow]) -> str:
-    twin = f"; twin {rows[0].twin}" if rows[0].twin else ""
-    return f"held-out accuracy % without the model; selectivity of backbone / {rows[0].action_stream}{twin}"
+    twin = f"; twin: {rows[0].twin}" if rows[0].twin else ""
+    return f"held-out accuracy % without the model; selectivity: accuracy above random labels{twin}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> str:

@@ -85,7 +85,7 @@ def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: in
     covariance = _covariance_by_halving((expert, backbone), generator)
     for stream in np.flatnonzero(covariance.diagonal() < _NO_VARIANCE):
         share = above[stream] + chance
-        covariance[stream, stream] = ((unseen(share, sizes.size) - share) ** 2).mean()
+        covariance[stream, stream] = ((unseen(share, sizes.size, seed) - share) ** 2).mean()
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
 

@@ -40,7 +40,7 @@ class Estimate:
         """Paired units that all agree are no proof that unseen ones would: see `unseen`."""
         value, draws, count = self.value - other.value, self.draws - other.draws, min(self.count, other.count)
         if constant(draws[:, None])[0]:
-            draws = unseen(value, count, draws.size, GAINS)
+            draws = unseen(value, count, self.units, draws.size, GAINS)
         return Estimate(value, draws, self.units, count)
 
     @property

@@ -10,11 +10,9 @@ from probe_kit.retention.cells import (
     controlled,
     debiased_value,
     difference_title,
-    headed_for,
     model_name,
-    number,
-    peak,
     percent,
+    place,
     probed,
     retention_value,
     title,
@@ -41,12 +39,12 @@ def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), 
     """
     parts = [_retention_table(rows)]
     if controlled(rows):
-        names = ["Model", *(name for name, _ in headed_for(CONTROL_COLUMNS, rows))]
+        names = ["Model", *(name for name, _ in CONTROL_COLUMNS)]
         cells = [[model_name(row), *(cell(row) for _, cell in CONTROL_COLUMNS)] for row in probed(rows)]
         parts.append(_plain_table(title("Controls", rows), names, cells))
     for heading, of_pair in groupby(differences, key=difference_title):
-        cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
-        parts.append(_plain_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
+        cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
+        parts.append(_plain_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
     return "\n".join([*parts, *(f"% {note}" for note in notes)])
 
 
@@ -85,7 +83,7 @@ def _retention_table(rows: Sequence[RetentionRow]) -> str:
             rf"\caption{{{escape(title('Success rate and retention', rows))}}}",
             r"\begin{tabular}{lllrrrrrrrll}",
             r"\toprule",
-            r"Model & View & Category & $n$ & SR & $\Delta$ & Prefix & depth & Action & depth"
+            r"Model & View & Category & $n$ & SR & $\Delta$ & Prefix & Layer & Action & Layer"
             r" & Retention & Debiased [95\,\%] \\",
             r"\midrule",
             *body[:-1],
@@ -111,9 +109,9 @@ def _line(row: RetentionRow) -> str:
         percent(row.sr),
         percent(row.delta),
         percent(row.prefix_accuracy),
-        number(row.prefix_depth),
+        place(row.prefix_layer),
         percent(row.action_accuracy),
-        peak(row.action_depth, row.action_iteration),
+        place(row.action_layer, row.action_iteration),
         retention_value(row),
         debiased_value(row),
     ]

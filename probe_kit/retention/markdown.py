@@ -11,16 +11,16 @@ from probe_kit.retention.cells import (
     controlled,
     debiased_value,
     difference_title,
-    headed_for,
     model_name,
     number,
     once_per_category,
-    peak,
     percent,
+    place,
     probed,
     retention_value,
     success_interval,
     title,
+    with_limits,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import RetentionRow
@@ -44,11 +44,12 @@ RETENTION_COLUMNS: list[Column] = [
     ("model", model_name),
     ("view", lambda row: row.view or "–"),
     ("category", lambda row: row.category),
-    ("prefix %", lambda row: percent(row.prefix_accuracy)),
-    ("at depth", lambda row: peak(row.prefix_depth)),
+    ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+    ("at layer", lambda row: place(row.prefix_layer)),
     ("p", lambda row: number(row.prefix_p_fwe, 3)),
-    ("action %", lambda row: percent(row.action_accuracy)),
-    ("at depth @step", lambda row: peak(row.action_depth, row.action_iteration)),
+    ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+    ("at layer @iteration", lambda row: place(row.action_layer, row.action_iteration)),
+    ("p", lambda row: number(row.action_p_fwe, 3)),
     ("retention", retention_value),
     ("debiased [95 %]", debiased_value),
     ("gap %", lambda row: percent(row.gap)),
@@ -66,11 +67,11 @@ def markdown(
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
         columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–")]
-        columns += headed_for(CONTROL_COLUMNS, rows)
+        columns += CONTROL_COLUMNS
         parts.append(_rows_table("Controls", probed(rows), columns))
     for heading, of_pair in groupby(differences, key=difference_title):
-        cells = [[cell(row) for _, cell in DIFFERENCE_COLUMNS] for row in of_pair]
-        parts.append(_markdown_table(heading, [name for name, _ in DIFFERENCE_COLUMNS], cells))
+        cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
+        parts.append(_markdown_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 

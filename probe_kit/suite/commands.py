@@ -56,6 +56,8 @@ def list_categories(
         print_json({"suite": suite.identity, "items": counts})
         return
     table = Table("category", "title", "domain", "items", "episodes", title=suite.identity)
+    for column in table.columns:
+        column.overflow = "fold"
     for slug, count in counts.items():
         category = CATEGORIES[slug]
         table.add_row(slug, category.title, category.domain, str(count), str(2 * count))

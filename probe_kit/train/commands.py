@@ -9,8 +9,10 @@ from rich.text import Text
 
 from probe_kit.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import UsageError
+from probe_kit.fitting_tables import Cell, FittingTable, Part
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.table import Table
 
     from probe_kit.train import Baseline, ProbeResults, Target
@@ -166,16 +168,23 @@ def _target(name: str) -> "Target":
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
-    from rich import box
-    from rich.table import Table
-
     mark = ", RANDOM WEIGHTS" if random_weights else ""
     peaks = results.scores.sort_values("accuracy", ascending=False, kind="stable")
     for view, of_view in peaks.groupby("view", sort=False):
-        columns = ("category", "best site", "accuracy % [95 %]", "family-wise p", "n")
-        table = Table(*columns, title=f"best site per stream, view {view}{mark}", box=box.SIMPLE_HEAD)
-        for _, rows in of_view.groupby(["category", "stream"]):
-            best = rows.iloc[0]
-            accuracy = f"{100 * best['accuracy']:.1f} [{100 * best['ci_low']:.1f}, {100 * best['ci_high']:.1f}]"
-            table.add_row(best["category"], best["site"], accuracy, f"{best['p_fwe']:.3f}", str(best["n"]))
+        best = [rows.iloc[0] for _, rows in of_view.groupby(["category", "stream"])]
+        headings = ("best site", "accuracy % [95 %]", "family-wise p", "n")
+        table = FittingTable(
+            title=f"Best site per stream, view {view}{mark}",
+            caption="",
+            name="category",
+            names=tuple(str(row["category"]) for row in best),
+            styles=("",) * len(best),
+            parts=(Part("Best sites", headings, tuple(_peak_cells(row) for row in best)),),
+        )
         out.print(table)
+
+
+def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
+    accuracy, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
+    p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
+    return tuple(map(Cell, (str(row["site"]), f"{accuracy} [{low}, {high}]", p, str(row["n"]))))

@@ -98,7 +98,7 @@ def bootstrap_means(
     times = draw_groups(names.size, seed, draws)
     means: Matrix = (times @ sums) / (times @ sizes)[:, None]
     for column in np.flatnonzero(constant(means)):
-        means[:, column] = unseen(float(means[0, column]), names.size, draws, bounds)
+        means[:, column] = unseen(float(means[0, column]), names.size, seed, draws, bounds)
     return means
 
 
@@ -108,7 +108,7 @@ def constant(draws: Matrix) -> NDArray[np.bool_]:
     return agree
 
 
-def unseen(value: float, count: int, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
+def unseen(value: float, count: int, seed: int, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
     """(draws,) means that `count` groups are consistent with that all have `value`.
 
     The share t of groups that are otherwise is Beta(1, count) given that none was seen: its 97.5 % point is that
@@ -119,7 +119,7 @@ def unseen(value: float, count: int, draws: int = DRAWS, bounds: Bounds = SHARES
     ends = [end for end in (low, high) if abs(end - value) > 1e-9]
     end = np.resize(ends, draws)
     means: Matrix = value + share * (end - value)
-    return np.random.default_rng(count).permutation(means)
+    return np.random.default_rng(derive_seed("unseen", seed)).permutation(means)
 
 
 def units_seed(names: ArrayLike, suite: str) -> int:

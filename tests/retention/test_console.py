@@ -1,27 +1,165 @@
-import io
-from collections.abc import Callable
+"""What a terminal shows, read back number by number."""
 
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention
-from probe_kit.train import ArrayRun
+from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results, save_results
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
 NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
+PERFECT = ([1.0, 1.0, 1.0], [[1.0, 1.0]])
+WIDTHS = (24, 40, 60, 80, 100, 120, 160, 240)
+"""Columns; 120 in a pipe."""
 
 
-def printed(table: RetentionTable) -> str:
-    console = Console(width=80, file=io.StringIO())
+def printed(table: RetentionTable, width: int = 80) -> str:
+    console = Console(width=width, file=io.StringIO())
     console.print(table.to_rich())
     return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
-def test_eighty_columns_suffice(probed_run: ProbedRun) -> None:
-    text = printed(retention([probed_run({"facial_emotion": SIGNAL, "color": NONE})]))
+@pytest.fixture
+def table(probed_run: ProbedRun) -> RetentionTable:
+    """Wide numbers: long names, 100 %, negative limits, controls, a twin, two groups."""
+    accuracies = {"facial_emotion": SIGNAL, "traffic_sign": PERFECT, "counting": NONE}
+    runs = [probed_run(accuracies, name) for name in ("one", "other")]
+    for run in runs:
+        results = load_results(run)
+        controls = Controls(
+            tuple(
+                BaselineScore(name, category, 0.4625, (0.4, 0.5), 0.4, 0.5, 200)
+                for name in ("position", "instruction", "pixels")
+                for category in accuracies
+            ),
+            tuple(
+                TwinScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "a twin")
+                for site in ("backbone.01.residual", "expert.01.residual@0")
+                for category in accuracies
+            ),
+        )
+        save_results(replace(results, controls=controls), run.path)
+    return retention({"first": [runs[0]], "second": [runs[1]]})
+
+
+def numbers(text: str) -> list[float]:
+    return [float(found) for found in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text.replace("−", "-"))]
+
+
+def blocks(text: str) -> Iterator[tuple[str, dict[str, list[float]]]]:
+    """Title and, by category, all numbers of the block's rows in order, from however many tables it has."""
+    for block in re.split(
+        r"\n(?=(?:Success rate|Retention|Controls|Difference): )|\n(?=(?:Retention|Controls),)", text
+    ):
+        found: dict[str, list[float]] = {}
+        for line in block.splitlines():
+            name, *cells = re.split(r" {2,}", line.strip())
+            if name in ("facial_emotion", "traffic_sign", "counting", "mean") and cells:
+                found.setdefault(name, []).extend(number for cell in cells for number in numbers(cell))
+        yield block.splitlines()[0], found
+
+
+def rounded(values: list[object], scales: list[tuple[float, int]]) -> list[float]:
+    """What a table shows of json values: None and undefined ones are left out, intervals are flat."""
+    shown = []
+    for value, (scale, digits) in zip(values, scales, strict=True):
+        parts = value if isinstance(value, list) else [value]
+        shown += [round(scale * one, digits) for one in parts if one is not None]
+    return shown
+
+
+SHARE, RATIO, WHOLE, PLACE, P = (100, 1), (1, 2), (100, 0), (1, 0), (1, 3)
+
+
+def expected(row: dict[str, object]) -> dict[str, list[float]]:
+    defined = bool(row["retention_defined"])
+    score = row["normalised_score"]
+    return {
+        "Success": rounded(
+            [
+                row["sr"],
+                row["sr_ci"],
+                row["delta"],
+                score,
+                row["sr_left"],
+                row["sr_right"],
+                row["p_wrong"],
+                row["p_oob"],
+            ],
+            [SHARE, SHARE, SHARE, (1, 1), WHOLE, WHOLE, SHARE, SHARE],
+        ),
+        "Retention": rounded(
+            [
+                *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer", "p_fwe")),
+                *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration", "p_fwe")),
+                *(row[name] if defined else None for name in ("retention", "retention_debiased", "retention_ci")),
+                row["gap"],
+            ],
+            [SHARE, SHARE, PLACE, P, SHARE, SHARE, PLACE, PLACE, P, RATIO, RATIO, RATIO, SHARE],
+        ),
+        "Controls": rounded(
+            [
+                *(row["baselines"][name] for name in ("position", "instruction", "pixels")),  # type: ignore[index]
+                *(row[f"{stream}_selectivity"] for stream in ("prefix", "action")),
+                *(row[f"{stream}_{name}"] for stream in ("prefix", "action") for name in ("twin", "twin_ci")),
+            ],
+            [SHARE] * 9,
+        ),
+    }
+
+
+@pytest.mark.parametrize("width", [width for width in WIDTHS if width >= 60])
+def test_every_number_can_be_read_back_at_every_width(table: RetentionTable, width: int) -> None:
+    text = printed(table, width)
+    rows = json.loads(table.to_json())["rows"]
+    found = [block for block in blocks(text) if block[1]]
+    assert len(found) == 2 * 3 + 1
+    for run, offset in ((0, 0), (1, 3)):
+        for title, block in found[offset : offset + 3]:
+            for row in rows[4 * run : 4 * run + 4]:
+                wanted = next(values for name, values in expected(row).items() if title.startswith(name))
+                assert block[row["category"]] == pytest.approx(wanted, abs=1e-9), (title, row["category"])
+    (difference,) = [row for row in table.differences if row.category == "mean"]
+    assert found[-1][1]["mean"][:3] == pytest.approx([0.0, *(round(100 * x, 1) for x in difference.sr_ci)])
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_width_crops_anything_or_runs_over(table: RetentionTable, width: int) -> None:
+    text = printed(table, width)
     assert "…" not in text
-    for cell in ("60.0 [", "knowledge", "90.0 @0.50", "70.0 @1.00/0", "0.49 [", "n/a"):
-        assert cell in text
+    assert max(map(len, text.splitlines())) <= width
+    row = table.rows[1]
+    low, high = (f"{100 * limit:.1f}" for limit in row.prefix_ci)  # type: ignore[union-attr,operator]
+    assert f"100.0 [{low}, {high}]" in text
+
+
+def test_a_wide_terminal_has_one_table_per_subject(table: RetentionTable) -> None:
+    headings = [line for line in printed(table, 240).splitlines() if line.startswith("category ")]
+    assert len(headings) == 2 * 3 + 1
+
+
+def test_text_says_backbone_and_action_and_latex_the_papers_columns(table: RetentionTable) -> None:
+    from probe_kit.retention.report.tables import control_table, difference_tables, retention_table
+
+    headings = [column.name for column in retention_table(table.all_rows).columns]  # type: ignore[union-attr]
+    headings += [column.name for column in control_table(table.all_rows).columns]  # type: ignore[union-attr]
+    headings += [column.name for one in difference_tables(table.differences) for column in one.columns]
+    lines = [
+        line for line in table.to_markdown().splitlines() if line.startswith("| model") or "| category" in line
+    ]
+    lines += [line for line in printed(table, 240).splitlines() if line.startswith("category")]
+    for text in (*headings, *lines):
+        assert not re.search("prefix|expert", text), text
+    assert sum("backbone" in text for text in (*headings, *lines)) >= 10
+    assert sum("action" in text for text in (*headings, *lines)) >= 10
+    assert "& Prefix & Layer & Action & Layer & Retention &" in table.to_latex()
 
 
 def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:
@@ -41,10 +179,11 @@ def test_every_run_has_its_own_block(probed_run: ProbedRun) -> None:
     assert text.index("Retention, view mean: pi0 ") < text.index("Success rate: smolvla ")
 
 
-def test_a_policy_without_an_expert_says_action_beside_one_that_has_one(probed_run: ProbedRun) -> None:
+def test_a_policy_without_an_expert_has_the_same_columns(probed_run: ProbedRun) -> None:
     runs = [probed_run({"color": SIGNAL}, "openvla", action_stream="action"), probed_run({"color": SIGNAL}, "pi0")]
     table = retention(runs)
     assert [row.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
     assert [row.retention for row in table.rows] == [table.rows[0].retention] * 2 != [None, None]
-    headings = [line.split() for line in printed(table).splitlines() if "backbone" in line]
-    assert [words[3] for words in headings] == ["action", "expert"]
+    headings = [line for line in printed(table, 160).splitlines() if "backbone %" in line]
+    assert len(headings) == 2
+    assert len({heading.split("action %")[0] for heading in headings}) == 1

@@ -45,21 +45,22 @@ GLOSSARY = MappingProxyType(
             "picture, in episodes and questions it was not fitted on."
         ),
         "backbone": "Best held-out accuracy of a probe in the vision-language backbone, over its layers.",
-        "expert": (
-            "Best held-out accuracy of a probe in the part that makes actions, over layers and iterations."
+        "action": (
+            "Best held-out accuracy of a probe where the action is made (the action expert, or the positions that "
+            "choose action tokens), over layers and iterations."
         ),
         "chance": "Accuracy of always naming the more frequent side.",
-        "depth": (
-            "Layer as a fraction: 0 enters the first block, 1 leaves the last. After @: the iteration, a flow- "
-            "matching step or an action token."
+        "layer": (
+            "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first "
+            "of several that are equally good. After @: the iteration, a flow-matching step or an action token."
         ),
         "p": (
             "Probability that the best layer of a stream looks this good when the answers are relabelled at "
             "random. It allows for having looked at all layers (family-wise)."
         ),
         "retention": (
-            "(expert − chance) / (backbone − chance): the share of what can be read in the backbone that can "
-            "still be read in the expert. Biased upwards when signals are weak, because both are maxima."
+            "(action − chance) / (backbone − chance): the share of what can be read in the backbone that can "
+            "still be read where the action is made. Biased upwards when signals are weak: both are maxima."
         ),
         "debiased": (
             "The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
@@ -68,7 +69,7 @@ GLOSSARY = MappingProxyType(
         "gap": "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
         "groups": "Independent groups of questions; questions that share a picture count once.",
         "n/a": "The backbone itself is not above chance, so there is nothing that could be retained.",
-        "selectivity": "Accuracy above that of the same probe on random labels, for backbone / expert.",
+        "selectivity": "Accuracy above that of the same probe on random labels.",
         "position, instruction, pixels": (
             "The same probe on the layout, the words, or the two pictures alone. Red: the suite gives the "
             "answer away without a model."

@@ -13,8 +13,8 @@ from probe_kit.retention.cells import (
     model_name,
     number,
     once_per_category,
-    peak,
     percent,
+    place,
     probed,
     success_interval,
     with_limits,
@@ -165,15 +165,15 @@ _RETENTION = [
         "backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent),
         lambda row: row.prefix_accuracy, "backbone", strong=lambda row: _is_low(row.prefix_p_fwe),
     ),
-    _Column("depth", lambda row: peak(row.prefix_depth), lambda row: row.prefix_depth, "depth"),
+    _Column("layer", lambda row: place(row.prefix_layer), lambda row: row.prefix_layer, "layer"),
     _Column("p", lambda row: _p(row.prefix_p_fwe), lambda row: row.prefix_p_fwe, "p"),
     _Column(
-        "expert % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent),
-        lambda row: row.action_accuracy, "expert", strong=lambda row: _is_low(row.action_p_fwe),
+        "action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent),
+        lambda row: row.action_accuracy, "action", strong=lambda row: _is_low(row.action_p_fwe),
     ),
     _Column(
-        "depth @step", lambda row: peak(row.action_depth, row.action_iteration), lambda row: row.action_depth,
-        "depth",
+        "layer @iteration", lambda row: place(row.action_layer, row.action_iteration),
+        lambda row: row.action_layer, "layer",
     ),
     _Column("p", lambda row: _p(row.action_p_fwe), lambda row: row.action_p_fwe, "p"),
     _Column(
@@ -193,7 +193,8 @@ _RETENTION = [
 
 _CONTROL_MEANINGS = {
     **dict.fromkeys(("position", "instruction", "pixels"), "position, instruction, pixels"),
-    "selectivity": "selectivity", "backbone − twin": "twin", "expert − twin": "twin",
+    "selectivity: backbone": "selectivity", "action": "selectivity", "backbone − twin": "twin",
+    "action − twin": "twin",
 }  # fmt: skip
 
 
@@ -228,14 +229,20 @@ def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
 
 def difference_tables(differences: Sequence[Difference]) -> list[HtmlTable]:
     """One table per pair of groups."""
-    columns = tuple(HtmlColumn(name, "", name not in ("category", "view")) for name, _ in DIFFERENCE_COLUMNS)
+    columns = (
+        HtmlColumn("category", "", numeric=False),
+        *(HtmlColumn(name, "", name != "view") for name, _ in DIFFERENCE_COLUMNS),
+    )
     titles = dict.fromkeys(difference_title(row) for row in differences)
     return [
         HtmlTable(
             title,
             columns,
             tuple(
-                tuple(HtmlCell(cell(row), cell(row)) for _, cell in DIFFERENCE_COLUMNS)
+                (
+                    HtmlCell(spell(row.category), row.category),
+                    *(HtmlCell(cell(row), cell(row)) for _, cell in DIFFERENCE_COLUMNS),
+                )
                 for row in differences
                 if difference_title(row) == title
             ),

@@ -1,0 +1,130 @@
+"""Tables on a console that never lose a digit: what does not fit side by side comes one below the other."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.table import Table
+
+GAP = 2
+"""Blanks between columns."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Text in a style of rich, such as `bold red`; a text of several lines keeps them."""
+
+    text: str
+    style: str = ""
+
+    @property
+    def width(self) -> int:
+        """Of its widest line."""
+        from rich.cells import cell_len
+
+        return max(map(cell_len, self.text.split("\n")), default=0)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Columns that answer one question and stay together where they can.
+
+    title: of their table where they get one of their own. headings: one per column; rows: one cell per column.
+    """
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def only(self, columns: Sequence[int]) -> "Part":
+        """The same with some of the columns."""
+        return Part(
+            self.title,
+            tuple(self.headings[column] for column in columns),
+            tuple(tuple(row[column] for column in columns) for row in self.rows),
+        )
+
+    @property
+    def width(self) -> int:
+        """Of all columns with the gaps before them."""
+        return sum(
+            GAP + max(Cell(heading).width, *(row[column].width for row in self.rows), 0)
+            for column, heading in enumerate(self.headings)
+        )
+
+
+@dataclass(frozen=True)
+class FittingTable:
+    """A table that is as wide as the console allows: one, or several that each repeat the names of the rows.
+
+    names: of the rows, under the heading `name`; styles: one per row. caption: under the last table.
+    """
+
+    title: str
+    caption: str
+    name: str
+    names: tuple[str, ...]
+    styles: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+    def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
+        from rich.text import Text
+
+        yield Text(self.title, style="italic")
+        yield from self._tables(options.max_width)
+        yield Text(self.caption, style="dim")
+        yield Text()
+
+    def _tables(self, width: int) -> "Iterator[Table | RenderableType]":
+        from rich.text import Text
+
+        room = width - max(Cell(name).width for name in (self.name, *self.names))
+        if any(part.only([column]).width > room for part in self.parts for column in range(len(part.headings))):
+            yield from self._lists()
+            return
+        shown = [one for part in self.parts for one in _split(part, room)]
+        while shown:
+            count = max(n for n in range(1, len(shown) + 1) if n == 1 or sum(p.width for p in shown[:n]) <= room)
+            if count < len(shown) or len(shown) < len(self.parts):
+                yield Text(f"\n{' · '.join(dict.fromkeys(part.title for part in shown[:count]))}")
+            yield self._table(shown[:count])
+            shown = shown[count:]
+
+    def _table(self, parts: Sequence[Part]) -> "Table":
+        from rich.box import SIMPLE_HEAD
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+        table.add_column(self.name, no_wrap=True, vertical="bottom")
+        for part in parts:
+            for heading in part.headings:
+                table.add_column(heading, no_wrap=True)
+        for number, (name, style) in enumerate(zip(self.names, self.styles, strict=True)):
+            cells = (cell for part in parts for cell in part.rows[number])
+            table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
+        return table
+
+    def _lists(self) -> "Iterator[RenderableType]":
+        """A line per value, for consoles on which not even one column fits beside the names."""
+        from rich.text import Text
+
+        for number, (name, style) in enumerate(zip(self.names, self.styles, strict=True)):
+            yield Text(f"{self.name} {name}", style=style or "underline")
+            for part in self.parts:
+                for heading, cell in zip(part.headings, part.rows[number], strict=True):
+                    yield Text(" ".join(f"{heading}:".split()), style="dim")
+                    yield Text(f"  {cell.text}", style=cell.style, overflow="fold")
+
+
+def _split(part: Part, room: int) -> Iterator[Part]:
+    """The columns of a part in as few pieces as fit into `room`."""
+    columns: list[int] = []
+    for column in range(len(part.headings)):
+        if columns and part.only([*columns, column]).width > room:
+            yield part.only(columns)
+            columns = []
+        columns.append(column)
+    yield part.only(columns)
