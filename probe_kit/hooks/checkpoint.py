@@ -1,7 +1,7 @@
 """Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError
@@ -9,12 +9,13 @@ from probe_kit.errors import CheckpointError
 # What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
 _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
 _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
-_PATTERNS = ["*.json", "*.safetensors", "*.model", "*.txt", "*.jinja"]
+PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 
 
-def checkpoint_folder(checkpoint: str) -> Path:
+def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The local folder of a folder path or hub id such as `lerobot/pi0_base`.
 
+    patterns: which files of a hub repository are needed.
     Raises CheckpointError if the folder is not there or the hub cannot deliver it.
     """
     folder = Path(checkpoint).expanduser()
@@ -26,7 +27,7 @@ def checkpoint_folder(checkpoint: str) -> Path:
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
     try:
-        return Path(snapshot_download(checkpoint, allow_patterns=_PATTERNS))
+        return Path(snapshot_download(checkpoint, allow_patterns=list(patterns)))
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
         reason = str(error).strip().splitlines()[0]
         raise CheckpointError(

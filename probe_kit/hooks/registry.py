@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.model import Model, Policy
 
 ENTRY_POINTS = "probe_kit.policies"
-FOLDERS = ("pi0", "smolvla", "openvla", "spatialvla", "prismatic", "magma", "xiaomi")
+FOLDERS = ("pi0", "smolvla", "openvla", "spatialvla", "prismatic", "magma", "xiaomi", "internvla")
 """In the order in which `probe-kit models` lists them."""
 
 

@@ -65,7 +65,7 @@ def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
     elif index.is_file():
         shards = _shards(index)
     elif len(pickles) == 1:
-        return Weights(_read_pickle(pickles[0]), str(folder), random=False)
+        return read_pickle(pickles[0])
     else:
         raise WeightsError(
             f"no weights in {folder}: neither {SINGLE_FILE} nor {INDEX_FILE} nor one .pt file is there"
@@ -100,7 +100,8 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path} cannot be read ({error}); download the checkpoint again") from error
 
 
-def _read_pickle(path: Path) -> dict[str, Tensor]:
+def read_pickle(path: Path) -> Weights:
+    """Read one `.pt` file with `weights_only=True`: it cannot run code. Raises WeightsError if it is none."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError) as error:
@@ -111,7 +112,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         raise WeightsError(
             f"{path} holds {type(content).__name__} of something else than tensors; expected a state dict"
         )
-    return content
+    return Weights(content, str(path), random=False)
 
 
 def load_weights(

@@ -38,7 +38,8 @@ class QueryTransformer(nn.Module):
 
     def forward(self, states: list[Tensor]) -> Tensor:
         """(B, Q, D) from one (B, S, width of the vision-language model) per layer."""
-        queries = self.query_tokens.expand(len(states[0]), -1, -1)
+        # A copy: what an edit writes into the stream must not land in the parameter.
+        queries = self.query_tokens.expand(len(states[0]), -1, -1).clone()
         for layer, state in zip(self.layers, states, strict=True):
             queries = layer(queries, self.proj(state))
         return queries

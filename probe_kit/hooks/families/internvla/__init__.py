@@ -1,0 +1,25 @@
+"""InternVLA-M1, native."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "internvla-m1",
+        "InternVLA-M1 (Qwen2.5-VL 3B, DINOv2, querying transformer, guided diffusion head), native",
+        "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge",
+        "probe_kit.hooks.families.internvla.adapter:load_internvla",
+        streams="backbone 37 layers, bridge 2 layers, expert 13 layers x 10 iterations, with and without condition",
+        embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
+        notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
+        verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
+        full_size="probe_kit.models.internvla:full_size_internvla",
+        options=(
+            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_dataset"),
+            Option("steps", int, "DDIM steps; as many as divide the training's evenly.", "10"),
+            Option("guidance", float, "Scale of guidance; 1 or less runs the condition alone.", "1.5"),
+            Option("vlm", str, "Folder or hub id of the Qwen2.5-VL it was made of; no weights.", "as config.yaml says"),
+            Option("tokenizer", str, "Folder of another tokenizer.json.", "the vision-language model's"),
+        ),
+    ),
+)

@@ -1,0 +1,268 @@
+"""The adapter for InternVLA-M1.
+
+Backbone: the chat with one picture. Bridge: queries that read the backbone's last states and DINOv2's features.
+Expert: what the queries found, then the noisy actions, at every DDIM step. Under guidance the head runs every row
+twice; `expert` is the half that has the condition, `expert_unconditional` the one that has none, which only serves
+to be subtracted.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.card import Card
+from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
+from probe_kit.hooks.families.internvla.units import ActionUnits
+from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
+from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
+from probe_kit.hooks.model import Rows, Tap
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.sites import Site, Stream
+from probe_kit.models.internvla import (
+    InternVLANetwork,
+    Schedule,
+    build_internvla,
+    dino_pixels,
+    guided,
+    look,
+    prompt,
+)
+from probe_kit.models.qwen import QwenInputs
+
+DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
+STEPS, GUIDANCE = 10, 1.5
+"""As the released evaluation runs it."""
+_TIED = ("qwen_vl_interface.model.lm_head.weight",)
+_BLOCK = ("residual", "attention", "mlp")
+_GRIPPER_OPEN = 0.5
+_UNCONDITIONAL = "expert_unconditional"
+
+
+class InternVLA(QwenVLA):
+    """A loaded InternVLA-M1. One observation per call: the queries read padding, so a batch changes its actions."""
+
+    fast_pictures: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        filled: Filled[InternVLANetwork],
+        parts: Parts,
+        checkpoint: str,
+        device: str,
+        unnorm_key: str | None,
+        steps: int,
+        guidance: float,
+        tokenizer: str | None,
+    ) -> None:
+        super().__init__(filled.network.vlm, parts.vlm, tokenizer, device)
+        self.network, self.parts, self.config = filled.network, parts, parts.config
+        self.guidance, self._unnorm_key = guidance, unnorm_key
+        self.schedule = Schedule.of(steps, self.config.head.steps, self.config.head.schedule)
+        self.streams = self._streams()
+        dino = self.config.dino
+        self.further_streams = {
+            "vision": self.vision_stream(),
+            "vision_dino": Stream(
+                "vision_dino", dino.blocks + 1, dino.width, part="vision", quantities=("residual",)
+            ),
+        }
+        expert = ("condition", "action")
+        self.role_names = {"backbone": BACKBONE_ROLES, "bridge": ("query",), "expert": expert}
+        if guided(guidance):
+            self.role_names[_UNCONDITIONAL] = expert
+        self.card = self._card(filled, checkpoint, tokenizer)
+
+    def _streams(self) -> dict[str, Stream]:
+        query, head, steps = self.config.query, self.config.head, len(self.schedule)
+        streams = [
+            self.backbone_stream(),
+            Stream("bridge", query.last - query.first + 1, query.width, part="bridge", quantities=_BLOCK),
+            Stream("expert", head.blocks + 1, head.width, steps, part="action"),
+        ]
+        if guided(self.guidance):
+            label = "action expert without condition"
+            streams.append(
+                Stream(
+                    _UNCONDITIONAL, head.blocks + 1, head.width, steps, part="action", label=label, probed=False
+                )
+            )
+        return {stream.name: stream for stream in streams}
+
+    def _card(self, filled: Filled[InternVLANetwork], checkpoint: str, tokenizer: str | None) -> Card:
+        units = self._units_or_reason()
+        named = isinstance(units, ActionUnits)
+        files = side_files(self.parts.place) | side_files(self.parts.vlm, "vlm/")
+        if tokenizer is not None:
+            files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
+        return Card(
+            family="internvla-m1",
+            checkpoint=checkpoint,
+            weights_sha256=filled.audit.sha256,
+            random_weights=filled.audit.random,
+            parameters=filled.audit.parameters,
+            dtype=filled.dtype,
+            device=self.device,
+            embodiment="7-DoF end-effector delta, one third-person camera",
+            cameras=(CAMERA,),
+            chunk=self.config.head.length,
+            execute=1,
+            notes=(f"units of {units.key}" if isinstance(units, ActionUnits) else f"cannot act: {units}",),
+            audit=filled.audit.to_json(),
+            settings={
+                **content_hashes(files),
+                "unnorm_key": units.key if isinstance(units, ActionUnits) else "none",
+                "action_statistics": units.sha256 if named and isinstance(units, ActionUnits) else "none",
+                "steps": str(len(self.schedule)),
+                "guidance": str(self.guidance),
+            },
+            weights_seed=filled.weights_seed,
+            batch=1,
+        )
+
+    def _units_or_reason(self) -> ActionUnits | str:
+        """The statistics, or why there are none: a checkpoint without them can be listened to, and cannot act."""
+        try:
+            return self.units
+        except CheckpointError as error:
+            return str(error)
+
+    @cached_property
+    def units(self) -> ActionUnits:
+        """What gives actions their units. Raises CheckpointError, UsageError."""
+        return ActionUnits.choose(self.parts.statistics(), self._unnorm_key)
+
+    def text(self, instruction: str) -> str:
+        """Qwen's chat around the prompt the run was trained with."""
+        return prompt(instruction, self.config.cot)
+
+    def look(self, seen: Observation) -> NDArray[np.uint8]:
+        """The whole picture, squeezed to a square."""
+        return look(seen.image, self.config.picture)
+
+    def views(self, seen: Sequence[Observation]) -> Tensor:
+        """(B, 3, H, W) float32 for DINOv2."""
+        rows = [dino_pixels(self.look(observation), self.config.dino.side) for observation in seen]
+        return torch.stack(rows).to(self.device)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation; see the contract."""
+        self.check(seen, seeds)
+        head = self.config.head
+        if len(self.units.low) != head.action_dim or head.action_dim != 7:
+            raise CheckpointError(
+                f"{self.units.key} has actions of {len(self.units.low)} dimensions and the head {head.action_dim}; "
+                "Act2Answer needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
+            )
+        noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)
+        chunk = self.infer(self.inputs(seen), self.views(seen), noise)
+        actions = self.units.restore(chunk.cpu().numpy())
+        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
+        return actions.astype(np.float32)
+
+    def infer(self, inputs: QwenInputs, views: Tensor, noise: Tensor) -> Tensor:
+        """(B, A, action numbers) normalised actions; one inference, as `capture` counts it."""
+        self._grid = inputs.grid
+        with torch.inference_mode():
+            condition = self.network.read(inputs, views)
+            return self.network.denoise(condition, noise, self.schedule, self.guidance)
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """The chat; the queries; conditions and actions."""
+        queries, length = self.config.query.queries, self.config.head.length
+        expert = [Roles.from_labels([*["condition"] * queries, *["action"] * length])] * len(seen)
+        roles = {"backbone": self.backbone_roles(seen), "expert": expert}
+        roles["bridge"] = [Roles.from_labels(["query"] * queries)] * len(seen)
+        if _UNCONDITIONAL in self.streams:
+            roles[_UNCONDITIONAL] = expert
+        return {name: roles[name] for name in self.streams}
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the last norm, or what a block adds."""
+        stream = self.stream_of(site).name
+        if stream == "backbone":
+            return self.backbone_tap(site)
+        if stream == "vision":
+            return self.vision_tap(site)
+        if stream == "vision_dino":
+            body = self.network.dino_encoder.body
+            block: Any = body.norm if site.layer == len(body.blocks) else body.blocks[site.layer]
+            return Tap(block if site.layer == len(body.blocks) else block.norm1, 1)
+        return self._bridge_tap(site) if stream == "bridge" else self._expert_tap(site)
+
+    def _bridge_tap(self, site: Site) -> Tap:
+        layers = self.network.layer_qformer.layers
+        if site.layer == len(layers):
+            return Tap(layers[-1], 1, "output")
+        layer: Any = layers[site.layer]
+        if site.quantity == "residual":
+            return Tap(layer.norm1, 1)
+        return Tap(layer.cross_attn if site.quantity == "attention" else layer.mlp, 1, "output")
+
+    def _expert_tap(self, site: Site) -> Tap:
+        head, steps = self.network.head, len(self.schedule)
+        blocks = 2 if guided(self.guidance) else 1
+        rows = Rows(1 if site.stream == _UNCONDITIONAL else 0, blocks)
+        if site.quantity == "final_norm":
+            return Tap(head.final_layer.norm_final, steps, "output", rows=rows)
+        if site.layer == len(head.blocks):
+            return Tap(head.final_layer.norm_final, steps, rows=rows)
+        block: Any = head.blocks[site.layer]
+        if site.quantity == "residual":
+            return Tap(block.norm1, steps, rows=rows)
+        return Tap(block.attn if site.quantity == "attention" else block.mlp, steps, "output", rows=rows)
+
+    @property
+    def merger_entry(self) -> nn.Module:
+        """The merger's norm."""
+        norm: nn.Module = self.tower.merger.ln_q
+        return norm
+
+
+def load_internvla(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    unnorm_key: str | None = None,
+    steps: int = STEPS,
+    guidance: float = GUIDANCE,
+    vlm: str | None = None,
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> InternVLA:
+    """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
+
+    unnorm_key: data set whose units the actions get; default the WidowX arm's or the only one. steps: of DDIM.
+    guidance: its scale; 1 or less runs the condition alone. vlm: folder or hub id of Qwen2.5-VL's configuration,
+    tokenizer and processor. tokenizer: folder of another one.
+    Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
+    """
+    name = checkpoint or DEFAULT_CHECKPOINT
+    parts = find_parts(name, vlm)
+    if not np.isfinite(guidance) or guidance < 0:
+        raise UsageError(f"guidance is {guidance}; expected a scale such as 1.5")
+
+    def build(kind: torch.dtype, place: str) -> InternVLANetwork:
+        return build_internvla(parts.config, kind, place)
+
+    if random_weights:
+        filled = twin(build, name, dtype, weights_seed)
+    else:
+        tied = _TIED if parts.config.vlm.tie_word_embeddings else ()
+        filled = fill(build, parts.read, dtype, lambda _: tied)
+    filled.network.to(device)
+    return InternVLA(filled, parts, name, device, unnorm_key, steps, guidance, tokenizer)

@@ -1,0 +1,111 @@
+"""Finding the parts of an InternVLA-M1 checkpoint, which lie apart, and reading them without running anything.
+
+A release is a run's folder: `config.yaml`, `dataset_statistics.json`, and the weights as
+`checkpoints/steps_<n>_pytorch_model.pt`. Configuration and tokenizer of the vision-language model come from elsewhere.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoint import PATTERNS, checkpoint_folder
+from probe_kit.hooks.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
+from probe_kit.models.internvla import InternVLAConfig, find_config
+
+STATISTICS_FILE = "dataset_statistics.json"
+WEIGHTS_FOLDER = "checkpoints"
+_VLM_TYPE = "qwen2_5_vl"
+_VLM_PATTERNS = ("*.json", "*.txt", "*.jinja")
+_DEVELOPMENT = "qwen2_5_vl_config"
+"""Where development references keep the configuration of their small vision-language model."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Where everything lies.
+
+    place: of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the folder of the
+    vision-language model's configuration, tokenizer and processor.
+    """
+
+    config: InternVLAConfig
+    place: Path
+    weights: Path
+    vlm: Path
+
+    def read(self) -> Weights:
+        """The tensors. Raises WeightsError."""
+        return read_pickle(self.weights) if self.weights.is_file() else read_weights(self.weights)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Per data set, what un-normalises its actions; empty without the file."""
+        file = self.place / STATISTICS_FILE
+        return dict(json.loads(file.read_text())) if file.is_file() else {}
+
+
+def find_parts(checkpoint: str, vlm: str | None) -> Parts:
+    """The parts of a run's folder, its `checkpoints/`, one `.pt` file of it, a converted folder, or a hub id.
+
+    vlm: folder or hub id of the vision-language model's files; default what the run's configuration names.
+    Raises CheckpointError naming what is missing or ambiguous.
+    """
+    given = Path(checkpoint).expanduser()
+    if given.is_file():
+        folder, weights = given.parent, given
+    else:
+        folder = checkpoint_folder(checkpoint, (*PATTERNS, "*.pt", "*.yaml"))
+        weights = _weights(folder)
+    values, place = find_config(folder)
+    where, content = _vlm(values, place, vlm)
+    return Parts(InternVLAConfig.from_values(values, content, str(place)), place, weights, where)
+
+
+def _weights(folder: Path) -> Path:
+    """Safetensors beside the configuration, or the only .pt file there or in `checkpoints/`."""
+    for place in (folder, folder / WEIGHTS_FOLDER):
+        if (place / SINGLE_FILE).is_file() or (place / INDEX_FILE).is_file():
+            return place
+    found = sorted(folder.glob("*.pt")) or sorted((folder / WEIGHTS_FOLDER).glob("*.pt"))
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise CheckpointError(
+            f"no weights in {folder} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or steps_<n>_pytorch_model.pt"
+        )
+    names = ", ".join(file.name for file in found)
+    raise CheckpointError(f"{found[0].parent} holds several weights: {names}. Pass one of these files as --checkpoint")
+
+
+def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Path, Mapping[str, Any]]:
+    """Folder and configuration of the vision-language model."""
+    if chosen is None and _DEVELOPMENT in values:
+        return place, values[_DEVELOPMENT]
+    folder = place if chosen is None and _is_vlm(place) else _vlm_folder(values, place, chosen)
+    if not _is_vlm(folder):
+        raise CheckpointError(
+            f"{folder} has no config.json of a {_VLM_TYPE} model; InternVLA-M1 is made of Qwen2.5-VL. "
+            "Name that model's folder with -M vlm=DIR"
+        )
+    return folder, json.loads((folder / "config.json").read_text())
+
+
+def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> Path:
+    """`chosen`, or what config.yaml names: a folder, which may be relative to the run, or a model of the hub."""
+    base = chosen or str(((values.get("framework") or {}).get("qwenvl") or {}).get("base_vlm", ""))
+    if not base:
+        raise CheckpointError(f"{place} names no vision-language model; pass its folder with -M vlm=DIR")
+    for folder in (Path(base).expanduser(), place / base):
+        if folder.is_dir():
+            return folder
+    # The authors' own folders end in the name the model has on the hub.
+    name = Path(base).name
+    hub = base if base.count("/") == 1 and not base.startswith((".", "/")) else f"Qwen/{name}"
+    return checkpoint_folder(hub, _VLM_PATTERNS)
+
+
+def _is_vlm(folder: Path) -> bool:
+    file = folder / "config.json"
+    return file.is_file() and json.loads(file.read_text()).get("model_type") == _VLM_TYPE

@@ -1,0 +1,73 @@
+"""InternVLA-M1's actions: from the head's numbers to the units of a data set."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.identity import sha256_json
+
+DEFAULTS = ("bridge_dataset", "oxe_bridge")
+"""The data set of the WidowX arm that Act2Answer imitates, as releases call it."""
+_GRIPPER, _OPEN = 6, 0.5
+
+
+@dataclass(frozen=True)
+class ActionUnits:
+    """Per dimension the 1 % and 99 % quantiles of a data set.
+
+    mask: False for dimensions that stay as the head puts them out, such as a gripper that is 0 or 1.
+    """
+
+    key: str
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+
+    @classmethod
+    def choose(cls, statistics: Mapping[str, Any], key: str | None) -> "ActionUnits":
+        """Those of data set `key`; without one, of the WidowX arm's, or of the only data set there is.
+
+        Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
+        """
+        if not statistics:
+            raise CheckpointError(
+                "the checkpoint has no dataset_statistics.json: its actions have no physical unit. "
+                "Take the file that the run was released with"
+            )
+        known = [name for name in DEFAULTS if name in statistics]
+        only = next(iter(statistics)) if len(statistics) == 1 else DEFAULTS[0]
+        chosen = key or (known[0] if known else only)
+        if chosen not in statistics:
+            near = get_close_matches(chosen, statistics, n=1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            names = ", ".join(sorted(statistics))
+            raise UsageError(f"no action statistics of {chosen!r}; choose -M unnorm_key among {names}.{hint}")
+        return cls.of(chosen, statistics[chosen].get("action") or {})
+
+    @classmethod
+    def of(cls, key: str, action: Mapping[str, Any]) -> "ActionUnits":
+        """From q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
+        if missing := [name for name in ("q01", "q99") if name not in action]:
+            raise CheckpointError(f"the action statistics of {key} lack {' and '.join(missing)}")
+        low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
+        mask = np.asarray(action.get("mask", np.ones(low.shape, bool)), bool)
+        if not low.shape == high.shape == mask.shape or not np.isfinite([low, high]).all():
+            raise CheckpointError(f"the action statistics of {key} are not one finite number per dimension")
+        return cls(key, low, high, mask)
+
+    @property
+    def sha256(self) -> str:
+        """Of the numbers."""
+        return sha256_json([self.low.tolist(), self.high.tolist(), self.mask.tolist()])
+
+    def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(…, D) in the data set's units: clipped to [-1, 1], the gripper open or closed, then stretched."""
+        clipped = np.clip(actions.astype(np.float64), -1, 1)
+        if clipped.shape[-1] > _GRIPPER:
+            clipped[..., _GRIPPER] = clipped[..., _GRIPPER] >= _OPEN
+        return np.where(self.mask, 0.5 * (clipped + 1) * (self.high - self.low) + self.low, clipped)
