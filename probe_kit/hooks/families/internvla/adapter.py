@@ -48,7 +48,7 @@ _UNCONDITIONAL = "expert_unconditional"
 
 
 class InternVLA(QwenVLA):
-    """A loaded InternVLA-M1. One observation per call: the queries read padding, so a batch changes its actions."""
+    """A loaded InternVLA-M1. One observation per call: its queries read padding, which changes the actions."""
 
     fast_pictures: ClassVar[bool] = True
 
@@ -161,7 +161,7 @@ class InternVLA(QwenVLA):
         head = self.config.head
         if len(self.units.low) != head.action_dim or head.action_dim != 7:
             raise CheckpointError(
-                f"{self.units.key} has actions of {len(self.units.low)} dimensions and the head {head.action_dim}; "
+                f"{self.units.key} has actions of {len(self.units.low)} dimensions, the head {head.action_dim}; "
                 "Act2Answer needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
             )
         noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)

@@ -1,7 +1,7 @@
 """Finding the parts of an InternVLA-M1 checkpoint, which lie apart, and reading them without running anything.
 
 A release is a run's folder: `config.yaml`, `dataset_statistics.json`, and the weights as
-`checkpoints/steps_<n>_pytorch_model.pt`. Configuration and tokenizer of the vision-language model come from elsewhere.
+`checkpoints/steps_<n>_pytorch_model.pt`. Configuration and tokenizer of the vision-language model lie elsewhere.
 """
 
 import json
@@ -27,8 +27,8 @@ _DEVELOPMENT = "qwen2_5_vl_config"
 class Parts:
     """Where everything lies.
 
-    place: of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the folder of the
-    vision-language model's configuration, tokenizer and processor.
+    place: of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the folder of
+    the vision-language model's configuration, tokenizer and processor.
     """
 
     config: InternVLAConfig
@@ -73,10 +73,12 @@ def _weights(folder: Path) -> Path:
         return found[0]
     if not found:
         raise CheckpointError(
-            f"no weights in {folder} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or steps_<n>_pytorch_model.pt"
+            f"no weights in {folder} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or one .pt file"
         )
     names = ", ".join(file.name for file in found)
-    raise CheckpointError(f"{found[0].parent} holds several weights: {names}. Pass one of these files as --checkpoint")
+    raise CheckpointError(
+        f"{found[0].parent} holds several weights: {names}. Pass one of these files as --checkpoint"
+    )
 
 
 def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Path, Mapping[str, Any]]:

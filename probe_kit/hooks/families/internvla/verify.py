@@ -66,7 +66,9 @@ def verify_internvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     if "in_images_uint8" in recorded and "in_dino_pixels" in recorded:
         outputs["dino_pixels"] = recorded["in_dino_pixels"]
     streams = ("backbone_resid", "backbone_final_norm", "hf_hidden_states")
-    return compare(outputs, produced, TOLERANCE, dict.fromkeys(streams, recorded["in_attention_mask"].astype(bool)))
+    return compare(
+        outputs, produced, TOLERANCE, dict.fromkeys(streams, recorded["in_attention_mask"].astype(bool))
+    )
 
 
 def _inputs(policy: InternVLA, recorded: Arrays) -> QwenInputs:

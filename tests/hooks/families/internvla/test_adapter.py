@@ -1,0 +1,192 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks.capture_context import edit
+from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
+from probe_kit.hooks.sites import first_of
+from probe_kit.hooks.testing import AdapterContract
+from probe_kit.hooks.verify import verify_keys, verify_reference
+from tests.internvla_checkpoints import write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("internvla"))
+
+
+@pytest.fixture(scope="module")
+def loaded(run: Path) -> InternVLA:
+    return load_internvla(str(run), steps=5)
+
+
+class TestInternVLA(AdapterContract):
+    @pytest.fixture
+    def policy(self, loaded: InternVLA) -> InternVLA:
+        return loaded
+
+
+class TestInternVLAWithoutGuidance(AdapterContract):
+    @pytest.fixture
+    def policy(self, run: Path) -> InternVLA:
+        return load_internvla(str(run), steps=4, guidance=1.0)
+
+
+# -- the reference ---------------------------------------------------------------------------------------------
+
+
+def test_the_golden_reference_is_reproduced_in_every_output(golden_internvla: Path) -> None:
+    verification = verify_reference("internvla-m1", golden_internvla)
+    assert verification.passed
+    assert {c.status for c in verification.comparisons} == {"ok"}
+    assert len(verification.comparisons) == 20
+
+
+def test_one_wrong_number_in_the_reference_is_noticed(golden_internvla: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(golden_internvla, tmp_path / "golden"))
+    with np.load(copy / "reference.npz") as arrays:
+        recorded = {name: arrays[name] for name in arrays.files}
+    recorded["dit_resid"][2, 1, 3] += 0.01  # a row without condition
+    recorded["something_else"] = np.zeros(1)
+    np.savez(copy / "reference.npz", **recorded)
+    status = {c.output: c.status for c in verify_reference("internvla-m1", copy).comparisons}
+    assert [name for name, found in status.items() if found == "over"] == ["dit_resid"]
+    assert status["something_else"] == "not compared"
+
+
+def test_full_size_keys_are_equal(golden_internvla: Path) -> None:
+    assert verify_keys("internvla-m1", golden_internvla / "real_keys.json.gz").passed
+
+
+# -- what it listens to ------------------------------------------------------------------------------------------
+
+
+def test_every_stream_is_the_sum_of_what_its_blocks_add(loaded: InternVLA, observation: Observation) -> None:
+    kinds = ("residual", "attention", "mlp")
+    with capture(loaded, [site for kind in kinds for site in loaded.sites(kind)]) as tape:
+        loaded.act([observation], [0])
+    for stream in loaded.streams.values():
+        for site in stream.sites("mlp"):
+            parts = [tape[Site(stream.name, site.layer, kind, site.iteration)] for kind in kinds]
+            following = tape[Site(stream.name, site.layer + 1, "residual", site.iteration)]
+            torch.testing.assert_close(sum(parts), following, rtol=0, atol=1e-5)
+
+
+def test_guidances_halves_are_told_apart(loaded: InternVLA, observation: Observation) -> None:
+    """Both start from the same actions; what stands before them differs in the condition alone."""
+    first = [Site(name, 0, "residual", 0) for name in ("expert", "expert_unconditional")]
+    with capture(loaded, first) as tape:
+        loaded.act([observation], [0])
+    ours, without = (tape[site][0] for site in first)
+    roles = loaded.roles([observation])["expert"][0]
+    actions = torch.from_numpy(roles.mask("action"))
+    torch.testing.assert_close(ours[actions], without[actions], rtol=0, atol=0)
+    assert (ours[~actions] - without[~actions]).abs().max() > 1e-2
+    other = Observation(255 - observation.image, observation.state, "Take it away")
+    with capture(loaded, first) as changed:
+        loaded.act([other], [0])
+    assert torch.equal(changed[first[1]][0], without)
+    assert (changed[first[0]][0][~actions] - ours[~actions]).abs().max() > 1e-3
+
+
+def test_the_half_without_condition_is_no_default_of_anything(loaded: InternVLA) -> None:
+    assert not loaded.streams["expert_unconditional"].probed
+    assert first_of("action", loaded.streams.values()) == "expert"
+    assert first_of("bridge", loaded.streams.values()) == "bridge"
+
+
+def test_without_guidance_there_is_no_such_half(run: Path) -> None:
+    policy = load_internvla(str(run), guidance=1.0)
+    assert list(policy.streams) == ["backbone", "bridge", "expert"]
+
+
+def test_an_edit_of_the_queries_leaves_the_parameter_as_it_was(
+    loaded: InternVLA, observation: Observation
+) -> None:
+    before = loaded.network.layer_qformer.query_tokens.clone()
+    plain = loaded.act([observation], [0])
+    with edit(loaded, {Site("bridge", 0): torch.zeros_like}):
+        changed = loaded.act([observation], [0])
+    assert np.abs(changed - plain).max() > 0
+    assert torch.equal(loaded.network.layer_qformer.query_tokens, before)
+    np.testing.assert_array_equal(loaded.act([observation], [0]), plain)
+
+
+def test_an_edit_of_one_half_leaves_the_other_alone(loaded: InternVLA, observation: Observation) -> None:
+    site, other = Site("expert", 1, "residual", 0), Site("expert_unconditional", 1, "residual", 0)
+    with capture(loaded, [other]) as plain:
+        loaded.act([observation], [0])
+    with edit(loaded, {site: torch.zeros_like}), capture(loaded, [site, other]) as edited:
+        loaded.act([observation], [0])
+    assert (edited[site] == 0).all()
+    assert torch.equal(edited[other], plain[other])
+
+
+def test_roles_follow_the_picture_and_the_chat(loaded: InternVLA, observation: Observation) -> None:
+    roles = loaded.roles([observation])
+    assert roles["backbone"][0].mask("image.primary").sum() == 64
+    assert roles["backbone"][0].mask("special").sum() == 7
+    assert [span.role for span in roles["bridge"][0].spans] == ["query"]
+    assert [(span.role, span.stop - span.start) for span in roles["expert"][0].spans] == [
+        ("condition", 6), ("action", 4),
+    ]  # fmt: skip
+    vision = [Site("vision", 2), Site("vision_dino", 2)]
+    with capture(loaded, vision) as tape:
+        loaded.act([observation], [0])
+    assert tape[vision[0]].shape == (1, 256, 32)
+    assert tape[vision[1]].shape == (1, 17, 24)
+
+
+# -- acting ----------------------------------------------------------------------------------------------------
+
+
+def test_actions_are_in_the_units_of_the_data_set(loaded: InternVLA, observation: Observation) -> None:
+    actions = loaded.act([observation], [0])
+    assert actions.shape == (1, 4, 7)
+    assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}
+    assert ((actions[..., :6] >= -0.04 - 1e-6) & (actions[..., :6] <= 0.05 + 1e-6)).all()
+    assert (loaded.card.chunk, loaded.card.execute, loaded.card.batch) == (4, 1, 1)
+
+
+def test_two_at_a_time_are_refused(loaded: InternVLA, observation: Observation) -> None:
+    with pytest.raises(ObservationError, match="at most 1"):
+        loaded.act([observation, observation], [0, 1])
+
+
+def test_options_are_part_of_the_identity(run: Path, loaded: InternVLA) -> None:
+    other = load_policy("internvla-m1", str(run), unnorm_key="fractal20220817_data", steps="10", guidance="2")
+    changed = {name for name, value in loaded.card.settings.items() if other.card.settings[name] != value}
+    assert changed == {"unnorm_key", "action_statistics", "steps", "guidance"}
+    assert {name for name in loaded.card.settings if name.startswith("file ")} >= {
+        "file config.yaml", "file dataset_statistics.json", "file dims.json", "file vlm/config.json",
+        "file vlm/tokenizer.json", "file vlm/preprocessor_config.json",
+    }  # fmt: skip
+    with pytest.raises(UsageError, match="bridge_dataset, fractal20220817_data"):
+        load_internvla(str(run), unnorm_key="franka")
+    with pytest.raises(UsageError, match="60 DDIM steps"):
+        load_internvla(str(run), steps=60)
+
+
+def test_without_statistics_it_says_so_and_refuses_to_act(
+    run: Path, tmp_path: Path, observation: Observation
+) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    (copy / "dataset_statistics.json").unlink()
+    policy = load_internvla(str(copy))
+    assert "cannot act" in policy.card.notes[0]
+    with pytest.raises(CheckpointError, match=r"dataset_statistics\.json"):
+        policy.act([observation], [0])
+
+
+def test_statistics_of_other_arms_are_refused(run: Path, tmp_path: Path, observation: Observation) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    two = {"both_arms": {"action": {"q01": [0.0] * 14, "q99": [1.0] * 14}}}
+    (copy / "dataset_statistics.json").write_text(json.dumps(two))
+    with pytest.raises(CheckpointError, match="14 dimensions"):
+        load_internvla(str(copy)).act([observation], [0])
