@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Plan, make_plan, plan_episodes
 from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
+from probe_kit.extract.play.refusals import refuse_meaningless, refuse_unreachable
 from probe_kit.extract.play.rehearsal import rehearse
 from probe_kit.extract.settings import ExtractSettings, run_label
 from probe_kit.extract.store.location import Location
@@ -65,7 +65,7 @@ def load(settings: ExtractSettings, rehearsed: bool = False) -> Prepared:
     """
     if settings.model not in SCRIPTED:
         _find_family(settings.model)
-    _refuse_meaningless(settings)
+    refuse_meaningless(settings)
     suite = _suite(settings)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
@@ -80,32 +80,6 @@ def _find_family(name: str) -> None:
     from probe_kit.hooks.registry import find_family
 
     find_family(name, tuple(SCRIPTED))
-
-
-def _refuse_meaningless(settings: ExtractSettings) -> None:
-    """A scripted policy has no weights, no chunks and no activations, so nothing that is asked of them."""
-    if settings.weights_seed and not settings.random_weights:
-        raise UsageError(
-            f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
-            "Leave it out, or add --random-weights"
-        )
-    if settings.model not in SCRIPTED:
-        return
-    asked = {
-        "--checkpoint": settings.checkpoint is not None,
-        "--random-weights": settings.random_weights,
-        "--batch": settings.batch != 1,
-        "--execute": settings.execute is not None,
-        "--dtype": settings.dtype is not None,
-        "--tokens all": settings.tokens == "all",
-        "--captured-calls": settings.captured_calls != 1,
-        **{f"-M {name}": True for name in settings.options},
-    }
-    if meaningless := [option for option, given in asked.items() if given]:
-        raise UsageError(
-            f"{settings.model} is scripted: it has no network, so {', '.join(meaningless)} means nothing. Leave "
-            "it out, or choose a model with weights"
-        )
 
 
 def _suite(settings: ExtractSettings) -> Suite:
@@ -130,11 +104,7 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
     )
     examples = example_observations(settings.scene, suite)
     refuse_unfit(policy.card, settings.batch, examples[0])
-    if settings.execute is not None and settings.execute > policy.card.chunk > 0:
-        raise UsageError(
-            f"--execute {settings.execute}: {settings.model} gives {policy.card.chunk} actions per inference; "
-            f"execute 1 to {policy.card.chunk} of them"
-        )
+    refuse_unreachable(settings, policy.card)
     return PolicyController(
         policy, settings.model, examples, settings.execute, settings.captured_calls, settings.tokens == "all"
     )

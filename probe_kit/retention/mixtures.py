@@ -13,6 +13,7 @@ _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
     "views": lambda settings: ", ".join(settings.views),
     "relabellings": lambda settings: str(settings.permutations),
     "relabellings of token views": lambda settings: str(settings.token_permutations),
+    "captured inferences": lambda settings: str(settings.call),
     "seeds": lambda settings: str(settings.seed),
     "categories": lambda settings: ", ".join(settings.categories),
 }
@@ -45,6 +46,8 @@ def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | N
             found.append(f"{name} {' against '.join(parts)}")
     labels = {one.settings.target for one in results.values()} - {"correct"}
     notes = [f"Probes were asked for the target {label!r}: {TARGETS[label]}." for label in sorted(labels)]
+    calls = {one.settings.call for one in results.values()} - {0}
+    notes += [f"Probes are of captured inference {call}, counted from 0." for call in sorted(calls)]
     if not found:
         return notes
     return [

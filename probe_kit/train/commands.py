@@ -39,6 +39,9 @@ def train(
     twin: Annotated[
         str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
+    call: Annotated[
+        int, typer.Option(help="Captured inference to probe, counted from 0; see extract --captured-calls.", min=0)
+    ] = 0,
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[
         int | None,
@@ -66,6 +69,7 @@ def train(
             permutations=permutations,
             token_permutations=token_permutations,
             target=asked,
+            call=call,
             controls=baselines,
             suite=suite,
             twin=beside,
@@ -144,6 +148,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     parts += [f"{probes.permutations} relabellings"]
     parts += [f"{probes.token_permutations} for tokens"] * (probes.token_permutations > 0)
     parts += [f"seed {probes.seed}"]
+    parts += [f"captured inference {probes.call}"] * (probes.call > 0)
     parts += [f"only {', '.join(probes.categories)}"] * (probes.categories != found.categories)
     parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
     return "; ".join([*parts, fitted])

@@ -30,6 +30,7 @@ class StoredProbes:
     permutations: int = 0
     token_permutations: int = 0
     seed: int = 0
+    call: int = 0
     controls: tuple[str, ...] = ()
 
 
@@ -108,6 +109,7 @@ def _probes(run: RunReader, key: str, header: Mapping[str, Any], used: str | Non
         permutations=settings.permutations,
         token_permutations=settings.token_permutations,
         seed=settings.seed,
+        call=settings.call,
         controls=_controls(run.location, key),
     )
 

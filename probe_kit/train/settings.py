@@ -25,8 +25,12 @@ class ProbeSettings:
     seed: int
     token_permutations: int = 0  # 0 where no token view is probed
     format: int = FORMAT
+    call: int = 0  # captured inference, counted from 0
 
     @property
     def key(self) -> str:
         """First 12 hex digits of the settings' sha256: the name of the results' folder."""
-        return sha256_json(asdict(self))[:12]
+        settings = asdict(self)
+        if self.call == 0:  # as before inferences could be chosen, so that older results keep their name
+            del settings["call"]
+        return sha256_json(settings)[:12]

@@ -17,6 +17,7 @@ from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site
+from probe_kit.train.at_call import at_call, captured_calls
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import StoredDirections, save_directions
@@ -77,6 +78,8 @@ def is_stored(run: Location, key: str) -> bool:
 def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
     """The stored results called `key`, or else the newest for `target` on the episodes the run has now.
 
+    The newest are of the first captured inference; those of later ones are read by their key.
+
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
     they were fitted then or read back. Results of another format, written by another version of probe_kit, are
     passed over. Raises NoProbesError if there are none, and UsageError for a key that is not there.
@@ -94,7 +97,8 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
                 f"{', '.join(stored) or 'none'}"
             )
         return _read(location, found[0], stored[found[0]])
-    current = [name for name, header in stored.items() if settings_of(header).target == target]
+    asked = [(name, settings_of(header)) for name, header in stored.items()]
+    current = [name for name, settings in asked if (settings.target, settings.call) == (target, 0)]
     current = [name for name in current if is_current(settings_of(stored[name]), run)]
     if not current:
         raise NoProbesError(_why_none(run, target, len(headers)))
@@ -104,7 +108,9 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     """Whether probes of these settings are of the episodes that the run has now."""
-    return (settings.run_settings, settings.episodes) == (run.settings_sha256, episodes_sha256(run))
+    if settings.run_settings != run.settings_sha256 or settings.call >= max(captured_calls(run), 1):
+        return False
+    return settings.episodes == episodes_sha256(at_call(run, settings.call))
 
 
 def _why_none(run: RunReader, target: Target, stored: int) -> str:

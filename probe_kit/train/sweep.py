@@ -10,6 +10,7 @@ from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
 from probe_kit.notebook import notebook_progress
 from probe_kit.train.add_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.arrays import check_device
+from probe_kit.train.at_call import at_call
 from probe_kit.train.baselines import Baseline
 from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.curve import Curve
@@ -36,6 +37,7 @@ def train_probes(
     permutations: int = 200,
     token_permutations: int = 59,
     target: Target = "correct",
+    call: int = 0,
     controls: Sequence[Baseline] = (),
     suite: Path | None = None,
     twin: RunReader | None = None,
@@ -50,7 +52,8 @@ def train_probes(
     categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
     `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'.
     permutations: relabellings behind the p-values, of which token views, many times as dear, take the first
-    `token_permutations`. controls: baselines that never see the model, of `position`, `instruction` and `pixels`,
+    `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
+    out. controls: baselines that never see the model, of `position`, `instruction` and `pixels`,
     which needs the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
     jobs: processes that probe, this one alone by default; with more than one, a script needs
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
@@ -67,13 +70,16 @@ def train_probes(
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
     crew = CrewSettings(jobs, device, ray)
-    sweep = _Sweep.of(
-        run, _settings(run, categories, views, target, permutations, token_permutations, seed), crew, progress
-    )
+    run = at_call(run, call)
+    settings = _settings(run, categories, views, target, permutations, token_permutations, seed, call)
+    sweep = _Sweep.of(run, settings, crew, progress)
     prepared = prepare_baselines(run, controls, suite, sweep.stored)
     beside = None
     if twin is not None:
-        other = _settings(twin, sweep.settings.categories, views, target, permutations, token_permutations, seed)
+        twin = at_call(twin, call)
+        other = _settings(
+            twin, sweep.settings.categories, views, target, permutations, token_permutations, seed, call
+        )
         check_twin(run, twin, other)
         beside = _Sweep.of(twin, other, crew, progress)
     results = add_baselines(sweep.results(), run, prepared)
@@ -150,6 +156,7 @@ def _settings(
     permutations: int,
     token_permutations: int,
     seed: int,
+    call: int,
 ) -> ProbeSettings:
     if not run.streams:
         raise NoProbesError(f"{run.location} has no activations to probe: policy {run.model!r} has no streams.")
@@ -170,6 +177,7 @@ def _settings(
         permutations=permutations,
         seed=seed,
         token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
+        call=call,
     )
 
 

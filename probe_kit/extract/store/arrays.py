@@ -17,11 +17,11 @@ from probe_kit.extract.store.location import Location
 
 
 def create_arrays(
-    store: Store, streams: list[StoredStream], episodes: int, steps: int, with_tokens: bool, codec: str
+    store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str
 ) -> None:
     """Create every array at its final size; afterwards only chunks are written.
 
-    Pooled rows: float32 (episode, step, [iteration,] layer, view, feature), one chunk per episode, NaN where
+    Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens.
     """
     root = zarr.open_group(store, mode="w-", zarr_format=3)
@@ -30,12 +30,12 @@ def create_arrays(
         pooled = (*stream.lead, len(stream.views), stream.width)
         group.create_array(
             "pooled",
-            shape=(episodes, steps, *pooled),
-            chunks=(1, steps, *pooled),
+            shape=(episodes, calls, *pooled),
+            chunks=(1, calls, *pooled),
             dtype="float32",
             fill_value=np.nan,
             compressors=codecs(codec, typesize=4),
-            dimension_names=("episode", "step", *stream.dimensions, "view", "feature"),
+            dimension_names=("episode", "call", *stream.dimensions, "view", "feature"),
             attributes={"views": list(stream.views)},
             config={"write_empty_chunks": True},
         )
@@ -43,13 +43,13 @@ def create_arrays(
             tokens = (*stream.lead, stream.stored_tokens, stream.width)
             group.create_array(
                 "tokens",
-                shape=(episodes, steps, *tokens),
-                shards=(1, steps, *tokens),
+                shape=(episodes, calls, *tokens),
+                shards=(1, calls, *tokens),
                 chunks=(1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width),
                 dtype="uint16",
                 fill_value=0,
                 compressors=codecs(codec, typesize=2),
-                dimension_names=("episode", "step", *stream.dimensions, "token", "feature"),
+                dimension_names=("episode", "call", *stream.dimensions, "token", "feature"),
                 attributes={"probe_kit:dtype": "bfloat16", "tokens": stream.tokens},
                 config={"write_empty_chunks": True},
             )

@@ -106,7 +106,8 @@ def _column_problems(run: Run) -> Iterator[str]:
     for stream in run.streams:
         for view in run.views(stream):
             for site in run.sites(stream):
-                try:
-                    run.column(site, view)
-                except RunDamagedError as error:
-                    yield str(error)
+                for call in range(run.captured_calls):
+                    try:
+                        run.column(site, view, call)
+                    except RunDamagedError as error:
+                        yield str(error)

@@ -3,8 +3,8 @@
 A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal`
 writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
 
-    columns.zarr/<stream>/pooled   float32 (step, view, [iteration,] layer, episode, feature)
-    columns.zarr/<stream>/role     uint8   (step, episode, token), codes named by the attribute `roles`
+    columns.zarr/<stream>/pooled   float32 (call, view, [iteration,] layer, episode, feature)
+    columns.zarr/<stream>/role     uint8   (call, episode, token), codes named by the attribute `roles`
 """
 
 from typing import TYPE_CHECKING

@@ -27,7 +27,7 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
     h5: `<stream>/pooled`, `<stream>/tokens`, and a dataset per column under `episodes`.
     safetensors: `<stream>.pooled` and `<stream>.tokens`, the latter true bfloat16; episodes in the metadata.
     parquet: a row per episode, inference, site and view with its vector; no tokens.
-    Array axes are (episode, step, [iteration,] layer, view or token, feature).
+    Array axes are (episode, call, [iteration,] layer, view or token, feature).
     Raises UsageError for another format or a file that exists, MissingExtraError, RunDamagedError.
     """
     if style not in _WRITERS:

@@ -67,7 +67,7 @@ def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[
 
 
 def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block: int) -> Iterator[TokenBlock]:
-    """Blocks of `block` tokens at `at` (step, [iteration,] layer); a block that `mask` never touches is left out.
+    """Blocks of `block` tokens at `at` (call, [iteration,] layer); a block that `mask` never touches is left out.
 
     Reads only the inner chunks it needs, one block of all episodes at a time.
     """

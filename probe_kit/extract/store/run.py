@@ -214,8 +214,22 @@ class Run:
         """All sites of one stream."""
         return self.stored(stream).stream.sites()
 
-    def _check(self, site: Site) -> StoredStream:
+    @property
+    def captured_calls(self) -> int:
+        """Inferences captured per episode, from the first on; episodes that ended early have fewer."""
+        return int(self.settings["captured_calls"])
+
+    def reached(self, call: int) -> NDArray[np.bool_]:
+        """(E,) whether an episode got as far as captured inference `call`."""
+        return np.array([len(commit["roles"]) > call for commit in self.commits()], bool)
+
+    def _check(self, site: Site, call: int) -> StoredStream:
         stored = self.stored(site.stream)
+        if not 0 <= call < self.captured_calls:
+            raise UnknownSiteError(
+                f"{self.location} has {self.captured_calls} captured inferences per episode, counted from 0; "
+                f"asked for {call}. Extract with --captured-calls {call + 1}"
+            )
         if site not in stored.stream.sites():
             raise UnknownSiteError(
                 f"{self.location} has no site {site}; {site.stream} has {stored.layers} layers"
@@ -228,9 +242,11 @@ class Run:
     def column(self, site: Site, view: str = "mean", call: int = 0) -> NDArray[np.float32]:
         """(E, D) float32: one pooled view of one site at one captured inference, a row per episode.
 
+        NaN in the rows of episodes that ended before inference `call`; see `reached`.
+
         Raises UnknownSiteError, or RunDamagedError if stored bytes are missing or fail their checksum.
         """
-        stored = self._check(site)
+        stored = self._check(site, call)
         view = resolve_view(view, stored.views)
         if view not in stored.views:
             raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
@@ -282,12 +298,13 @@ class Run:
         arrays = {}
         for name, stored in self._streams.items():
             if self._columns is None:
-                dimensions = ["episode", "step", *stored.dimensions, "view", "feature"]
+                dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
                 array = xr.DataArray(self._pooled(name), dims=dimensions)
             else:
                 array = self._columns.xarray(name)
             own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
-            array = array.rename({"step": "call", **own}).transpose("episode", "call", *own.values())
+            old = {"step": "call"} if "step" in array.dims else {}  # its name in runs of schema 1
+            array = array.rename({**old, **own}).transpose("episode", "call", *own.values())
             arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
         labels = ("episode_id", "category", "layout", "side_correct", "outcome")
         return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in labels})
@@ -336,12 +353,13 @@ class Run:
         return np.asarray(kernel / np.sqrt(np.outer(counts, counts)))
 
     def _role_mask(self, site: Site, role: str | None, call: int) -> NDArray[np.bool_]:
-        stored = self._check(site)
+        stored = self._check(site, call)
         if self.settings["tokens"] != "all":
             raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
-        spans = [commit["roles"][call][site.stream] for commit in self.commits()]
+        calls = [commit["roles"] for commit in self.commits()]
+        spans = [own[call][site.stream] if call < len(own) else [] for own in calls]
         mask = role_mask(spans, stored.stored_tokens, role)
-        if not mask.any(axis=1).all():
+        if not mask[self.reached(call)].any(axis=1).all():
             known = sorted({name for episode in spans for name, _, _ in episode})
             raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {known}")
         return mask

@@ -55,7 +55,7 @@ def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:
         dtype="float32",
         fill_value=np.nan,
         compressors=codecs(run.settings["codec"], typesize=4),
-        dimension_names=("step", "view", *stored.dimensions, "episode", "feature"),
+        dimension_names=("call", "view", *stored.dimensions, "episode", "feature"),
         attributes={"views": list(stored.views)},
         config={"write_empty_chunks": True},
     )
@@ -83,9 +83,9 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
     names = [PADDING, *sorted({role for calls in spans for call in calls for role, _, _ in call} - {PADDING})]
     codes = np.zeros((run.settings["captured_calls"], len(spans), run.stored(name).stored_tokens), np.uint8)
     for episode, calls in enumerate(spans):
-        for step, call in enumerate(calls):
+        for number, call in enumerate(calls):
             for role, start, stop in call:
-                codes[step, episode, start:stop] = names.index(role)
+                codes[number, episode, start:stop] = names.index(role)
     array: zarr.Array[Any] = group.create_array(
         f"{name}/role",
         shape=codes.shape,
@@ -93,7 +93,7 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
         dtype="uint8",
         fill_value=0,
         compressors=codecs(run.settings["codec"], typesize=1),
-        dimension_names=("step", "episode", "token"),
+        dimension_names=("call", "episode", "token"),
         attributes={"roles": names},
         config={"write_empty_chunks": True},
     )

@@ -68,7 +68,7 @@ class RunWriter:
     ) -> None:
         self.location, self.plan = location, plan
         self.provenance = provenance or provenance_here()
-        self._certified = False
+        self._begun = self._certified = False
         self.settings = json.loads(canonical_json(settings))
         if not location.exists(RUN_FILE):
             location.found(self._beginning(), last=RUN_FILE)
@@ -122,7 +122,12 @@ class RunWriter:
         if not allow_mixed:
             stored = read_provenances(self.location).values()
             refuse_other_provenance(stored, self.provenance, str(self.location))
-        keep_provenance(self.location, self.provenance)
+        self._say_who_plays()
+
+    def _say_who_plays(self) -> None:
+        if not self._begun:
+            keep_provenance(self.location, self.provenance)
+            self._begun = True
 
     def remaining(self) -> list[int]:
         """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
@@ -131,6 +136,7 @@ class RunWriter:
 
     def write(self, episode: EpisodeRecord) -> None:
         """Store one episode: first its arrays, then the commit that makes it count."""
+        self._say_who_plays()  # before any commit names it
         planned = episode.planned
         store = RecordingStore(self.location.store(DATA))
         for kind, by_stream in episode.arrays.items():

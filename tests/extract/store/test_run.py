@@ -67,7 +67,7 @@ def test_plain_zarr_and_plain_xarray_read_the_store(recorded_run: Run) -> None:
     assert pooled.shape == (48, 1, 10, recorded_run.streams["expert"].layers, 4, 64)
     np.testing.assert_array_equal(pooled[:, 0, 7, 3, 0], recorded_run.column(Site("expert", 3, iteration=7)))
     dataset = xr.open_zarr(recorded_run.path / "data.zarr", group="backbone", consolidated=False, chunks=None)
-    assert dataset["pooled"].dims == ("episode", "step", "layer", "view", "feature")
+    assert dataset["pooled"].dims == ("episode", "call", "layer", "view", "feature")
 
 
 def test_the_labelled_dataset_selects_by_name(recorded_run: Run) -> None:

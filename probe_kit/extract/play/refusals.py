@@ -1,0 +1,48 @@
+"""Combinations of settings that would be obeyed and mean nothing."""
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.play.controllers import SCRIPTED
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.hooks.card import Card
+
+
+def refuse_meaningless(settings: ExtractSettings) -> None:
+    """Raise UsageError for what has no effect: a scripted policy has no weights, no chunks and no activations."""
+    if settings.weights_seed and not settings.random_weights:
+        raise UsageError(
+            f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
+            "Leave it out, or add --random-weights"
+        )
+    if settings.model not in SCRIPTED:
+        return
+    asked = {
+        "--checkpoint": settings.checkpoint is not None,
+        "--random-weights": settings.random_weights,
+        "--batch": settings.batch != 1,
+        "--execute": settings.execute is not None,
+        "--dtype": settings.dtype is not None,
+        "--tokens all": settings.tokens == "all",
+        "--captured-calls": settings.captured_calls != 1,
+        **{f"-M {name}": True for name in settings.options},
+    }
+    if meaningless := [option for option, given in asked.items() if given]:
+        raise UsageError(
+            f"{settings.model} is scripted: it has no network, so {', '.join(meaningless)} means nothing. Leave "
+            "it out, or choose a model with weights"
+        )
+
+
+def refuse_unreachable(settings: ExtractSettings, card: Card) -> None:
+    """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    if settings.execute is not None and settings.execute > card.chunk:
+        raise UsageError(
+            f"--execute {settings.execute}: {settings.model} gives {card.chunk} actions per inference; execute "
+            f"1 to {card.chunk} of them"
+        )
+    execute, steps = settings.execute or card.execute, settings.scene.max_steps
+    inferences = -(-steps // max(1, execute))
+    if settings.captured_calls > inferences:
+        raise UsageError(
+            f"--captured-calls {settings.captured_calls}: episodes of {steps} actions, {execute} per inference, "
+            f"have at most {inferences}; capture 1 to {inferences} of them, or raise --max-steps"
+        )
