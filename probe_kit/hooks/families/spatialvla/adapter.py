@@ -192,12 +192,17 @@ class SpatialVLA(Policy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """A chunk per observation; decoding is greedy, so the seeds change nothing. See the contract."""
+        """A chunk per observation; decoding is greedy, so the seeds change nothing. See the contract.
+
+        A row is flagged if a token of its first step, the one that is executed, names no action.
+        """
         self.check(seen, seeds)
         rows = [self.prompt(observation.instruction) for observation in seen]
         ids = self.generate(self.pictures(seen), self.cameras(seen), rows).ids.cpu().numpy()
         ids = ids.reshape(len(seen), -1, STEP_TOKENS)
-        self._say_unknown(ids)
+        self.flagged = ~np.asarray(self.bins.known(ids[:, 0]).all(axis=-1))
+        if self.flagged.any():
+            _say_unknown()
         actions = self.actions(ids)
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
@@ -219,14 +224,6 @@ class SpatialVLA(Policy):
             features = self.network.look(pictures, cameras).features
             return self.network.decode(
                 packed.ids.to(device), packed.mask.to(device), features, self.steps, slots, fed
-            )
-
-    def _say_unknown(self, ids: NDArray[np.int64]) -> None:
-        if not self.bins.known(ids).all():
-            warnings.warn(
-                "the model put out tokens that name no action; they count as the nearest bin, as in the original "
-                "software. Random weights do this; if trained ones do, prompt or tokenizer are wrong",
-                stacklevel=3,
             )
 
     # -- listening ---------------------------------------------------------------------------------------
@@ -265,6 +262,15 @@ class SpatialVLA(Policy):
             block.post_attention_layernorm if site.quantity == "attention" else block.post_feedforward_layernorm
         )
         return Tap(added, self.steps, "output", tokens)
+
+
+def _say_unknown() -> None:
+    warnings.warn(
+        "the model put out tokens that name no action; they count as the nearest bin, as in the original "
+        "software, and the step as flagged. Random weights do this; if trained ones do, prompt or tokenizer are "
+        "wrong",
+        stacklevel=3,
+    )
 
 
 def _vision_tap(tower: Any, site: Site) -> Tap:

@@ -11,6 +11,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
 from probe_kit.hooks.testing import AdapterContract, example_observations
+from probe_kit.models.spatialvla import Decoded
 from tests.spatialvla_checkpoints import BINS, SIDE, edges, processor_values, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
@@ -184,14 +185,29 @@ def test_a_chunk_is_in_units_of_the_data_and_one_step_of_it_is_executed(
     assert set(np.unique(actions[..., 6])) <= {0, 1}
 
 
-def test_tokens_that_name_no_action_are_said_and_slots_prevent_them(
-    plain: SpatialVLA, chunked: SpatialVLA, seen: list[Observation]
+def test_an_executed_step_that_names_no_action_is_flagged_and_said(
+    plain: SpatialVLA, seen: list[Observation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.warns(UserWarning, match="name no action"):
-        plain.act(seen, [0, 1])
+    ids = torch.tensor([[slot.start for slot in plain.bins.slots] * 4] * 2)
+    ids[0, 5] = 7  # in a step that is planned and not executed
+    monkeypatch.setattr(plain, "generate", lambda *_: Decoded(ids, torch.empty(0)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        chunked.act(seen, [0, 1])
+        plain.act(seen, [0, 1])
+    assert plain.flagged is not None
+    assert plain.flagged.tolist() == [False, False]
+    ids[1, 1] = plain.bins.slots[0].start  # a movement where a rotation belongs
+    with pytest.warns(UserWarning, match="name no action"):
+        plain.act(seen, [0, 1])
+    assert plain.flagged.tolist() == [False, True]
+
+
+def test_decoding_within_slots_always_names_an_action_and_says_so(
+    plain: SpatialVLA, chunked: SpatialVLA, seen: list[Observation]
+) -> None:
+    chunked.act(seen, [0, 1])
+    assert chunked.flagged is not None
+    assert not chunked.flagged.any()
     assert any("original does not" in note for note in chunked.card.notes)
     assert (plain.card.settings["constrained"], chunked.card.settings["constrained"]) == ("False", "True")
 
