@@ -109,7 +109,18 @@ def _cache_key(options: Mapping[str, Any]) -> str:
     the notice beside it holds its checksums.
     """
     folder = Path(__file__).parent
-    own = ("build", "card", "categories", "grouping", "items", "manifest", "pictures", "suite", "wording")
+    own = (
+        "build",
+        "card",
+        "categories",
+        "grouping",
+        "items",
+        "making",
+        "manifest",
+        "pictures",
+        "suite",
+        "wording",
+    )
     sources = [
         *sorted((folder / "generators").glob("*.py")),
         *(folder / f"{name}.py" for name in own),

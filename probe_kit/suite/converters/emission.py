@@ -1,6 +1,5 @@
 """From accepted proposals to items with pictures: sampled, laid out left and right, and encoded."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,11 +8,11 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.identity import sha256_json
-from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.converters.candidates import Reading, SourcePicture
 from probe_kit.suite.converters.pairing import Bundle, Proposal
 from probe_kit.suite.items import Item, Side, other_side
-from probe_kit.suite.pictures import encode_png, letterboxed, picture_file_name, pixels_sha256
+from probe_kit.suite.making import Picture, make_item
+from probe_kit.suite.pictures import encode_png, letterboxed, pixels_sha256
 
 TRANSFER_TYPES = {
     **dict.fromkeys(("emotion", "attribute", "state", "color", "public-info", "traffic"), "near"),
@@ -32,16 +31,11 @@ class Emitted:
 
 
 @dataclass(frozen=True)
-class _Stored:
-    image_id: str
-    pixels: str
-    original_pixels: str
-    png: bytes
-    operation: str
+class _Stored(Picture):
+    """original_pixels: hash of the source's pixels. operation: what was done to them."""
 
-    @property
-    def file_name(self) -> str:
-        return picture_file_name(self.pixels)
+    original_pixels: str
+    operation: str
 
 
 def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
@@ -101,7 +95,7 @@ def _encode(picture: SourcePicture, image: Image.Image) -> _Stored:
     size = min(max(square.width, _SMALLEST), _LARGEST)
     shown = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
     return _Stored(
-        picture.image_id, pixels_sha256(shown), pixels_sha256(image), encode_png(shown), picture.operation
+        picture.image_id, encode_png(shown), pixels_sha256(shown), pixels_sha256(image), picture.operation
     )
 
 
@@ -113,14 +107,16 @@ def _item(
     content = {
         "instruction": proposal.instruction,
         "correct_side": side,
-        "left": left.pixels,
-        "right": right.pixels,
+        "left": left.pixels_sha256,
+        "right": right.pixels_sha256,
         "source_id": proposal.source_id,
     }
-    return Item(
-        item_id=f"{source}-{proposal.category}-{sha256_json(content)[:10]}",
-        category=proposal.category,
-        domain=CATEGORIES[proposal.category].domain,
+    return make_item(
+        source,
+        proposal.category,
+        side,
+        (left, right),
+        content,
         transfer_type=TRANSFER_TYPES[proposal.category],
         construction=proposal.construction,
         instruction=proposal.instruction,
@@ -129,16 +125,6 @@ def _item(
         polarity=proposal.polarity,
         target_concept=proposal.target_concept,
         distractor_concept=proposal.distractor_concept,
-        correct_side=side,
-        left_file_name=left.file_name,
-        right_file_name=right.file_name,
-        left_sha256=hashlib.sha256(left.png).hexdigest(),
-        right_sha256=hashlib.sha256(right.png).hexdigest(),
-        left_pixels_sha256=left.pixels,
-        right_pixels_sha256=right.pixels,
-        left_image_id=left.image_id,
-        right_image_id=right.image_id,
-        group_id="",
         pair_id=f"{source}-{proposal.category}-{sha256_json(proposal.pair_key)[:12]}",
         rule_id=proposal.wording.rule_id,
         curation_status=proposal.curation_status,
@@ -146,7 +132,6 @@ def _item(
         attribution=reading.attribution,
         redistributable=reading.redistributable,
         contains_real_face=proposal.target.real_face or proposal.distractor.real_face,
-        split="eval",
         source={
             "benchmark": source,
             "version": reading.revision,
