@@ -167,5 +167,11 @@ class TooFewGroupsError(ProbeKitError):
     """There are fewer independent groups than folds, or only one class."""
 
 
+class UnbalancedEpisodesError(ProbeKitError):
+    """So many episodes of one side are missing that the other is right without any knowledge."""
+
+    exit_code = 3
+
+
 class ProbeNotConvergedError(ProbeKitError):
     """The logistic solver stopped before the optimum."""

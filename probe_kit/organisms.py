@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Literal
 
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.retention import RetentionRow, retention
-from probe_kit.retention.cells import debiased_value, number, percent
+from probe_kit.retention.cells import beats, debiased_value, number, percent
+from probe_kit.retention.success import Regime
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
-from probe_kit.train.controls import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit.fitting_tables import Cell, FittingTable
@@ -45,11 +45,8 @@ class Organism:
 TRAINED = Organism(
     "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
 )
-ORGANISMS = (
-    TRAINED,
-    Organism("early", "run-early", "pi0-tiny-early"),
-    Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True),
-)
+RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True)
+ORGANISMS = (TRAINED, Organism("early", "run-early", "pi0-tiny-early"), RANDOM_TWIN)
 
 
 @dataclass(frozen=True)
@@ -71,33 +68,45 @@ class Finding:
 def verdict(row: RetentionRow) -> Verdict:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
-    In the backbone: its best site is family-wise significant. Acted on: the SR is above 0.5 + Δ. *Acted on, not
-    found* is a contradiction, and true of no policy: the instrument missed what the policy plainly reads.
+    In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the SR is
+    in the regime of knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument
+    missed what the policy plainly reads.
     """
-    known = row.prefix_p_fwe is not None and row.prefix_p_fwe < SIGNIFICANCE
-    if row.delta is not None and row.sr > 0.5 + row.delta:
-        return "used" if known else "acted on, not found"
-    return "encoded, unused" if known else "absent"
+    if row.regime == Regime.KNOWLEDGE:
+        return "used" if row.prefix_signal else "acted on, not found"
+    return "encoded, unused" if row.prefix_signal else "absent"
 
 
 def probed(
-    organism: Organism, suite: Suite, folder: Path, permutations: int, stage: NamedProgress
+    organism: Organism,
+    suite: Suite,
+    folder: Path,
+    permutations: int,
+    stage: NamedProgress,
+    twin: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
-    """The organism's run on `suite`, in `folder`, and its probes; what is finished is reused.
+    """The organism's run on `suite`, in `folder`, and its probes, held against binding; finished work is reused.
 
-    stage: gives a progress callback (done, total, …) for a stage of this name.
+    stage: gives a progress callback (done, total, …) for a stage of this name. twin: a run to hold it against too.
     """
     settings = ExtractSettings(
         organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
     )
     run = extract_run(settings, folder / organism.folder, progress=stage(f"episodes, {organism.name}"))
     progress = stage(f"probing sites, {organism.name}")
-    return run, train_probes(run, permutations=permutations, progress=progress)
+    results = train_probes(
+        run, permutations=permutations, controls=("binding",), suite=suite.folder, twin=twin, progress=progress
+    )
+    return run, results
 
 
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge every organism on `suite`; arguments as of `probed`."""
-    runs = [(organism, probed(organism, suite, folder, permutations, stage)[0]) for organism in ORGANISMS]
+    """Judge every organism on `suite`, the trained ones against the random twin too; arguments as of `probed`."""
+    twin, _ = probed(RANDOM_TWIN, suite, folder, permutations, stage)
+    runs = [
+        (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
+        for one in ORGANISMS
+    ]
     return [
         Finding(organism.name, row.category, organism.expected(row.category), verdict(row), row)
         for organism, run in runs
@@ -124,7 +133,7 @@ def to_rich(findings: Sequence[Finding]) -> "FittingTable":
             ),
             Part(
                 "What they rest on",
-                ("SR %", "± Δ", "backbone", "p", "action", "retention [95 %]"),
+                ("SR %", "± Δ", "backbone", "p", "beats", "action", "retention [95 %]"),
                 tuple(map(_number_cells, findings)),
             ),
         ),
@@ -144,6 +153,6 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
     row = finding.row
     texts = (
         percent(row.sr), percent(row.delta), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
-        percent(row.action_accuracy), debiased_value(row),
+        beats(row), percent(row.action_accuracy), debiased_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

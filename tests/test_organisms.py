@@ -5,12 +5,16 @@ import pytest
 from probe_kit.console import out
 from probe_kit.organisms import ORGANISMS, TRAINED, Finding, to_rich, verdict
 from probe_kit.retention import RetentionRow
+from probe_kit.retention.success import regime
 
 
-def row(sr: float, p: float | None) -> RetentionRow:
+def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
+    """p: of the backbone's best site against chance."""
+    chance = None if p is None else p < 0.05
     return RetentionRow(
         "run", "pi0-tiny", False, "0" * 64, "suite@1", "s", "p", "color", "mean", 48, 24, sr,
-        delta=0.14, prefix_accuracy=0.9, prefix_p_fwe=p,
+        regime=regime(sr, 0.14, 1 - sr, 0.0)[0], prefix_accuracy=0.9, prefix_p_fwe=p,
+        prefix_beats={"chance": chance, "binding": None, "twin": None} | beats,
     )  # fmt: skip
 
 
@@ -29,6 +33,13 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
     sr: float, p: float | None, expected: str
 ) -> None:
     assert verdict(row(sr, p)) == expected
+
+
+@pytest.mark.parametrize("control", ["binding", "twin"])
+def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
+    """Color of the random twin had p = 0.005 against chance, and knew nothing."""
+    assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
+    assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, unused"
 
 
 def test_only_the_trained_organism_knows_anything() -> None:

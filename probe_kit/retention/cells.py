@@ -60,6 +60,14 @@ def place(layer: int | None, iteration: int | None = None) -> str:
     return str(layer) if iteration is None else f"{layer} @{iteration}"
 
 
+def beats(row: RetentionRow) -> str:
+    """What the backbone's best site is better than, and what not; says so if only chance was asked."""
+    found = {name: better for name, better in row.prefix_beats.items() if better is not None}
+    if set(found) == {"chance"}:
+        return "against chance only" if found["chance"] else "not chance"
+    return ", ".join(name if better else f"not {name}" for name, better in found.items()) or "–"
+
+
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     """Success rates do not depend on the view: the first row of each run and category."""
     return list({(row.run, row.category): row for row in reversed(rows)}.values())[::-1]

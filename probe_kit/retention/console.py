@@ -50,12 +50,21 @@ def rich_tables(
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
             reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
-            tables.append(_of_run(f"Retention, view {view}", shown, _RETENTION, [_SITE_LEGEND, *reasons]))
+            legend = [_SITE_LEGEND, *reasons, *_judged(shown)]
+            tables.append(_of_run(f"Retention, view {view}", shown, _RETENTION, legend))
             if controlled(shown):
                 tables.append(_of_run(f"Controls, view {view}", shown, _CONTROLS, [_control_legend(shown)]))
     for title, of_pair in groupby(differences, key=difference_title):
         tables.append(_fitting(title, "", list(of_pair), {"Difference": DIFFERENCE_COLUMNS}))
     return Group(*tables, *(Text(note, style="yellow") for note in notes))
+
+
+def _judged(rows: Sequence[RetentionRow]) -> list[str]:
+    """A warning where nothing but chance was beaten, because nothing else was tried."""
+    found = [row.prefix_beats for row in rows if row.prefix_beats]
+    tried = any(better is not None for beats in found for name, better in beats.items() if name != "chance")
+    mark = "signal is judged against chance only: add the controls binding and twin"
+    return [mark] if found and not tried else []
 
 
 def _regime(row: RetentionRow) -> str:
@@ -91,6 +100,7 @@ _RETENTION: dict[str, Sequence[Column]] = {
         ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
         ("layer", lambda row: place(row.prefix_layer)),
         ("p", lambda row: number(row.prefix_p_fwe, 3)),
+        ("beats", beats),
     ],
     "Where the action is made": [
         ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),

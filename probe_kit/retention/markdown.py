@@ -8,6 +8,7 @@ from probe_kit.retention.cells import (
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
     Column,
+    beats,
     controlled,
     debiased_value,
     difference_title,
@@ -55,6 +56,7 @@ RETENTION_COLUMNS: list[Column] = [
     ("gap %", lambda row: percent(row.gap)),
     ("chance %", lambda row: percent(row.chance)),
     ("groups", lambda row: "–" if row.n_groups is None else str(row.n_groups)),
+    ("backbone beats", beats),
 ]
 
 

@@ -15,7 +15,7 @@ from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import HALVINGS, Crossfit, GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.controls import BINDING, TWIN, Beats, Controls, signal
 from probe_kit.train.curve import Curve
 
 Iterations = Literal["all", "best", "last"] | int
@@ -41,8 +41,9 @@ class Retention:
 
     plain: (best expert − chance) / (best backbone − chance), the published formula; NaN if the backbone's best is
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
-    means nothing; `note` then says so. debiased: the same ratio scored on episodes that had no part in choosing
-    the sites, with its 95 % Fieller interval; fit: the two scores it is the ratio of.
+    means nothing, and than binding and twin where they were run; `note` then says so. debiased: the same ratio
+    scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two scores
+    it is the ratio of.
     """
 
     chance: float
@@ -69,9 +70,12 @@ def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak
     return Peak(curve.sites[best], float(accuracy.max()), float(curve.p_fwe()[best]))
 
 
-def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 0) -> Retention | None:
+def measure_retention(
+    curve: Curve, iterations: Iterations = "all", seed: int = 0, beats: Beats | None = None
+) -> Retention | None:
     """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
+    beats: what the backbone's best site is better than, as `Controls.beats` says; chance alone by default.
     Raises UsageError if that stream has no such iteration.
     """
     stream = curve.action_stream
@@ -79,6 +83,7 @@ def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 
     expert = None if stream is None else best_site(curve, stream, iterations)
     if stream is None or backbone is None or expert is None:
         return None
+    beats = beats or Controls().beats("", "", str(backbone.site), backbone.p_fwe)
     scores = GroupScores.of(curve.correct, curve.groups)
     fit = crossfit(
         scores.only(_rows(curve, "backbone", "all")),
@@ -91,8 +96,8 @@ def measure_retention(curve: Curve, iterations: Iterations = "all", seed: int = 
         backbone=backbone,
         expert=expert,
         plain=_ratio(expert.accuracy - curve.chance, backbone.accuracy - curve.chance),
-        defined=backbone.p_fwe < SIGNIFICANCE,
-        note=_note(backbone.p_fwe),
+        defined=signal(beats),
+        note=_note(beats),
         debiased=_ratio(fit.expert, fit.backbone),
         interval=retention_interval(fit),
         fit=fit,
@@ -116,10 +121,13 @@ def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]
     return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
 
 
-def _note(p_fwe: float) -> str:
-    if np.isnan(p_fwe):
+def _note(beats: Beats) -> str:
+    if beats["chance"] is None:
         return "n/a (no permutations)"
-    return "" if p_fwe < SIGNIFICANCE else "n/a (no backbone signal)"
+    if not beats["chance"]:
+        return "n/a (no backbone signal)"
+    equals = [name for name in (BINDING, TWIN) if beats[name] is False]
+    return f"n/a (backbone no better than {' and '.join(equals)})" if equals else ""
 
 
 def _ratio(numerator: float, denominator: float) -> float:

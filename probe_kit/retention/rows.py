@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from probe_kit.train.controls import signal
+
 MEAN = "mean"
 """Category of the rows that average over categories."""
 
@@ -16,6 +18,8 @@ class RetentionRow:
     sr_by_epsilon: SR by zone radius in metres. prefix_selectivity, action_selectivity: accuracy of the best site
     above that of the same probe on random labels of items. baselines: accuracy of each control that never sees the
     model; leaks: those above chance.
+    prefix_beats, action_beats: whether the best site is better than `chance`, `binding` and `twin`, family-wise;
+    None for a control that was not run.
     prefix_twin, action_twin: how much more accurate the best site is than that of `twin`.
     action_stream: `expert`, or `action` in a policy without one, whose iterations are action tokens.
     In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
@@ -85,6 +89,18 @@ class RetentionRow:
     group: str | None = None
     categories: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    prefix_beats: dict[str, bool | None] = field(default_factory=dict)
+    action_beats: dict[str, bool | None] = field(default_factory=dict)
+
+    @property
+    def prefix_signal(self) -> bool:
+        """Whether the backbone knows the answer: better than chance and every control that was run."""
+        return bool(self.prefix_beats) and signal(self.prefix_beats)
+
+    @property
+    def action_signal(self) -> bool:
+        """The same of the stream the action is made in."""
+        return bool(self.action_beats) and signal(self.action_beats)
 
     @property
     def action_name(self) -> str:

@@ -72,10 +72,15 @@ def _row(
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
         peaks = _peaks(curve, settings.iterations)
-        retention = measure_retention(curve, settings.iterations, settings.seed)
+        beats = {
+            name: results.controls.beats(category, view, str(peak.site), peak.p_fwe)
+            for name, peak in peaks.items()
+        }
+        retention = measure_retention(curve, settings.iterations, settings.seed, beats.get("prefix"))
         estimates |= probe_estimates(curve, peaks, retention, run.suite)
         values |= _probes(curve, peaks, success, estimates) | _retention(retention)
         values |= _controls(results.controls, category, view, curve.action_stream)
+        values |= {f"{name}_beats": found for name, found in beats.items()}
     return Drawn(RetentionRow(**values, category=category, view=view, group=group), estimates)
 
 

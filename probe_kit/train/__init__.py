@@ -10,18 +10,21 @@ from probe_kit.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.train.array_run import ArrayRun
     from probe_kit.train.baselines import BASELINES, Baseline
-    from probe_kit.train.controls import BaselineScore, Controls, TwinScore
+    from probe_kit.train.controls import BaselineScore, Controls, Excess, TwinScore
     from probe_kit.train.curve import Curve
     from probe_kit.train.directions import Direction
+    from probe_kit.train.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.reader import RunReader
     from probe_kit.train.results import ProbeResults
     from probe_kit.train.settings import ProbeSettings
     from probe_kit.train.store import load_results, save_results
     from probe_kit.train.sweep import Progress, train_probes
-    from probe_kit.train.targets import TARGETS, Target
+    from probe_kit.train.targets import INCOMPLETE, TARGETS, Incomplete, Target
 
 __all__ = [
     "BASELINES",
+    "FOLD_UNITS",
+    "INCOMPLETE",
     "TARGETS",
     "ArrayRun",
     "Baseline",
@@ -29,6 +32,9 @@ __all__ = [
     "Controls",
     "Curve",
     "Direction",
+    "Excess",
+    "FoldUnit",
+    "Incomplete",
     "ProbeResults",
     "ProbeSettings",
     "Progress",
@@ -51,6 +57,11 @@ __getattr__ = lazy_names(
         "Controls": "controls",
         "Curve": "curve",
         "Direction": "directions",
+        "Excess": "controls",
+        "FOLD_UNITS": "folds",
+        "FoldUnit": "folds",
+        "INCOMPLETE": "targets",
+        "Incomplete": "targets",
         "ProbeResults": "results",
         "ProbeSettings": "settings",
         "Progress": "sweep",

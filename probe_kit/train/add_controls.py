@@ -1,16 +1,19 @@
 """Fitting the controls of probe results: what can be wrong with them is found before anything is fitted."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.train.baselines import Baseline, baseline_features
-from probe_kit.train.controls import BaselineScore, TwinScore
+from probe_kit.identity import derive_seed
+from probe_kit.train.baselines import Baseline, baseline_features, needed
+from probe_kit.train.binding import BindingInputs, binding_scores
+from probe_kit.train.controls import BINDING, TWIN, BaselineScore, Excess, TwinScore
 from probe_kit.train.curve import Curve
+from probe_kit.train.paired import better_than_best
 from probe_kit.train.permutation import site_p
 from probe_kit.train.problem import POOLED, category_problem
 from probe_kit.train.reader import RunReader
@@ -20,8 +23,13 @@ from probe_kit.train.scores import GAINS, chance_level, correctness, group_boots
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.targets import target_labels
 
-Prepared = Mapping[Baseline, NDArray[np.float32]]
-"""Features of baselines that are still to be probed, (E, D) each."""
+
+@dataclass(frozen=True)
+class Prepared:
+    """Baselines that are still to be probed: features (E, D) by name, and what `binding` sees if it is one."""
+
+    features: Mapping[Baseline, NDArray[np.float32]]
+    binding: BindingInputs | None
 
 
 def prepare_baselines(
@@ -33,13 +41,20 @@ def prepare_baselines(
     raises.
     """
     missing = [name for name in names if stored is None or not _has(stored, name)]
-    return {name: baseline_features(run, name, suite) for name in missing}
+    features = {name: baseline_features(run, name, suite) for name in missing if name != BINDING}
+    binding = BindingInputs.of(run, needed(suite, BINDING)) if BINDING in missing else None
+    return Prepared(features, binding)
 
 
 def add_baselines(results: ProbeResults, run: RunReader, prepared: Prepared) -> ProbeResults:
-    """`results` with these baselines for every category."""
-    scores = [score for name, found in prepared.items() for score in _baseline_scores(results, run, name, found)]
-    return replace(results, controls=results.controls.with_baselines(scores))
+    """`results` with these baselines for every category; all sites are held against binding if it is one."""
+    controls = results.controls
+    for name, features in prepared.features.items():
+        controls = controls.with_baselines(_baseline_scores(results, run, name, features))
+    if prepared.binding is not None:
+        scores, excess = binding_scores(results, run, prepared.binding)
+        controls = controls.with_baselines(scores).with_excess(excess)
+    return replace(results, controls=controls)
 
 
 def _has(results: ProbeResults, name: str) -> bool:
@@ -96,7 +111,24 @@ def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
     scores = [
         score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
     ]
-    return replace(results, controls=results.controls.with_twin(scores))
+    excess = [one for place, curve in results.curves.items() for one in _twin_excess(results, place, curve, twin)]
+    return replace(results, controls=results.controls.with_twin(scores).with_excess(excess))
+
+
+def _twin_excess(
+    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
+) -> Iterator[Excess]:
+    """Every site of a stream against the best of the twin's."""
+    other = twin.curves[place]
+    for stream in dict.fromkeys(site.stream for site in curve.sites):
+        if not other.stream(stream).size:
+            continue
+        rows, others = curve.stream(stream), other.correct[other.stream(stream)]
+        seed = derive_seed(TWIN, results.settings.seed, *place, stream)
+        p = better_than_best(curve.correct[rows], others, curve.groups, seed)
+        best = float(others.mean(axis=1).max())
+        for row, of_site in zip(rows, p, strict=True):
+            yield Excess(TWIN, *place, str(curve.sites[row]), best, float(of_site))
 
 
 def _twin_scores(

@@ -14,11 +14,12 @@ if TYPE_CHECKING:
 
     from probe_kit.suite import Suite
 
-Baseline = Literal["position", "instruction", "pixels"]
+Baseline = Literal["position", "instruction", "pixels", "binding"]
 BASELINES: dict[str, str] = {
     "position": "the layout alone",
     "instruction": "the words of the instruction, alone and with the layout",
     "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
+    "binding": "random nonlinear features of pictures and words together, as wide as the site; needs the suite",
 }
 THUMBNAIL = 32
 
@@ -26,7 +27,7 @@ Features = NDArray[np.float32]
 
 
 def baseline_features(run: RunReader, name: Baseline, suite: Path | None) -> Features:
-    """(E, D) features of a baseline, rows in the order of the run's episodes.
+    """(E, D) features of a baseline but `binding`, rows in the order of the run's episodes.
 
     Raises UsageError for an unknown name, a missing column or a missing suite, SuiteError for another suite.
     """
@@ -35,12 +36,15 @@ def baseline_features(run: RunReader, name: Baseline, suite: Path | None) -> Fea
     if name == "instruction":
         return _words(run)
     if name == "pixels":
-        if suite is None:
-            raise UsageError(
-                "the pixel baseline needs the pictures: give the folder of the run's suite as `suite`"
-            )
-        return _pixels(run.episodes, suite_of(run, suite))
+        return tile_pixels(run.episodes, suite_of(run, needed(suite, name)), THUMBNAIL)
     raise UsageError(f"unknown control {name!r}; expected one of {', '.join(BASELINES)}")
+
+
+def needed(suite: Path | None, name: Baseline) -> Path:
+    """`suite`, for a baseline that needs it. Raises UsageError without one."""
+    if suite is None:
+        raise UsageError(f"the control {name!r} needs the pictures: give the folder of the run's suite as `suite`")
+    return suite
 
 
 def suite_of(run: RunReader, folder: Path) -> "Suite":
@@ -73,6 +77,12 @@ def _words(run: RunReader) -> Features:
 
     The second half shows a word whose picture always lies on one side.
     """
+    counts = word_counts(run)
+    return np.hstack([counts, counts * _layout(run.episodes)])
+
+
+def word_counts(run: RunReader) -> Features:
+    """(E, W): how often each word occurs in the instruction. Raises UsageError without instructions."""
     if "instruction" not in run.episodes:
         raise UsageError(f"the episodes of {run.location} have no column 'instruction'; leave that control out")
     words = [str(text).lower().split() for text in run.episodes["instruction"]]
@@ -81,11 +91,11 @@ def _words(run: RunReader) -> Features:
     for row, text in enumerate(words):
         for word in text:
             counts[row, known[word]] += 1
-    return np.hstack([counts, counts * _layout(run.episodes)])
+    return counts
 
 
-def _pixels(episodes: "pd.DataFrame", suite: "Suite") -> Features:
-    """(E, 6144): the left and the right picture of every episode, RGB from 0 to 1."""
+def tile_pixels(episodes: "pd.DataFrame", suite: "Suite", side: int) -> Features:
+    """(E, 6 side²): the left and the right picture of every episode, RGB from 0 to 1, `side` pixels wide."""
     from probe_kit.suite import Episode
 
     items = {item.item_id: item for item in suite.items}
@@ -94,15 +104,15 @@ def _pixels(episodes: "pd.DataFrame", suite: "Suite") -> Features:
     for item_id, layout in zip(episodes["item_id"], episodes["layout"], strict=True):
         episode = Episode(items[item_id], layout)
         pictures = [episode.picture("left"), episode.picture("right")]
-        thumbnails |= {path: _thumbnail(path) for path in pictures if path not in thumbnails}
+        thumbnails |= {path: _thumbnail(path, side) for path in pictures if path not in thumbnails}
         rows.append(np.concatenate([thumbnails[path] for path in pictures]))
     return np.stack(rows)
 
 
-def _thumbnail(path: Path) -> Features:
+def _thumbnail(path: Path, side: int) -> Features:
     from PIL import Image
 
     from probe_kit.suite import load_picture
 
-    small = load_picture(path).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+    small = load_picture(path).resize((side, side), Image.Resampling.BOX)
     return np.asarray(small, np.float32).ravel() / np.float32(255)

@@ -1,8 +1,9 @@
 """`probe-kit train`, and `probe-kit run show`, which lists what it stored."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.text import Text
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-    from probe_kit.train import Baseline, ProbeResults, Target
+    from probe_kit.train import Baseline, FoldUnit, Incomplete, ProbeResults, RunReader, Target
     from probe_kit.train.inventory import Inventory, StoredProbes
 
 
@@ -32,10 +33,20 @@ def train(
     target: Annotated[
         str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
     ] = "correct",
+    folds: Annotated[
+        str, typer.Option(help="groups, or concepts: items about the same two concepts stay together too.")
+    ] = "groups",
+    incomplete: Annotated[
+        str, typer.Option(help="Items of which an episode is missing: keep the other, or drop it too.")
+    ] = "keep",
     controls: Annotated[
-        str | None, typer.Option(help="Comma-separated baselines: position, instruction, pixels.")
+        str | None,
+        typer.Option(
+            help="Comma-separated: position, instruction, pixels, binding, or none. Default binding, if the "
+            "suite is at hand: --suite, or the embedded one."
+        ),
     ] = None,
-    suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels.")] = None,
+    suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels and binding.")] = None,
     twin: Annotated[
         str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
@@ -53,14 +64,17 @@ def train(
 ) -> None:
     """Fit logistic probes at every site and store their scores in the run.
 
-    Nested, grouped cross-validation; p-values by relabelling whole items. Same settings are read back.
+    Nested, grouped cross-validation; p-values by relabelling groups of items. Same settings are read back.
     """
     from probe_kit.extract import open_run
-    from probe_kit.train import train_probes
+    from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes
 
-    asked, baselines = _target(target), _baselines(controls)
+    asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
+    units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
+    rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
     opened = open_run(run, allow_partial=partial)
     beside = None if twin is None else open_run(twin, allow_partial=partial)
+    pictures = suite or _embedded_suite(opened)
     with progress() as bar:
         results = train_probes(
             opened,
@@ -70,8 +84,10 @@ def train(
             token_permutations=token_permutations,
             target=asked,
             call=call,
-            controls=baselines,
-            suite=suite,
+            folds=units,
+            incomplete=rest,
+            controls=baselines if baselines is not None else _default_controls(pictures),
+            suite=pictures,
             twin=beside,
             seed=seed,
             jobs=jobs,
@@ -80,6 +96,8 @@ def train(
             progress=counter(bar, "sites"),
         )
     _print_peaks(results, opened.random_weights)
+    if not results.controls.excess:
+        err.print("signal is judged against chance only: give --suite, or a --twin by random weights")
     err.print(f"next: [bold]probe-kit retention {run}[/]", highlight=False, soft_wrap=True)
 
 
@@ -154,22 +172,38 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     return "; ".join([*parts, fitted])
 
 
-def _baselines(names: str | None) -> "tuple[Baseline, ...]":
+def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":
+    """None for the default."""
     from probe_kit.train import BASELINES
 
-    for name in split(names) or ():
-        if name not in BASELINES:
-            raise UsageError(f"unknown control {name!r}; expected some of {', '.join(BASELINES)}")
-    return cast("tuple[Baseline, ...]", split(names) or ())
+    if names is None:
+        return None
+    if names == "none":
+        return ()
+    return tuple(cast("Baseline", _one_of("control", name, BASELINES)) for name in split(names) or ())
 
 
-def _target(name: str) -> "Target":
-    from probe_kit.train import TARGETS
+def _embedded_suite(run: "RunReader") -> Path | None:
+    """Folder of the embedded suite, if the run's pictures come from it."""
+    from probe_kit.errors import SuiteError
+    from probe_kit.suite import default_suite
+    from probe_kit.suite.generators.couples import SUITE_NAME
+    from probe_kit.train.baselines import suite_of
 
-    for target in TARGETS:
-        if name == target:
-            return cast("Target", target)
-    raise UsageError(f"unknown target {name!r}; expected one of {', '.join(TARGETS)}")
+    if not run.suite.startswith(f"{SUITE_NAME}@"):
+        return None
+    folder = default_suite().folder
+    try:
+        suite_of(run, folder)
+    except SuiteError:  # drawn with another seed or version
+        return None
+    return folder
+
+
+def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:
+    if name not in known:
+        raise UsageError(f"unknown {what} {name!r}; expected one of {', '.join(known)}")
+    return name
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
@@ -177,7 +211,7 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
     peaks = results.scores.sort_values("accuracy", ascending=False, kind="stable")
     for view, of_view in peaks.groupby("view", sort=False):
         best = [rows.iloc[0] for _, rows in of_view.groupby(["category", "stream"])]
-        headings = ("best site", "accuracy % [95 %]", "family-wise p", "n")
+        headings = ("best site", "accuracy % [95 %]", "family-wise p", "beats", "n")
         table = FittingTable(
             title=f"Best site per stream, view {view}{mark}",
             caption="",
@@ -192,4 +226,16 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
 def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
     accuracy, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
     p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
-    return tuple(map(Cell, (str(row["site"]), f"{accuracy} [{low}, {high}]", p, str(row["n"]))))
+    return tuple(map(Cell, (str(row["site"]), f"{accuracy} [{low}, {high}]", p, _beats(row), str(row["n"]))))
+
+
+def _beats(best: "pd.Series[Any]") -> str:
+    """What a site is better than, of what was tried."""
+    from pandas import isna
+
+    from probe_kit.train.controls import SIGNIFICANCE
+
+    chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
+    tried = {"chance": chance, "binding": best["beats_binding"], "twin": best["beats_twin"]}
+    found = [name if better else f"not {name}" for name, better in tried.items() if not isna(better)]
+    return ", ".join(found) or "–"

@@ -1,10 +1,14 @@
 """What probes are held against: baselines that never see the model, and a twin that was never trained."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from math import isnan
 from typing import Any
 
 SIGNIFICANCE = 0.05
+BINDING, TWIN = "binding", "twin"
+"""The controls that a site must beat, where they were run, before its signal counts as knowledge."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +52,50 @@ class TwinScore:
 
 
 @dataclass(frozen=True)
+class Excess:
+    """Whether a site's probe is more accurate than a control: paired by group, family-wise over its stream.
+
+    control: `binding`, or `twin` for the best site of the twin's stream. reference: the control's accuracy.
+    """
+
+    control: str
+    category: str
+    view: str
+    site: str
+    reference: float
+    p: float
+
+
+Beats = dict[str, bool | None]
+"""Whether a site is better than `chance`, `binding` and `twin`; None for what was not run."""
+
+
+def signal(beats: Beats) -> bool:
+    """Whether that is knowledge: better than chance, and than every control that was run."""
+    return beats["chance"] is True and False not in beats.values()
+
+
+@dataclass(frozen=True)
 class Controls:
-    """What was controlled so far."""
+    """What was controlled so far. excess: every site held against binding and twin."""
 
     baselines: tuple[BaselineScore, ...] = ()
     twin: tuple[TwinScore, ...] = ()
+    excess: tuple[Excess, ...] = ()
+
+    def beats(self, category: str, view: str, site: str, p_fwe: float) -> Beats:
+        """What a site with this family-wise p is better than."""
+        found = self._beaten.get((category, view, site), {})
+        chance = None if isnan(p_fwe) else bool(p_fwe < SIGNIFICANCE)
+        return {"chance": chance, BINDING: found.get(BINDING), TWIN: found.get(TWIN)}
+
+    @cached_property
+    def _beaten(self) -> dict[tuple[str, str, str], dict[str, bool]]:
+        """By category, view and site: the controls it was held against, and whether it is better."""
+        beaten: dict[tuple[str, str, str], dict[str, bool]] = {}
+        for one in self.excess:
+            beaten.setdefault((one.category, one.view, one.site), {})[one.control] = one.p < SIGNIFICANCE
+        return beaten
 
     def of_category(self, category: str) -> dict[str, BaselineScore]:
         """Baselines of a category by name."""
@@ -66,11 +109,16 @@ class Controls:
     def with_baselines(self, scores: Iterable[BaselineScore]) -> "Controls":
         """These and more; a newer score replaces one of the same name and category."""
         merged = {(score.name, score.category): score for score in (*self.baselines, *scores)}
-        return Controls(tuple(merged.values()), self.twin)
+        return replace(self, baselines=tuple(merged.values()))
 
     def with_twin(self, scores: Sequence[TwinScore]) -> "Controls":
         """The same baselines with another twin."""
-        return Controls(self.baselines, tuple(scores))
+        return replace(self, twin=tuple(scores))
+
+    def with_excess(self, found: Sequence[Excess]) -> "Controls":
+        """These, with all sites held anew against the controls that are in `found`."""
+        renewed = {one.control for one in found}
+        return replace(self, excess=(*(one for one in self.excess if one.control not in renewed), *found))
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `controls.json`."""
@@ -82,4 +130,5 @@ class Controls:
         return cls(
             tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
             tuple(TwinScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["twin"]),
+            tuple(Excess(**one) for one in stored["excess"]),
         )

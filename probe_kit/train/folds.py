@@ -1,11 +1,21 @@
 """Folds that keep everything that shares a picture together."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.errors import TooFewGroupsError
+from probe_kit.errors import TooFewGroupsError, UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FoldUnit = Literal["groups", "concepts"]
+FOLD_UNITS: dict[str, str] = {
+    "groups": "items that share a picture stay together",
+    "concepts": "so do items about the same two concepts: no pair of the test fold was trained on",
+}
 
 
 @dataclass(frozen=True)
@@ -33,6 +43,40 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
             "Extract more items of this category."
         )
     return folds
+
+
+def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:
+    """(E,) name of what folds must not separate: the group, or all groups about the same two concepts.
+
+    episodes: column `group_id`, and for concepts `target_concept` and `distractor_concept`, whose order does not
+    matter. Raises UsageError for an unknown unit or a missing column.
+    """
+    groups = episodes["group_id"].to_numpy(dtype=str)
+    if unit == "groups":
+        return groups
+    if unit != "concepts":
+        raise UsageError(f"unknown fold unit {unit!r}; expected one of {', '.join(FOLD_UNITS)}")
+    columns = ["target_concept", "distractor_concept"]
+    if not set(columns) <= set(episodes):
+        raise UsageError(
+            f"folds by concepts need the columns {' and '.join(columns)}, which these episodes lack. Use folds by "
+            "groups, or add the columns."
+        )
+    concepts = np.sort(episodes[columns].to_numpy(dtype=str), axis=1)
+    _, pair_of = np.unique(concepts, axis=0, return_inverse=True)
+    return np.array([f"concepts-{component}" for component in _components(groups, pair_of.ravel())])
+
+
+def _components(groups: NDArray[np.str_], pairs: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(E,) connected component of every episode, where a group or a pair of concepts in common connects."""
+    from scipy.sparse import coo_array  # type: ignore[import-untyped]
+    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+
+    names, group_of = np.unique(groups, return_inverse=True)
+    nodes = names.size + int(pairs.max()) + 1
+    ties = coo_array((np.ones(pairs.size), (group_of, names.size + pairs)), shape=(nodes, nodes))
+    component: NDArray[np.intp] = connected_components(ties, directed=False)[1][group_of].astype(np.intp)
+    return component
 
 
 def assign_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> NDArray[np.intp]:

@@ -1,8 +1,12 @@
 """Is it signal? Labels that could have been, and how often they score as well.
 
-A relabelling treats an item as a whole, because its two layouts are the same question: under "the answer is
-not encoded" every relabelling is as likely as the real labels, which makes the p-values exact.
+A relabelling treats a group of items as a whole, because items that share a picture share features: flipped one
+by one, they would look more independent than they are. It keeps the number of episodes of each class, because a
+probe that names the larger class is no signal. Under "the answer is not encoded" every such relabelling is as
+likely as the real labels, which makes the p-values exact.
 """
+
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,26 +23,98 @@ def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: in
     return flipped
 
 
-def exchange_items(
-    labels: NDArray[np.bool_], items: ArrayLike, layouts: ArrayLike, count: int, seed: int
-) -> NDArray[np.bool_]:
-    """`count` relabellings (E, count) in which items exchange their labels, layout by layout.
+ENUMERATED_BELOW = 12
+"""With fewer groups every relabelling there is is made, 1,023 at most where all groups are balanced."""
 
-    labels: (E,). items, layouts: (E,). Only items present in the same layouts are exchanged. Keeps the share
-    of every class, and so any side preference: right for the chosen side.
+
+def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
+    """About `count` relabellings (E, P) that flip all labels of some groups and keep the size of both classes.
+
+    labels: (E,). groups: (E,) group of every episode. A group with as many episodes of either class is flipped or
+    not, freely; the others exchange their signs among those with the same surplus. Right for the correct side,
+    which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all relabellings but the real
+    one, in an order drawn from `seed`, and none that only mirrors another: a probe of mirrored labels is as
+    accurate.
     """
-    names, item_of = np.unique(np.asarray(items), return_inverse=True)
-    kinds, layout_of = np.unique(np.asarray(layouts), return_inverse=True)
-    row = np.full((names.size, kinds.size), -1)
-    row[item_of, layout_of] = np.arange(labels.size)
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    surplus = 2 * np.bincount(group_of[labels], minlength=names.size) - np.bincount(group_of)
+    generator = np.random.default_rng(seed)
+    if count == 0:
+        flips = np.zeros((names.size, 0), bool)
+    elif names.size < ENUMERATED_BELOW:
+        flips = generator.permutation(_every_flip(surplus), axis=1)
+    else:
+        flips = _drawn_flips(surplus, count, generator)
+    flipped: NDArray[np.bool_] = labels[:, None] ^ flips[group_of]
+    return flipped
 
+
+def _drawn_flips(surplus: NDArray[np.int64], count: int, generator: np.random.Generator) -> NDArray[np.bool_]:
+    """(G, count) flips by chance; groups of one surplus exchange their signs."""
+    flips = generator.random((surplus.size, count)) < 0.5
+    for size in np.unique(np.abs(surplus[surplus != 0])):
+        alike = np.flatnonzero(np.abs(surplus) == size)
+        signs = np.repeat(surplus[alike, None] > 0, count, axis=1)
+        flips[alike] = generator.permuted(signs, axis=0) != signs
+    return flips
+
+
+def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(G, P) all flips that keep the sum of every surplus but no flip at all, and one of every mirrored two."""
+    numbers = np.arange(2**surplus.size)
+    flips = (numbers >> np.arange(surplus.size)[:, None]) & 1 == 1
+    keeps = np.ones(numbers.size, bool)
+    mirrored = True
+    for size in np.unique(np.abs(surplus[surplus != 0])):
+        alike = np.abs(surplus) == size
+        keeps &= (np.where(flips[alike], -1, 1) * surplus[alike, None]).sum(axis=0) == surplus[alike].sum()
+        mirrored &= bool(surplus[alike].sum() == 0)
+    if mirrored:
+        keeps &= ~flips[0]
+    keeps[0] = False
+    kept: NDArray[np.bool_] = flips[:, keeps]
+    return kept
+
+
+def exchange_groups(
+    labels: NDArray[np.bool_], groups: ArrayLike, items: ArrayLike, layouts: ArrayLike, count: int, seed: int
+) -> NDArray[np.bool_]:
+    """`count` relabellings (E, count) in which groups exchange their labels, layout by layout.
+
+    labels, groups, items, layouts: (E,). Only groups whose items are present in the same layouts are exchanged.
+    Keeps the share of every class, and so any side preference: right for the chosen side.
+    """
     generator = np.random.default_rng(seed)
     exchanged = np.repeat(labels[:, None], count, axis=1)
-    for present in np.unique(row >= 0, axis=0):
-        rows = row[((row >= 0) == present).all(axis=1)][:, present]
+    shaped = sorted(_shapes(groups, items, layouts), key=lambda shaped: shaped[0])
+    for _, alike in groupby(shaped, key=lambda shaped: shaped[0]):
+        rows = np.array([episodes for _, episodes in alike])
         for draw in range(count):
             exchanged[rows, draw] = labels[rows[generator.permutation(len(rows))]]
     return exchanged
+
+
+Shape = tuple[tuple[str, ...], ...]
+"""The layouts in which each item of a group is present."""
+
+
+def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tuple[Shape, list[int]]]:
+    """Shape and episodes of every group, the episodes in the order of the shape."""
+    members: dict[str, dict[str, dict[str, int]]] = {}
+    columns = (np.asarray(column).astype(str).tolist() for column in (groups, items, layouts))
+    for row, (group, item, layout) in enumerate(zip(*columns, strict=True)):
+        members.setdefault(group, {}).setdefault(item, {})[layout] = row
+    found = []
+    for of_group in members.values():
+        ordered = sorted((tuple(sorted(rows)), item) for item, rows in of_group.items())
+        episodes = [of_group[item][layout] for present, item in ordered for layout in present]
+        found.append((tuple(present for present, _ in ordered), episodes))
+    return found
+
+
+def smallest_p(relabellings: int) -> float:
+    """The smallest p-value that so many relabellings can give; 1 without any."""
+    return 1 / (1 + relabellings)
 
 
 def site_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -46,7 +122,7 @@ def site_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[
 
     NaN without a null.
     """
-    return _p_value(observed, null)
+    return p_value(observed, null)
 
 
 def family_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -54,10 +130,11 @@ def family_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArra
 
     The probability that any site without signal falls below 0.05 is then at most 0.05. NaN without a null.
     """
-    return _p_value(observed, null.max(axis=0, keepdims=True) if observed.size else null)
+    return p_value(observed, null.max(axis=0, keepdims=True) if observed.size else null)
 
 
-def _p_value(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
+def p_value(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(S,) share of draws in `null` (S, P) or (1, P) that are as high as `observed` (S,), which counts as one."""
     draws = null.shape[1]
     if draws == 0:
         return np.full(observed.shape, np.nan)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit.errors import NonFiniteActivationError
 from probe_kit.train.arrays import to_numpy
 from probe_kit.train.features import Coordinates
 from probe_kit.train.folds import Fold, grouped_folds
@@ -72,8 +73,9 @@ def probe_site(
 ) -> SiteProbe:
     """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) relabellings.
 
-    Raises ProbeNotConvergedError.
+    Raises ProbeNotConvergedError, and NonFiniteActivationError for NaN or infinity.
     """
+    refuse_non_finite(samples)
     columns = np.column_stack([labels, relabellings])
     fitted = cross_validate(samples, columns, folds)
     decisions = _out_of_fold(fitted, folds)
@@ -85,6 +87,16 @@ def probe_site(
         spreads=np.array([fold.spread for fold in fitted]),
         null=correctness(decisions, columns)[:, 1:].mean(axis=0),
     )
+
+
+def refuse_non_finite(samples: Samples) -> None:
+    """Raise NonFiniteActivationError, naming the first broken episode by its number, if there is any."""
+    broken = samples.broken()
+    if broken.size:
+        raise NonFiniteActivationError(
+            f"{broken.size} of {len(samples.counts)} episodes hold NaN or infinity, first number {broken[0]}, "
+            "from 0 on; expected finite features. Leave these episodes out, or extract them again."
+        )
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import TooFewGroupsError
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.identity import derive_seed
-from probe_kit.train.permutation import exchange_items, flip_items
+from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.folds import fold_units
+from probe_kit.train.permutation import exchange_groups, flip_groups, smallest_p
 from probe_kit.train.probe import NestedFold, SiteProbe, nested_folds, probe_site
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import chance_level
@@ -22,6 +24,9 @@ if TYPE_CHECKING:
 
 POOLED = "all"
 """Category that holds the episodes of all categories."""
+
+MOST_OF_ONE_SIDE = 0.75
+"""Share of episodes with the same correct side above which a category is refused; it is 0.5 if none is missing."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +49,33 @@ class CategoryProblem:
     def probe(self, samples: Samples) -> SiteProbe:
         """Probe one site; `samples` are those of all the run's episodes."""
         drawn = self.relabellings if samples.pools else self.relabellings[:, : self.token_permutations]
-        return probe_site(samples.of(self.rows), self.labels, drawn, self.folds)
+        return self.fit(samples.of(self.rows), drawn)
+
+    def fit(self, samples: Samples, relabellings: NDArray[np.bool_]) -> SiteProbe:
+        """Probe the samples of this category's episodes, and again for every column of (E, P) relabellings."""
+        return probe_site(samples, self.labels, relabellings, self.folds)
 
 
 def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:
-    """The probing problem of one category, or of all episodes for `POOLED`. Raises TooFewGroupsError."""
+    """The probing problem of one category, or of all episodes for `POOLED`.
+
+    Raises TooFewGroupsError, UnbalancedEpisodesError and, for concept folds without concepts, UsageError.
+    """
     defined = target_labels(episodes, settings.target, settings.seed)
     chosen = (episodes["category"] == category).to_numpy() | (category == POOLED)
+    if settings.incomplete == "drop":
+        chosen &= _complete(episodes)
     rows = np.flatnonzero(chosen & (defined >= 0))
     table, labels = episodes.iloc[rows], defined[rows] == 1
-    groups = table["group_id"].to_numpy(dtype=str)
-    if settings.target != "chosen" and chance_level(labels) > 0.5:
-        warnings.warn(
-            f"category {category!r}: classes are not balanced, chance is {chance_level(labels):.3f}; "
-            "expected 0.5 with both layouts of every item. Episodes are missing from the run.",
-            stacklevel=3,
-        )
+    groups = fold_units(table, settings.folds)
+    if settings.target != "chosen":
+        _check_balance(labels, category)
     try:
         folds = nested_folds(labels, groups, derive_seed("folds", settings.seed, category))
     except TooFewGroupsError as error:
         raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
+    relabellings = _relabel(table, labels, groups, category, settings, folds)
+    _check_power(relabellings.shape[1], category, settings)
     return CategoryProblem(
         rows=rows,
         labels=labels,
@@ -71,14 +83,49 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
         groups=groups,
         episodes=table["episode_id"].to_numpy(dtype=str),
         folds=folds,
-        relabellings=_relabel(table, labels, category, settings, folds),
+        relabellings=relabellings,
         token_permutations=settings.token_permutations,
     )
+
+
+def _complete(episodes: "pd.DataFrame") -> NDArray[np.bool_]:
+    """(E,) whether all layouts that the run has are there of an episode's item."""
+    layouts = episodes.groupby("item_id")["layout"].transform("nunique")
+    complete: NDArray[np.bool_] = (layouts == episodes["layout"].nunique()).to_numpy()
+    return complete
+
+
+def _check_balance(labels: NDArray[np.bool_], category: str) -> None:
+    """Warn of sides that are not equally often correct; raise UnbalancedEpisodesError if one nearly always is."""
+    share = chance_level(labels) if labels.size else 0.5
+    if share == 0.5:
+        return
+    seen = (
+        f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
+        "of every item. Episodes are missing from the run."
+    )
+    if share > MOST_OF_ONE_SIDE:
+        raise UnbalancedEpisodesError(
+            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. Extract the missing episodes again, or "
+            "leave out the other layout of their items (--incomplete drop, incomplete='drop')."
+        )
+    warnings.warn(f"{seen} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
+
+
+def _check_power(relabellings: int, category: str, settings: ProbeSettings) -> None:
+    """Warn where the groups allow no result to be significant."""
+    if relabellings < settings.permutations and (least := smallest_p(relabellings)) >= SIGNIFICANCE:
+        warnings.warn(
+            f"category {category!r}: its groups allow {relabellings} relabellings, the smallest possible p is "
+            f"{least:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
+            stacklevel=4,
+        )
 
 
 def _relabel(
     table: "pd.DataFrame",
     labels: NDArray[np.bool_],
+    groups: NDArray[np.str_],
     category: str,
     settings: ProbeSettings,
     folds: list[NestedFold],
@@ -87,8 +134,8 @@ def _relabel(
     seed = derive_seed("relabelling", settings.seed, category)
     count = max(settings.permutations, settings.token_permutations)
     if settings.target == "chosen":
-        drawn = exchange_items(labels, table["item_id"], table["layout"], count, seed)
+        drawn = exchange_groups(labels, groups, table["item_id"], table["layout"], count, seed)
     else:
-        drawn = flip_items(labels, table["item_id"], count, seed)
+        drawn = flip_groups(labels, groups, count, seed)
     shares = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
     return drawn[:, ((shares > 0) & (shares < 1)).all(axis=0)]

@@ -11,10 +11,10 @@ import numpy as np
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import sha256_json
-from probe_kit.train.controls import Controls
+from probe_kit.train.controls import Controls, signal
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction, Place
-from probe_kit.train.permutation import site_p
+from probe_kit.train.permutation import site_p, smallest_p
 from probe_kit.train.reader import RunReader
 from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss, units_seed
 from probe_kit.train.settings import ProbeSettings
@@ -57,7 +57,10 @@ class ProbeResults:
         `accuracy` with its 95 % interval over groups (`ci_low`, `ci_high`), `p` of the site alone, `p_fwe`
         against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per
         outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
-        consistent within an item, `selectivity` the accuracy above it; NaN without relabellings.
+        consistent within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`:
+        no p-value can be lower with so many relabellings. `beats_binding`, `beats_twin`: whether the site is
+        better than that control, missing where it was not run; `signal`: than chance, family-wise, and every
+        control that was run.
         """
         import pandas as pd
 
@@ -66,7 +69,8 @@ class ProbeResults:
             for (category, view), curve in self.curves.items()
             for row in _score_rows(self, category, view, curve)
         ]
-        return pd.DataFrame(rows).astype({"iteration": "Int64"})
+        kinds = {"iteration": "Int64", "beats_binding": "boolean", "beats_twin": "boolean"}
+        return pd.DataFrame(rows).astype(kinds)
 
     def direction(self, category: str, view: str, site: Site) -> Direction:
         """The probes' weights at a site, in raw features. Raises UnknownSiteError if it was not probed."""
@@ -89,6 +93,10 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
     accuracy = correct.mean(axis=1)
     low, high = group_bootstrap(correct.T, curve.groups, units_seed(curve.groups, settings.suite))
     p, p_fwe, control = site_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
+    beats = [
+        results.controls.beats(category, view, str(site), float(p_site))
+        for site, p_site in zip(curve.sites, p_fwe, strict=True)
+    ]
     return [
         {
             "model": settings.model,
@@ -118,6 +126,10 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
             "C": " ".join(f"{strength:g}" for strength in curve.strengths[row]),
             "fold_accuracy": " ".join(f"{correct[row, fold.test].mean():.4f}" for fold in folds),
             "settings": settings.key,
+            "smallest_p": smallest_p(curve.null.shape[1]),
+            "beats_binding": beats[row]["binding"],
+            "beats_twin": beats[row]["twin"],
+            "signal": signal(beats[row]),
         }
         for row, site in enumerate(curve.sites)
     ]

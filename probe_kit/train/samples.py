@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.views import resolve_view
-from probe_kit.train.arrays import Array, to_device
+from probe_kit.train.arrays import Array, to_device, to_numpy
 from probe_kit.train.reader import RunReader, Tokens
 from probe_kit.train.rows import ChosenRows, Features
 
@@ -58,6 +58,11 @@ class Samples:
     def pools(self) -> bool:
         """Whether every episode is a single sample."""
         return len(self.counts) == len(self.features)
+
+    def broken(self) -> NDArray[np.intp]:
+        """Episodes with a feature that is NaN or infinite: such a sample shows in its episode's mean."""
+        means = to_numpy(self.means)
+        return np.flatnonzero(~np.isfinite(means).all(axis=1))
 
     def of(self, episodes: NDArray[np.intp]) -> "Samples":
         """The samples of some episodes, in this order."""
@@ -111,7 +116,7 @@ def read_samples(run: RunReader, view: str, site: Site) -> Samples:
         samples = Samples.tokens(run.iter_token_blocks(site, role), run.token_mask(site, role))
     else:
         samples = Samples.pooled(run.column(site, view))
-    broken = np.flatnonzero(~np.isfinite(samples.means).all(axis=1))
+    broken = samples.broken()
     if broken.size:
         raise NonFiniteActivationError(
             f"{site}, view {view!r}, of {run.location} holds NaN or infinity in {broken.size} of "

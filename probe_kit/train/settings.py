@@ -3,9 +3,10 @@
 from dataclasses import asdict, dataclass
 
 from probe_kit.identity import sha256_json
-from probe_kit.train.targets import Target
+from probe_kit.train.folds import FoldUnit
+from probe_kit.train.targets import Incomplete, Target
 
-FORMAT = 3  # raise when settings have other fields or would give other numbers
+FORMAT = 4  # raise when settings have other fields or would give other numbers
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class ProbeSettings:
     permutations: int
     seed: int
     token_permutations: int = 0  # 0 where no token view is probed
+    folds: FoldUnit = "groups"
+    incomplete: Incomplete = "keep"
     format: int = FORMAT
     call: int = 0  # captured inference, counted from 0
 

@@ -64,9 +64,12 @@ def _write_header(run: Location, key: str, header: Mapping[str, Any]) -> None:
 
 
 def _save_controls(results: ProbeResults, run: Location) -> None:
-    """Write the controls beside the probes, over former ones; nothing where nothing was controlled."""
+    """Write the controls beside the probes, over former ones, and what the scores say of them; nothing where
+    nothing was controlled.
+    """
     if results.controls != Controls():
         content = json.dumps(results.controls.to_json(), indent=2)
+        run.write(f"{HOME}/{results.key}/{SCORES}", results.scores.to_csv(index=False).encode())
         run.write(f"{HOME}/{results.key}/{CONTROLS}", content.encode())
 
 

@@ -15,13 +15,14 @@ from probe_kit.train.baselines import Baseline
 from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction
+from probe_kit.train.folds import FoldUnit
 from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.store import is_stored, load_results, save_results
-from probe_kit.train.targets import Target
+from probe_kit.train.targets import Incomplete, Target
 from probe_kit.train.unfinished import Unfinished
 from probe_kit.train.workers import probe_columns
 
@@ -38,6 +39,8 @@ def train_probes(
     token_permutations: int = 59,
     target: Target = "correct",
     call: int = 0,
+    folds: FoldUnit = "groups",
+    incomplete: Incomplete = "keep",
     controls: Sequence[Baseline] = (),
     suite: Path | None = None,
     twin: RunReader | None = None,
@@ -53,8 +56,11 @@ def train_probes(
     `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'.
     permutations: relabellings behind the p-values, of which token views, many times as dear, take the first
     `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
-    out. controls: baselines that never see the model, of `position`, `instruction` and `pixels`,
-    which needs the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
+    out. folds: `concepts` also keeps items about the same two concepts together.
+    incomplete: `drop` leaves out items of which an episode is missing.
+    controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`,
+    which need the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
+    What is no better than `binding` and the twin is no signal, whatever its p-value.
     jobs: processes that probe, this one alone by default; with more than one, a script needs
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
     ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
@@ -66,19 +72,22 @@ def train_probes(
     interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
     stored before all of it is fitted: where this raises, `load_results` finds what it found before.
     Raises NoProbesError for a run without activations, UnknownCategoryError, UnknownSiteError for a view no
-    stream has, TooFewGroupsError, ProbeNotConvergedError, UsageError, and SuiteError for another suite.
+    stream has, TooFewGroupsError, UnbalancedEpisodesError, ProbeNotConvergedError, UsageError, and SuiteError for
+    another suite.
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
     crew = CrewSettings(jobs, device, ray)
     run = at_call(run, call)
-    settings = _settings(run, categories, views, target, permutations, token_permutations, seed, call)
-    sweep = _Sweep.of(run, settings, crew, progress)
+    asked = _settings(
+        run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
+    )
+    sweep = _Sweep.of(run, asked, crew, progress)
     prepared = prepare_baselines(run, controls, suite, sweep.stored)
     beside = None
     if twin is not None:
         twin = at_call(twin, call)
         other = _settings(
-            twin, sweep.settings.categories, views, target, permutations, token_permutations, seed, call
+            twin, asked.categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
         )
         check_twin(run, twin, other)
         beside = _Sweep.of(twin, other, crew, progress)
@@ -153,6 +162,8 @@ def _settings(
     categories: Sequence[str] | None,
     views: Sequence[str],
     target: Target,
+    folds: FoldUnit,
+    incomplete: Incomplete,
     permutations: int,
     token_permutations: int,
     seed: int,
@@ -178,6 +189,8 @@ def _settings(
         seed=seed,
         token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
         call=call,
+        folds=folds,
+        incomplete=incomplete,
     )
 
 

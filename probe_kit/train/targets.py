@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Target = Literal["correct", "chosen", "shuffled"]
+Incomplete = Literal["keep", "drop"]
+INCOMPLETE: dict[str, str] = {
+    "keep": "items of which a layout is missing take part with the other",
+    "drop": "they do not: the classes are balanced again",
+}
 TARGETS: dict[str, str] = {
     "correct": "side of the correct picture",
     "chosen": "side on which the cube was placed; episodes outside both zones are left out",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probe_kit.train.permutation import family_p, flip_items, site_p
+from probe_kit.train.permutation import family_p, flip_groups, site_p
 from probe_kit.train.probe import nested_folds, probe_site
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness
@@ -16,7 +16,7 @@ def p_values(seed: int, sites: int, relabellings: int) -> tuple[np.ndarray, np.n
     """Per-site and family-wise p of `sites` correlated sites of noise."""
     generator = np.random.default_rng(seed)
     shared = generator.standard_normal((40, 6))
-    columns = flip_items(LABELS, ITEMS, relabellings, seed)
+    columns = flip_groups(LABELS, ITEMS, relabellings, seed)
     folds = nested_folds(LABELS, ITEMS, seed)
     probes = [
         probe_site(Samples.pooled(shared + generator.standard_normal((40, 6))), LABELS, columns, folds)

@@ -4,7 +4,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from probe_kit.errors import TooFewGroupsError
+from probe_kit.errors import NonFiniteActivationError, TooFewGroupsError
 from probe_kit.extract.store.rows import TokenBlock
 from probe_kit.train.folds import Fold
 from probe_kit.train.permutation import flip_items
@@ -163,3 +163,13 @@ def test_torch_gives_the_numbers_of_numpy(samples: Samples) -> None:
     np.testing.assert_allclose(torch_probe.decisions, numpy_probe.decisions, rtol=0, atol=1e-9 * scale)
     np.testing.assert_array_equal(torch_probe.strengths, numpy_probe.strengths)
     np.testing.assert_array_equal(torch_probe.null, numpy_probe.null)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_features_that_are_not_finite_are_refused_by_number(broken: float) -> None:
+    """A NaN makes every decision of its fold "right side" and scores like chance, silently."""
+    features = FEATURES.copy()
+    features[7, 3] = broken
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    with pytest.raises(NonFiniteActivationError, match="1 of 60 episodes hold NaN or infinity, first number 7"):
+        probe_site(Samples.pooled(features), LABELS, NONE, folds)

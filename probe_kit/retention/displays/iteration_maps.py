@@ -59,7 +59,7 @@ class IterationMapDisplay(Shown):
         scores = scores[(scores["stream"] == stream) & scores["iteration"].notna()]
         if scores.empty:
             raise UnknownSiteError(f"stream {stream!r} in view {view!r} has no iterations; see the layer curve")
-        grid = scores.pivot(index="iteration", columns="layer", values=["accuracy", "p_fwe"])
+        grid = scores.pivot(index="iteration", columns="layer", values=["accuracy", "signal"])
         return cls(
             category=category,
             view=view,
@@ -67,7 +67,7 @@ class IterationMapDisplay(Shown):
             chance=curve.chance,
             depth=np.sort(scores["depth"].unique()),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
-            significant=grid["p_fwe"].to_numpy(dtype=float) < SIGNIFICANCE,
+            significant=grid["signal"].to_numpy(dtype=bool),
             certificate=Certificate.of_results(results, view),
         )
 

@@ -13,7 +13,6 @@ from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, darker, plain, series, spell
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.train.controls import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +91,6 @@ def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     accuracy = row.prefix_accuracy if prefix else row.action_accuracy
     if accuracy is None:
         return None
-    p_fwe = row.prefix_p_fwe if prefix else row.action_p_fwe
     return GapPoint(
         model=model_name(row),
         category=row.category,
@@ -100,7 +98,7 @@ def _point(row: RetentionRow, stream: str) -> GapPoint | None:
         accuracy_ci=row.prefix_ci if prefix else row.action_ci,
         sr=row.sr,
         sr_ci=row.sr_ci,
-        significant=p_fwe is not None and p_fwe < SIGNIFICANCE,
+        significant=row.prefix_signal if prefix else row.action_signal,
     )
 
 

@@ -73,7 +73,7 @@ class StreamCurve:
             high=high,
             least=by_depth.min().to_numpy(dtype=float),
             most=by_depth.max().to_numpy(dtype=float),
-            significant=(best["p_fwe"] < SIGNIFICANCE).to_numpy(dtype=bool),
+            significant=best["signal"].to_numpy(dtype=bool),
             iterations=int(scores["iteration"].nunique()) or 1,
         )
 
@@ -82,8 +82,9 @@ class StreamCurve:
 class LayerCurveDisplay(Shown):
     """Held-out accuracy against depth, for one category in one view.
 
-    Filled markers are above chance against the best site of their stream (family-wise p < 0.05). Grey: chance,
-    and `null_band`, which holds 95 % of the accuracies under relabelling; None below 20 relabellings.
+    Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above binding
+    and twin where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
+    relabelling; None below 20 relabellings.
     """
 
     category: str
@@ -138,7 +139,8 @@ def layer_curve(results: ProbeResults, view: str | None = None) -> "Figure":
     """Held-out accuracy against depth for every category, as a matplotlib figure (`figure.savefig(…)`).
 
     Lines: backbone, and the expert's best iteration with a band over all its iterations; bars: 95 % intervals
-    over groups. Filled markers are above chance against the best site of their stream (family-wise p < 0.05).
+    over groups. Filled markers are above chance against the best site of their stream (family-wise p < 0.05),
+    and above binding and twin where those were run.
     Grey: chance, and the band that holds 95 % of the accuracies under relabelling. view: the first probed one
     by default. Raises UnknownSiteError for a view that was not probed.
     """

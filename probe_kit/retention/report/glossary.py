@@ -58,6 +58,11 @@ GLOSSARY = MappingProxyType(
             "Probability that the best layer of a stream looks this good when the answers are relabelled at "
             "random. It allows for having looked at all layers (family-wise)."
         ),
+        "beats": (
+            "What the best layer is better than, family-wise and paired by question: chance; binding, an "
+            "untrained conjunction of pictures and words; the twin, the same network with random weights. Only "
+            "what beats all that was tried is knowledge; against chance alone a random network can look knowing."
+        ),
         "retention": (
             "(action − chance) / (backbone − chance): the share of what can be read in the backbone that can "
             "still be read where the action is made. Biased upwards when signals are weak: both are maxima."

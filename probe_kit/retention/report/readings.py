@@ -7,7 +7,7 @@ from probe_kit.retention.cells import model_name, percent
 from probe_kit.retention.displays.style import spell
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.train.controls import SIGNIFICANCE, Beats
 
 _MOSTLY = 0.5  # share of episodes above which something is said first
 
@@ -81,7 +81,7 @@ def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
         found.append(_knowledge(rows))
     if any(row.retention is not None for row in rows):
         found.append(_retention(mean, rows))
-    if mean.gap is not None and any(_clear(row.prefix_p_fwe) for row in rows):
+    if mean.gap is not None and any(row.prefix_signal for row in rows):
         found.append(
             f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
             f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
@@ -98,18 +98,24 @@ def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
 
 
 def _knowledge(rows: Sequence[RetentionRow]) -> str:
-    backbone = [row for row in rows if _clear(row.prefix_p_fwe)]
-    expert = [row for row in rows if _clear(row.action_p_fwe)]
-    text = f"A linear probe reads the answer above chance in the backbone in {_of(backbone, rows)}"
+    backbone = [row for row in rows if row.prefix_signal]
+    expert = [row for row in rows if row.action_signal]
+    text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
     if any(row.action_accuracy is not None for row in rows):
         text += f", and in the {rows[0].action_name} in {_of(expert, rows)}"
     return f"{text}."
 
 
+def _judge(rows: Sequence[RetentionRow]) -> str:
+    """What had to be beaten."""
+    names = [name for name in ("binding", "twin") if any(row.prefix_beats.get(name) is not None for row in rows)]
+    return f"chance, {' and '.join(names)}" if names else "chance (no control was run)"
+
+
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
     counted = [row for row in rows if row.retention_defined]
     if not counted or mean.retention_debiased is None:
-        return "Retention is not defined: where the backbone is at chance, there is nothing to retain."
+        return "Retention is not defined: where the backbone knows no more than the controls, nothing is retained."
     left = f" ({len(mean.left_out)} left out for lack of a backbone signal)" if mean.left_out else ""
     return (
         f"Of what can be read in the backbone above chance, a share of {mean.retention_debiased:.2f} can still be "
@@ -153,27 +159,26 @@ def read_row(row: RetentionRow) -> list[str]:
     if row.prefix_accuracy is not None:
         found.append(
             f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
-            f"{row.prefix_depth:.2f}: {_clear_words(row.prefix_p_fwe)}."
+            f"{row.prefix_depth:.2f}: {_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
         )
     if row.action_accuracy is not None:
         step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
         found.append(
             f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}: "
-            f"{_clear_words(row.action_p_fwe)}."
+            f"{_clear_words(row.action_p_fwe, row.action_beats)}."
         )
     if row.retention_defined and row.retention_debiased is not None:
         found.append(f"Debiased retention {row.retention_debiased:.2f} ({_interval_words(row)}).")
     return found
 
 
-def _clear(p: float | None) -> bool:
-    return p is not None and p < SIGNIFICANCE
-
-
-def _clear_words(p: float | None) -> str:
+def _clear_words(p: float | None, beats: Beats) -> str:
     if p is None:
         return "not tested, for lack of relabellings"
-    return f"{'above chance' if _clear(p) else 'not above chance'}, p = {p:.3f}"
+    controls = {"binding": "an untrained conjunction of pictures and words", "twin": "its twin"}
+    equals = [words for name, words in controls.items() if beats.get(name) is False]
+    clear = "above chance" if p < SIGNIFICANCE else "not above chance"
+    return f"{clear}{f' but no better than {" and ".join(equals)}' if equals else ''}, p = {p:.3f}"
 
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:

@@ -7,6 +7,7 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    beats,
     controlled,
     debiased_value,
     difference_title,
@@ -163,13 +164,13 @@ _RETENTION = [
     _VIEW,
     _Column(
         "backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent),
-        lambda row: row.prefix_accuracy, "backbone", strong=lambda row: _is_low(row.prefix_p_fwe),
+        lambda row: row.prefix_accuracy, "backbone", strong=lambda row: row.prefix_signal,
     ),
     _Column("layer", lambda row: place(row.prefix_layer), lambda row: row.prefix_layer, "layer"),
     _Column("p", lambda row: _p(row.prefix_p_fwe), lambda row: row.prefix_p_fwe, "p"),
     _Column(
         "action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent),
-        lambda row: row.action_accuracy, "action", strong=lambda row: _is_low(row.action_p_fwe),
+        lambda row: row.action_accuracy, "action", strong=lambda row: row.action_signal,
     ),
     _Column(
         "layer @iteration", lambda row: place(row.action_layer, row.action_iteration),
@@ -184,6 +185,7 @@ _RETENTION = [
         "debiased [95 %]", debiased_value, _debiased, "debiased", _debiased,
     ),
     _Column("gap", lambda row: percent(row.gap), lambda row: row.gap, "gap"),
+    _Column("backbone beats", beats, beats, "beats"),
     _share("chance %", "chance", "chance"),
     _Column(
         "groups", lambda row: "–" if row.n_groups is None else str(row.n_groups), lambda row: row.n_groups,
