@@ -49,7 +49,9 @@ class BindingInputs:
         return outputs
 
 
-def binding_scores(results: ProbeResults, run: RunReader, suite: Path) -> tuple[list[BaselineScore], list[Excess]]:
+def binding_scores(
+    results: ProbeResults, run: RunReader, inputs: BindingInputs
+) -> tuple[list[BaselineScore], list[Excess]]:
     """The control's accuracy per category, as wide as the backbone, and every site held against it.
 
     A site is held against layers of its own stream's width, on the same folds.

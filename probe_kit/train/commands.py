@@ -183,6 +183,10 @@ def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":
     return tuple(cast("Baseline", _one_of("control", name, BASELINES)) for name in split(names) or ())
 
 
+def _default_controls(suite: Path | None) -> "tuple[Baseline, ...]":
+    return () if suite is None else ("binding",)
+
+
 def _embedded_suite(run: "RunReader") -> Path | None:
     """Folder of the embedded suite, if the run's pictures come from it."""
     from probe_kit.errors import SuiteError
