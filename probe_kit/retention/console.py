@@ -11,6 +11,7 @@ from probe_kit.retention.cells import (
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
     Column,
+    beats,
     controlled,
     debiased_value,
     difference_title,
