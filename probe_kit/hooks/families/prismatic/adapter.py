@@ -5,7 +5,6 @@ one the positions whose logits choose the output: the prompt's last token, then 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
@@ -26,35 +25,13 @@ from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.views import PADDING
+from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
 
 CAMERA = "primary"
 # The frame around a question that prism-dinosiglip-224px+7b and its siblings without a chat were trained with.
 _FRAME = "In: {}\nOut:"
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
-
-
-@dataclass(frozen=True)
-class Packed:
-    """Prompts as one batch: ids (B, T) int64 and mask (B, T) bool, False at padding.
-
-    Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
-    is in the batch. Positions count tokens only, so the network computes the same numbers as without padding.
-    """
-
-    ids: Tensor
-    mask: Tensor
-
-    @classmethod
-    def of(cls, rows: Sequence[Sequence[int]], padding: int) -> "Packed":
-        """Pack one prompt per row."""
-        longest = max(map(len, rows))
-        ids = torch.full((len(rows), longest), padding)
-        mask = torch.zeros((len(rows), longest), dtype=torch.bool)
-        for index, row in enumerate(rows):
-            ids[index, : len(row) - 1], ids[index, -1] = torch.tensor(row[:-1]), row[-1]
-            mask[index, : len(row) - 1], mask[index, -1] = True, True
-        return cls(ids, mask)
 
 
 class PrismaticModel(Model):

@@ -7,7 +7,7 @@ import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_model, load_policy
-from probe_kit.hooks.families.prismatic.adapter import Packed, Prismatic, load_prismatic
+from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.verify import verify_reference
 from tests.prismatic_checkpoints import write_checkpoint
 
@@ -27,12 +27,6 @@ def test_the_golden_reference_is_reproduced(golden_prismatic: Path) -> None:
     assert ok == {
         "pixel_values", "vision_patches", "projector_features", "hidden_states", "logits", "generated_ids",
     }  # fmt: skip
-
-
-def test_padding_stands_before_the_last_token_so_that_no_other_token_moves() -> None:
-    packed = Packed.of([[1, 7, 8, 9, 10], [1, 7, 29]], padding=0)
-    assert packed.ids.tolist() == [[1, 7, 8, 9, 10], [1, 7, 0, 0, 29]]
-    assert packed.mask.tolist() == [[True] * 5, [True, True, False, False, True]]
 
 
 def test_both_streams_together_are_the_hidden_states_of_one_pass(
