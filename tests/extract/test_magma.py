@@ -43,7 +43,8 @@ def acting(small_suite: Suite, folder: Path, tmp_path_factory: pytest.TempPathFa
 def talking(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Weights that put out anything but actions."""
     folder = write_checkpoint(tmp_path_factory.mktemp("talking"), steered=False)
-    return extract_run(settings("magma", small_suite, folder), tmp_path_factory.mktemp("runs") / "talking")
+    chosen = settings("magma", small_suite, folder, tokens="all")
+    return extract_run(chosen, tmp_path_factory.mktemp("runs") / "talking")
 
 
 def test_a_run_has_both_streams_and_every_role(acting: Run) -> None:
@@ -64,6 +65,15 @@ def test_steps_without_an_action_are_counted_per_episode(acting: Run, talking: R
     assert acting.episodes["flagged_steps"].tolist() == [0] * 24
     assert talking.episodes["flagged_steps"].tolist() == [STEPS] * 24
     assert (talking.episodes["outcome"] == "oob").all()
+
+
+def test_tokens_are_stored_by_role(talking: Run) -> None:
+    """256 pixels make 2 x 2 crops of 64: a map of 4 x 4 places and a separator behind each of its rows."""
+    site = Site("backbone", 0)
+    for role, count in (("image", 16), ("separator", 4)):
+        values, mask = talking.tokens(site, role=role)
+        assert mask.sum(axis=1).tolist() == [count] * 24
+        assert np.abs(values[mask]).max() > 0
 
 
 def test_protocol_and_units_are_part_of_a_runs_identity(acting: Run, small_suite: Suite, folder: Path) -> None:

@@ -110,20 +110,24 @@ class ChatText:
         self._refuse_markers(question + begun)
         turn = picture_question(question, self.config.image_start_end)
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
+        start, stop = self._place(turn, frames)
         encoding = self._tokenizer.encode(frames + begun)
-        # Templates strip what a turn says, so the question's own outer spaces may be gone.
-        bare = question.strip()
-        start = frames.rfind(bare)
-        if start < 0:
-            raise CheckpointError(
-                f"the chat template in {self.folder} changes the words of the question: {bare!r} is not in "
-                f"{frames!r}. Take the template the model was trained with"
-            )
         inside = tuple(
-            not special and first < start + len(bare) and last > start
+            not special and first < stop and last > start
             for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
         )
         return Prompt(tuple(encoding.ids), inside)
+
+    def _place(self, turn: str, frames: str) -> tuple[int, int]:
+        """Where in `frames` the question of the user's turn begins and ends."""
+        said = turn.strip()  # as templates do
+        place = frames.find(said)
+        if place < 0:
+            raise CheckpointError(
+                f"the chat template in {self.folder} changes the words of a turn: {said!r} is not in {frames!r}. "
+                "Take the template the model was trained with"
+            )
+        return place + len(picture_question("", self.config.image_start_end)), place + len(said)
 
     def _refuse_markers(self, text: str) -> None:
         for token in self._tokenizer.get_added_tokens_decoder().values():

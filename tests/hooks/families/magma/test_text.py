@@ -30,6 +30,19 @@ def test_the_question_is_told_from_the_frames_around_it(folder: Path) -> None:
     assert "talk and act" in spoken.decode(frames[: frames.index(IDS["<|eot_id|>"])])
 
 
+@pytest.mark.parametrize("user_first", [False, True])
+@pytest.mark.parametrize("question", ["see", "user", "Is it <here>?", "a\nb"])
+def test_a_question_whose_words_stand_in_the_frames_too_is_found(
+    folder: Path, question: str, user_first: bool
+) -> None:
+    spoken = text(folder, user_first=user_first)
+    prompt = spoken.prompt(question)
+    places = [place for place, inside in enumerate(prompt.question) if inside]
+    assert spoken.decode([prompt.ids[place] for place in places]) == question
+    assert places == list(range(places[0], places[-1] + 1))
+    assert places[0] > prompt.ids.index(IDS["<image>"])
+
+
 def test_a_begun_answer_stands_behind_the_frames(folder: Path) -> None:
     spoken = text(folder)
     plain, begun = spoken.prompt("Which?"), spoken.prompt("Which?", "The answer is ")
