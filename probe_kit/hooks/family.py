@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,6 +26,8 @@ class Family:
     random_weights) gives a Model, and takes `weights_seed` if its random twins can differ; verifier(folder,
     recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device.
     options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, a Reader.
+    hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
+    config.json. packages: modules of an extra that it needs, with the name of that extra.
     unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
     `verify --keys` prints them.
     Raises UsageError if an option is not declared as an `Option`.
@@ -43,6 +46,8 @@ class Family:
     acts: bool = True
     reads: bool = False
     unstored: tuple[str, ...] = ()
+    hub: tuple[tuple[str, str], ...] = ()
+    packages: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -87,12 +92,16 @@ class Family:
 
     def missing(self) -> str:
         """What this machine lacks to load the default checkpoint; empty if it is ready."""
-        if self.default_checkpoint is None:
-            return ""
         from huggingface_hub import try_to_load_from_cache
 
-        here = isinstance(try_to_load_from_cache(self.default_checkpoint, "config.json"), str)
-        return "" if here else f"download of {self.default_checkpoint}"
+        files = self.hub
+        if self.default_checkpoint is not None and self.default_checkpoint not in dict(files):
+            files = ((self.default_checkpoint, "config.json"), *files)
+        absent = [name for name, file in files if not isinstance(try_to_load_from_cache(name, file), str)]
+        lacking = [f"extra {extra}" for module, extra in self.packages if find_spec(module) is None]
+        if absent:
+            lacking.append(f"download of {', '.join(absent)}")
+        return " and ".join(lacking)
 
 
 def check_machine(device: str, dtype: str | None) -> None:

@@ -46,3 +46,27 @@ def test_what_must_be_downloaded_is_said_before_it_is_tried(tmp_path, monkeypatc
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     assert known_families()["pi0-tiny"].missing() == ""
     assert "lerobot/pi0_base" in known_families()["pi0"].missing()
+
+
+def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tokenizer from another repository, a configuration that is no config.json, a package of an extra."""
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
+    known = known_families()
+    for name, needed in (
+        ("pi0", ("lerobot/pi0_base", "google/paligemma-3b-pt-224")),
+        ("smolvla", ("lerobot/smolvla_base", "HuggingFaceTB/SmolVLM2-500M-Video-Instruct")),
+        ("internvla-m1", ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "Qwen/Qwen2.5-VL-3B-Instruct")),
+        ("xiaomi-r0", ("XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",)),
+    ):
+        assert known[name].missing() == f"download of {', '.join(needed)}"
+    monkeypatch.setattr("probe_kit.hooks.family.find_spec", lambda _: None)
+    assert known["prismatic"].missing() == "extra openvla"
+    assert known["magma"].missing() == "extra magma and download of microsoft/Magma-8B"
+    there = ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml")
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *asked: "x" if asked == there else None)
+    assert known["internvla-m1"].missing() == "download of Qwen/Qwen2.5-VL-3B-Instruct"
+
+
+def test_the_seven_models_of_the_papers_tables_can_be_loaded_by_name() -> None:
+    acting = {name for name, family in known_families().items() if family.acts}
+    assert acting >= {"pi0", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0", "internvla-m1"}

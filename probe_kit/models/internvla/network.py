@@ -64,8 +64,8 @@ class InternVLANetwork(nn.Module):
         """
         keywords = inputs.keywords(self.vlm.model)
         states = self.vlm.model(**keywords, output_hidden_states=True, use_cache=False).hidden_states
-        seen = self.dino_pro(self.dino_encoder.body(views.to(self.dino_pro.weight.dtype)))
-        seen = seen.reshape(len(inputs.ids), -1, seen.shape[-1])
+        features = self.dino_encoder.body(views.to(self.dino_pro.weight.dtype))
+        seen = self.dino_pro(features.reshape(len(inputs.ids), -1, features.shape[-1]))
         chosen = states[self.config.query.first : self.config.query.last]
         condition: Tensor = self.layer_qformer([torch.cat([state, seen], dim=1) for state in chosen])
         return condition

@@ -14,6 +14,10 @@ FAMILIES = (
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
         verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
         full_size="probe_kit.models.internvla:full_size_internvla",
+        hub=(
+            ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),
+            ("Qwen/Qwen2.5-VL-3B-Instruct", "tokenizer.json"),
+        ),
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_dataset"),
             Option("steps", int, "DDIM steps; as many as divide the training's evenly.", "10"),

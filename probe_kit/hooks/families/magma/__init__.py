@@ -11,6 +11,7 @@ FAMILIES = (
         "probe_kit.hooks.families.magma.adapter:load_magma",
         streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
+        packages=(("timm", "magma"),),
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
         verifier="probe_kit.hooks.families.magma.verify:verify_magma",
         full_size="probe_kit.models.magma:full_size_magma",

@@ -12,6 +12,7 @@ FAMILIES = (
         "probe_kit.hooks.families.openvla.adapter:load_openvla",
         streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
+        packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
         verifier="probe_kit.hooks.families.prismatic.verify:verify_openvla",
         full_size="probe_kit.models.prismatic:full_size_openvla",

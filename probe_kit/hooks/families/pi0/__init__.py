@@ -31,6 +31,7 @@ FAMILIES = (
         "probe_kit.hooks.families.pi0.adapter:load_pi0",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes="Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
         verifier=_VERIFIER,
         full_size="probe_kit.models.pi0:full_size_pi0",

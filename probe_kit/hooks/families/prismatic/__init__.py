@@ -16,6 +16,7 @@ FAMILIES = (
         "probe_kit.hooks.families.prismatic.adapter:load_prismatic",
         streams="backbone 33 layers, answer 33 layers (7B)",
         embodiment="none: answers, does not act",
+        packages=(("timm", "openvla"),),
         notes="pass --checkpoint in the layout of PrismaticForConditionalGeneration; extra openvla",
         verifier="probe_kit.hooks.families.prismatic.verify:verify_prismatic",
         full_size="probe_kit.models.prismatic:full_size_prismatic",

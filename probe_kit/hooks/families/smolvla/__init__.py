@@ -10,6 +10,7 @@ FAMILIES = (
         "probe_kit.hooks.families.smolvla.adapter:load_smolvla",
         streams="backbone 17 layers, expert 17 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
+        hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
         notes="Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
         verifier="probe_kit.hooks.families.lerobot_verify:verify_smolvla",
         full_size="probe_kit.models.smolvla:full_size_smolvla",
