@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.measure import Peak, Retention
+from probe_kit.retention.success import units_of
 from probe_kit.train.curve import Curve
 from probe_kit.train.scores import GAINS, bootstrap_means, constant, draw_groups, interval, units_seed, unseen
 
@@ -70,12 +71,12 @@ def average(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
-    """SR of a table of episodes, whole items drawn."""
-    items = episodes["item_id"].to_numpy(dtype=str)
-    units = units_seed(items, suite)
+    """SR of a table of episodes, whole groups of items drawn."""
+    groups = units_of(episodes)
+    units = units_seed(groups, suite)
     correct = (episodes["outcome"] == "correct").to_numpy()
-    draws = bootstrap_means(correct[:, None], items, units)
-    return Estimate(float(correct.mean()), draws[:, 0], units, np.unique(items).size)
+    draws = bootstrap_means(correct[:, None], groups, units)
+    return Estimate(float(correct.mean()), draws[:, 0], units, np.unique(groups).size)
 
 
 def probe_estimates(

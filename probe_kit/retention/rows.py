@@ -18,6 +18,8 @@ class RetentionRow:
     sr_by_epsilon: SR by zone radius in metres. prefix_selectivity, action_selectivity: accuracy of the best site
     above that of the same probe on random labels of items. baselines: accuracy of each control that never sees the
     model; leaks: those above chance.
+    delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
+    which decides `regime`.
     prefix_beats, action_beats: whether the best site is better than `chance`, `binding` and `twin`, family-wise;
     None for a control that was not run.
     prefix_twin, action_twin: how much more accurate the best site is than that of `twin`.
@@ -91,6 +93,7 @@ class RetentionRow:
     left_out: tuple[str, ...] = ()
     prefix_beats: dict[str, bool | None] = field(default_factory=dict)
     action_beats: dict[str, bool | None] = field(default_factory=dict)
+    delta_regime: float | None = None
 
     @property
     def prefix_signal(self) -> bool:

@@ -10,7 +10,7 @@ from probe_kit.hooks.sites import first_of
 from probe_kit.retention.estimates import Estimates, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
-from probe_kit.retention.success import SuccessRate, sensitivity, success_rate
+from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.reader import RunReader
@@ -66,7 +66,7 @@ def _row(
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> Drawn:
-    success = success_rate(episodes, units_seed(episodes["item_id"].to_numpy(dtype=str), run.suite))
+    success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
     values = _identity(run, results) | _behaviour(success, sensitivity(episodes, settings.epsilons))
     estimates = {"sr": sr_estimate(episodes, run.suite)}
     curve = None if results is None or view is None else results.curves.get((category, view))
@@ -104,6 +104,7 @@ def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> dict[str
         "sr": success.sr,
         "delta": success.delta,
         "delta_items": success.delta_items,
+        "delta_regime": success.delta_regime,
         "sr_ci": success.ci,
         "sr_original": success.sr_original,
         "sr_swapped": success.sr_swapped,

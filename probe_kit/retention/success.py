@@ -12,7 +12,9 @@ from probe_kit.errors import UsageError
 from probe_kit.train.scores import group_bootstrap
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
+    from numpy.typing import NDArray
 
 
 class Regime(StrEnum):
@@ -28,7 +30,8 @@ class PairedItems:
     """Items that ran in both layouts, by how many of the two were right.
 
     both, one, none: numbers of items. both_wrong: items that chose the wrong picture twice, part of `none`.
-    p: exact one-sided p of `both` against `both_wrong`. A side bias of any strength makes them equally likely.
+    p: exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of any
+    strength makes them equally likely, and items that share a picture count once.
     """
 
     both: int
@@ -42,12 +45,13 @@ class PairedItems:
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
-    ci: 95 % interval of `sr`, whole items resampled. sr_original, sr_swapped: per layout, and layout_mean their
-    mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None if it was not
-    recorded. p_flagged: share of inferences that put out no action, None for a policy that cannot tell. sr_left,
-    sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
-    guessing explains, for N = episodes; delta_items: the same for N = items, conservative. side_preference:
-    share placed left among episodes placed in a zone. A rate over no episodes is None.
+    ci: 95 % interval of `sr`, whole groups of items resampled. sr_original, sr_swapped: per layout, and
+    layout_mean their mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None
+    if it was not recorded. p_flagged: share of inferences that put out no action, None for a policy that cannot
+    tell. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
+    guessing explains, for N = episodes (the paper's); delta_items: the same for N = items; delta_regime: for as
+    many items as count, fewer where items of a group answer alike, and what `regime` is judged by.
+    side_preference: share placed left among episodes placed in a zone. A rate over no episodes is None.
     """
 
     n_episodes: int
@@ -65,13 +69,14 @@ class SuccessRate:
     p_flagged: float | None
     delta: float
     delta_items: float
+    delta_regime: float
     regime: Regime
     reason: str
     side_preference: float | None
     paired: PairedItems
 
 
-def chance_margin(n: int, alpha: float = 0.05) -> float:
+def chance_margin(n: float, alpha: float = 0.05) -> float:
     """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
     if n < 1:
         raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
@@ -102,8 +107,8 @@ def normalised_score(success_rates: Sequence[float]) -> float:
 def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
-    episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`.
-    Raises UsageError for an empty table.
+    episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
+    and `group_id` where items share pictures. Raises UsageError for an empty table.
     """
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
@@ -111,9 +116,9 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     sr, p_wrong = float(correct.mean()), float((episodes["outcome"] == "wrong").mean())
     p_oob = float((episodes["outcome"] == "oob").mean())
     n_items = int(episodes["item_id"].nunique())
-    delta = chance_margin(len(episodes))
-    name, reason = regime(sr, delta, p_wrong, p_oob)
-    low, high = group_bootstrap(correct.to_numpy(bool)[:, None], episodes["item_id"].to_numpy(dtype=str), seed)
+    delta_regime = chance_margin(independent_items(episodes))
+    name, reason = regime(sr, delta_regime, p_wrong, p_oob)
+    low, high = group_bootstrap(correct.to_numpy(bool)[:, None], units_of(episodes), seed)
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
     return SuccessRate(
@@ -130,8 +135,9 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         p_oob=p_oob,
         p_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
         p_flagged=_flagged(episodes),
-        delta=delta,
+        delta=chance_margin(len(episodes)),
         delta_items=chance_margin(n_items),
+        delta_regime=delta_regime,
         regime=name,
         reason=reason,
         side_preference=_rate(placed == "left"),
@@ -144,6 +150,25 @@ def _flagged(episodes: "pd.DataFrame") -> float | None:
     if not {"flagged_steps", "inferences"} <= set(episodes):
         return None
     return float(episodes["flagged_steps"].sum() / episodes["inferences"].sum())
+
+
+def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
+    """(E,) what is drawn as a whole: the group of items that share pictures, or the item where none is known."""
+    return episodes["group_id" if "group_id" in episodes else "item_id"].to_numpy(dtype=str)
+
+
+def independent_items(episodes: "pd.DataFrame") -> float:
+    """How many items the success rate rests on: all of them, or fewer where those of a group answer alike.
+
+    The number of items over how much more the success rate varies between groups than it would if their items had
+    nothing in common.
+    """
+    correct = (episodes["outcome"] == "correct").astype(float)
+    residual = correct - correct.mean()
+    by_item = float((residual.groupby(episodes["item_id"]).sum() ** 2).sum())
+    by_group = float((residual.groupby(units_of(episodes)).sum() ** 2).sum())
+    items = int(episodes["item_id"].nunique())
+    return items if by_group <= by_item else items * by_item / by_group
 
 
 def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:
@@ -167,13 +192,15 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
     outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
     outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
     right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)
+    group_of = dict(zip(episodes["item_id"], units_of(episodes), strict=True))
+    lead = ((right == 2).astype(int) - (wrong == 2)).groupby(outcomes.index.map(group_of)).sum()
     both, both_wrong = int((right == 2).sum()), int((wrong == 2).sum())
     return PairedItems(
         both=both,
         one=int((right == 1).sum()),
         none=int((right == 0).sum()),
         both_wrong=both_wrong,
-        p=_sign_test(both, both + both_wrong),
+        p=_sign_test(int((lead > 0).sum()), int((lead != 0).sum())),
     )
 
 

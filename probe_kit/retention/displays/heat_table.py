@@ -12,6 +12,7 @@ from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, spell
 from probe_kit.retention.heat import HEAT, heat_colour
 from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.success import Regime
 from probe_kit.retention.table import RetentionTable
 
 if TYPE_CHECKING:
@@ -127,14 +128,14 @@ class SuccessTableDisplay(HeatTableDisplay):
     """Success rate in percent by model and category; bold above 0.5 + Δ."""
 
     title = "Success rate (%)"
-    note = "bold: above 50 % + Δ, more than guessing explains"
+    note = "bold: more than guessing explains, items as the unit"
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
         return cls._of(
             once_per_category(table.all_rows),
-            lambda row: Cell((row.sr,), row.delta is not None and row.sr > 0.5 + row.delta),
+            lambda row: Cell((row.sr,), row.regime == Regime.KNOWLEDGE),
         )
 
 

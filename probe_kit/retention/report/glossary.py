@@ -6,11 +6,12 @@ GLOSSARY = MappingProxyType(
     {
         "SR": (
             "Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 "
-            "% interval, whole questions resampled. Two pictures: guessing gives 50 %."
+            "% interval, whole groups of questions resampled. Two pictures: guessing gives 50 %."
         ),
         "Δ": (
-            "How far from 50 % guessing alone may lead with this many episodes. Only a success rate above 50 % "
-            "+ Δ is evidence of knowledge."
+            "How far from 50 % guessing alone may lead if every episode were a question of its own, as the paper "
+            "has it. The reading is stricter: it counts questions, and those that share a picture and are "
+            "answered alike as fewer."
         ),
         "wrong": "Share of episodes that ended on the other picture.",
         "outside": "Share of episodes that ended on neither picture.",
@@ -35,8 +36,8 @@ GLOSSARY = MappingProxyType(
         ),
         "p (twice)": "Probability that luck alone gives so many questions right twice rather than wrong twice.",
         "reading": (
-            "Knowledge: above 50 % + Δ. Not reliable: within 50 % ± Δ. Failure: below; the policy misses both "
-            "pictures or prefers the wrong one."
+            "Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so "
+            "far. Failure: as far below; the policy misses both pictures or prefers the wrong one."
         ),
         "normalised score": "Mean success rate on a scale where guessing is 0 and perfection 100.",
         "n": "Episodes, and in brackets questions; each question is asked in two layouts.",

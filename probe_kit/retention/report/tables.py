@@ -131,7 +131,7 @@ _BEHAVIOUR = [
     *_NAMES,
     _Column(
         "SR % [95 %]", success_interval, lambda row: row.sr, "SR", lambda row: row.sr,
-        lambda row: row.delta is not None and row.sr > 0.5 + row.delta,
+        lambda row: row.regime == Regime.KNOWLEDGE,
     ),
     _share("± Δ", "delta", "Δ"),
     _Column(
