@@ -15,6 +15,8 @@ class Card:
     batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
     needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
     chunk, execute: actions per inference and how many of them are carried out; 0 for a model that does not act.
+    ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
+    newest weighing most; None carries out the head of the newest chunk.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """
 
@@ -36,6 +38,7 @@ class Card:
     weights_seed: int | None = None
     batch: int | None = None
     needs: frozenset[str] = frozenset()
+    ensemble: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As stored in a run's certificate: plain values only."""

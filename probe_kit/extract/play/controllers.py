@@ -1,7 +1,7 @@
 """Who decides: a captured policy, or the scripted expert that knows the answer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError
+from probe_kit.extract.play.ensemble import ensemble
 from probe_kit.extract.store.layout import StoredStream
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.views import view_names
@@ -33,13 +34,15 @@ class Turn:
     """One inference that is due.
 
     seed: of the episode; every inference derives its own. call: how many inferences came before.
-    buffers: where the activations of the first calls go.
+    buffers: where the activations of the first calls go. past: chunks of the inferences before, oldest first,
+    which the controller keeps where a policy averages them.
     """
 
     seen: Observation
     seed: int
     call: int
     buffers: "EpisodeBuffers"
+    past: list[NDArray[np.float32]] = field(default_factory=list)
 
 
 class Controller(Protocol):
@@ -119,7 +122,10 @@ class PolicyController:
         self._check: dict[str, Any] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
-        """The first `execute` actions of a fresh chunk per turn, from one call of the policy."""
+        """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
+
+        Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
+        """
         observations = [turn.seen for turn in turns]
         seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
@@ -128,7 +134,14 @@ class PolicyController:
         else:
             chunks = self.policy.act(observations, seeds)
         self.flagged = self.policy.flagged
-        return [chunk[: self.execute] for chunk in chunks]
+        return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+
+    def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
+        exponent = self.policy.card.ensemble
+        if exponent is None:
+            return chunk[: self.execute]
+        turn.past.append(chunk)
+        return ensemble(turn.past, exponent)[None]
 
     def certificate(self) -> dict[str, Any]:
         """The policy's card, fire counts of the last capture, and what `_prove_harmless` measured."""

@@ -40,6 +40,11 @@ def refuse_unreachable(settings: ExtractSettings, card: Card) -> None:
             f"1 to {card.chunk} of them"
         )
     execute, steps = settings.execute or card.execute, settings.scene.max_steps
+    if card.ensemble is not None and execute != 1:
+        raise UsageError(
+            f"--execute {execute}: {settings.model} averages the plans of overlapping chunks, which needs an "
+            "inference per action; leave --execute out, or the model's option that asks for averaging"
+        )
     inferences = -(-steps // max(1, execute))
     if settings.captured_calls > inferences:
         raise UsageError(

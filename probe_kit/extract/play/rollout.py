@@ -52,18 +52,19 @@ class Seat:
         self.seen: Observation | None = None
         self.calls = 0
         self.flagged: int | None = None
+        self.past: list[NDArray[np.float32]] = []
 
     def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
         """Begin an episode."""
         self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
-        self.flagged = None
+        self.flagged, self.past = None, []
         self.stage.ask("begin", planned, film)
 
     def turn(self) -> Turn:
         """The inference that is due."""
         assert self.planned is not None
         assert self.seen is not None
-        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers)
+        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
 
     def go_on(self, actions: NDArray[np.float32], flagged: bool | None) -> None:
         """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""

@@ -26,6 +26,7 @@ FAMILIES = (
                 "iterations", str, "Tokens listened to: of a step (3) or of the chunk.", "step", ("step", "chunk")
             ),
             Option("constrained", bool, "Decode every token within its slot; not the original's way.", "false"),
+            Option("ensemble", bool, "Average the plans of overlapping chunks, the newest most.", "false"),
             TOKENIZER,
         ),
     ),

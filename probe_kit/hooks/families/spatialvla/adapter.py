@@ -46,6 +46,8 @@ BRIDGE = "bridge_orig/1.0.0"
 """The data set of the WidowX arm that Act2Answer imitates."""
 SCENE = "scene"
 """Asks for the camera of the observation."""
+ENSEMBLE = 0.8
+"""With this exponent the client for SimplerEnv averages the plans of overlapping chunks."""
 _GRIPPER_OPEN = 0.5
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
@@ -67,10 +69,12 @@ class SpatialVLA(Policy):
         steps: int,
         heard: int,
         constrained: bool,
+        ensemble: bool = False,
     ) -> None:
         self.loaded, self.speech, self.statistics = loaded, speech, statistics
         self.network, self.config = loaded.network, loaded.config
         self.camera, self.steps, self.constrained = camera, steps, constrained
+        self.ensemble = ENSEMBLE if ensemble else None
         self.bins = ActionBins.of(
             loaded.processor, self.config.first_action, self.config.actions, loaded.processor_file
         )
@@ -111,6 +115,7 @@ class SpatialVLA(Policy):
             settings=self._settings(),
             weights_seed=loaded.weights_seed,
             needs=frozenset({"intrinsics"}) if needed else frozenset(),
+            ensemble=self.ensemble,
         )
 
     def _settings(self) -> dict[str, str]:
@@ -128,6 +133,7 @@ class SpatialVLA(Policy):
             "lowercase": str(self.speech.lowercase),
             "camera": self.camera,
             "constrained": str(self.constrained),
+            "ensemble": str(self.ensemble),
             "steps": str(self.steps),
             "iterations": str(self.streams["action"].iterations),
         }
@@ -305,6 +311,7 @@ def load_spatialvla(
     camera: str = SCENE,
     iterations: str = "step",
     constrained: bool = False,
+    ensemble: bool = False,
     tokenizer: str | None = None,
     weights_seed: int = 0,
 ) -> SpatialVLA:
@@ -314,7 +321,8 @@ def load_spatialvla(
     `bare`, `question` or a template with {instruction}. lowercase: the instruction as in training. camera: `scene`
     for the observation's intrinsics, or a data set of the checkpoint whose camera is taken for the scene's.
     iterations: listen to the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
-    within its slot, which the original does not. tokenizer: folder of another tokenizer, or `bytes`.
+    within its slot, which the original does not. ensemble: average the plans of overlapping chunks. tokenizer:
+    folder of another tokenizer, or `bytes`.
     Raises UsageError, and what `load_checkpoint` raises.
     """
     if iterations not in ("step", "chunk"):
@@ -329,6 +337,7 @@ def load_spatialvla(
         steps,
         STEP_TOKENS if iterations == "step" else steps,
         constrained,
+        ensemble,
     )
 
 

@@ -12,7 +12,7 @@ from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
 from probe_kit.hooks.testing import AdapterContract, example_observations
 from probe_kit.models.spatialvla import Decoded
-from tests.spatialvla_checkpoints import BINS, SIDE, edges, processor_values, write_checkpoint
+from tests.spatialvla_checkpoints import BINS, SIDE, edges, processor_values, write_checkpoint, write_tokenizer
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 
@@ -22,7 +22,9 @@ FRACTAL = "fractal20220817_data/0.1.0"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"))
+    own = processor_values()["statistics"]["bridge_orig/1.0.0"]
+    known = {"statistics": {"bridge_orig/1.0.0": own, "my_arm": {"action": {**own["action"], "q99": [0.2] * 7}}}}
+    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"), processor=known)
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +51,25 @@ def seen() -> list[Observation]:
 
 
 class TestOneStepHeard(AdapterContract):
+    family = "spatialvla"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def other_options(self, tmp_path: Path) -> dict[str, Any]:
+        return {
+            "unnorm_key": "my_arm", "prompt": "question", "lowercase": False, "camera": "default",
+            "iterations": "chunk", "constrained": True, "ensemble": True,
+            "tokenizer": str(write_tokenizer(tmp_path)),
+        }  # fmt: skip
+
+    @pytest.fixture
+    def alike(self, seen: list[Observation]) -> list[Observation]:
+        """One letter of a tokenizer of letters."""
+        return [replace(seen[0], instruction=text) for text in ("Put it on the star", "Put it on the stir")]
+
     @pytest.fixture
     def policy(self, plain: SpatialVLA) -> SpatialVLA:
         return plain
@@ -293,7 +314,7 @@ def test_options_are_declared_and_checked(folder: Path) -> None:
 def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:
     choices: list[dict[str, Any]] = [
         {"lowercase": False}, {"prompt": "question"}, {"camera": "default"}, {"constrained": True},
-        {"iterations": "chunk"}, {"tokenizer": "bytes"},
+        {"ensemble": True},        {"iterations": "chunk"}, {"tokenizer": "bytes"},
     ]  # fmt: skip
     for choice in choices:
         assert load_spatialvla(str(folder), **choice).card.settings != plain.card.settings
