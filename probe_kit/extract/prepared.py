@@ -106,5 +106,12 @@ def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
     refuse_unfit(policy.card, settings.batch, examples[0])
     refuse_unreachable(settings, policy.card)
     return PolicyController(
-        policy, settings.model, examples, settings.execute, settings.captured_calls, settings.tokens == "all"
+        policy,
+        settings.model,
+        examples,
+        settings.execute,
+        settings.captured_calls,
+        settings.tokens == "all",
+        settings.edits,
+        settings.vectors,
     )

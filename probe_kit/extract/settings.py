@@ -8,12 +8,25 @@ from typing import Any
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.store.layout import CODECS
+from probe_kit.hooks.edits import Edit, Vectors
+from probe_kit.identity import sha256_json
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
 FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
-_ELSEWHERE = {"checkpoint", "options", "label", "weights_seed", "suite", "categories", "items", "scene"}
+_ELSEWHERE = {
+    "checkpoint",
+    "options",
+    "label",
+    "weights_seed",
+    "suite",
+    "categories",
+    "items",
+    "scene",
+    "edits",
+    "vectors",
+}
 _MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", "workers", "ray"}
 
 
@@ -26,6 +39,7 @@ class ExtractSettings:
     weights_seed: of a random twin's weights.
     options: what only some families have, such as `unnorm_key`; what they lead to is in the policy's card.
     label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`.
+    edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
     tokens: `pooled` stores pooled views only, `all` also every token.
@@ -56,6 +70,8 @@ class ExtractSettings:
     captured_calls: int = 1
     execute: int | None = None
     label: str | None = None
+    edits: tuple[Edit, ...] = ()
+    vectors: Vectors = field(default_factory=dict)
     codec: str = "zstd"
     device: str = "cpu"
     dtype: str | None = None
@@ -79,7 +95,8 @@ class ExtractSettings:
 
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
+        return plain | ({"edits": [edit.to_json() for edit in self.edits]} if self.edits else {})
 
 
 def run_label(settings: ExtractSettings) -> str:
@@ -92,6 +109,8 @@ def run_label(settings: ExtractSettings) -> str:
     parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights:
         parts.append(f"random {settings.weights_seed}" if settings.weights_seed else "random")
+    if settings.edits:
+        parts.append(f"edited {sha256_json([edit.to_json() for edit in settings.edits])[:6]}")
     return " · ".join(parts)
 
 

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.hooks.card import Card
+from probe_kit.hooks.edits import Edit
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.options import Option
@@ -12,12 +13,14 @@ from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capture_context import capture, edit
+    from probe_kit.hooks.editing import applied
     from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading, Rows, Tap
     from probe_kit.hooks.roles import Roles, pool
     from probe_kit.hooks.tape import Tape
 
 __all__ = [
     "Card",
+    "Edit",
     "Family",
     "Model",
     "Observation",
@@ -32,6 +35,7 @@ __all__ = [
     "Stream",
     "Tap",
     "Tape",
+    "applied",
     "capture",
     "edit",
     "known_families",
@@ -52,6 +56,7 @@ __getattr__ = lazy_names(
         "Rows": "model",
         "Tap": "model",
         "Tape": "tape",
+        "applied": "editing",
         "capture": "capture_context",
         "edit": "capture_context",
         "Roles": "roles",

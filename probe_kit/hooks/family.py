@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from types import MappingProxyType
@@ -81,6 +81,9 @@ class Family:
                 raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
         model: Model = load(checkpoint or self.default_checkpoint, device, dtype, random_weights, **chosen)
+        # What an adapter does not say of its options itself is part of the identity all the same.
+        said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
+        model.card = replace(model.card, settings={**said, **model.card.settings})
         return model
 
     def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:

@@ -199,7 +199,7 @@ class Reading:
 
     @classmethod
     def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
-        """Of the logits (B, V) behind every prompt and, per row, the ids of its options."""
+        """Of the logits (B, V) behind every prompt and, per row, the different ids of its options."""
         chosen = np.take_along_axis(logits, np.array(options, np.int64).reshape(len(logits), -1), axis=1)
         shares = np.exp(logits - logits.max(axis=1, keepdims=True))
         peak = np.exp(chosen - logits.max(axis=1, keepdims=True))

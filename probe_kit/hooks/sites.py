@@ -75,6 +75,8 @@ class Stream:
     label: what people read; default the name in plain words.
     quantities: what can be captured of it; `residual` always.
     probed: whether peaks, retention and default probes use it; False for the unconditional half of guidance.
+    sums: whether residual + attention + mlp make the next residual; False where something else enters between
+    blocks, such as DeepStack's pictures.
     Raises UsageError for an unknown part, or none where the name does not tell it.
     """
 
@@ -86,6 +88,7 @@ class Stream:
     label: str = ""
     quantities: tuple[str, ...] = QUANTITIES
     probed: bool = True
+    sums: bool = True
 
     def __post_init__(self) -> None:
         part = self.part or _KNOWN_PARTS.get(self.name)

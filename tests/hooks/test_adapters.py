@@ -1,50 +1,72 @@
-"""Every adapter passes the same contract."""
+"""Every adapter passes the same contract, on checkpoints made here and, where they are, on golden ones."""
 
 from pathlib import Path
 
 import pytest
 
-from probe_kit.hooks import Observation
+from probe_kit.hooks import Model, Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.smolvla.adapter import SmolVLA, load_smolvla
-from probe_kit.hooks.testing import AdapterContract, example_observations
-
-GOLDEN_TASKS = ["open the drawer", "pick up the red cube and place it on the tray"]
-
-
-@pytest.fixture(scope="module")
-def pi0(golden_pi0: Path) -> Pi0:
-    return load_pi0(str(golden_pi0 / "checkpoint"))
-
-
-@pytest.fixture(scope="module")
-def smolvla(golden_smolvla: Path) -> SmolVLA:
-    return load_smolvla(str(golden_smolvla / "checkpoint"))
+from probe_kit.hooks.testing import AdapterContract
+from probe_kit.models.pi0_tiny import embedded_checkpoint
+from tests.smolvla_checkpoints import write_smolvla
 
 
 class TestPi0Tiny(AdapterContract):
+    family = "pi0-tiny"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self) -> Path:
+        return embedded_checkpoint("pi0-tiny")
+
     @pytest.fixture
     def policy(self, pi0_tiny: Pi0) -> Pi0:
         return pi0_tiny
 
 
-class TestGoldenPi0(AdapterContract):
+class TestSmolVLA(AdapterContract):
+    family = "smolvla"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_smolvla(tmp_path_factory.mktemp("smolvla"))
+
+    @pytest.fixture(scope="class")
+    def policy(self, checkpoint: Path) -> SmolVLA:
+        return load_smolvla(str(checkpoint))
+
+
+class TestSmolVLAWithMarkedPicturesMaskedCamerasAndAFixedPrefix(TestSmolVLA):
+    @pytest.fixture(scope="class")
+    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_smolvla(
+            tmp_path_factory.mktemp("marked"),
+            cameras=("top", "wrist"),
+            add_image_special_tokens=True,
+            empty_cameras=1,
+            prefix_length=40,
+        )
+
+
+class _Golden:
+    @pytest.fixture
+    def observations(self, model: Model) -> list[Observation]:
+        return AdapterContract.examples(model, "open the drawer", "pick up the red cube and place it on the tray")
+
+    @pytest.fixture
+    def alike(self, model: Model) -> list[Observation]:
+        return AdapterContract.examples(model, "open the drawer", "open the tray")
+
+
+class TestGoldenPi0(_Golden, AdapterContract):
     """Two cameras, of which one stays masked, and an empty one."""
 
-    @pytest.fixture
-    def policy(self, pi0: Pi0) -> Pi0:
-        return pi0
-
-    @pytest.fixture
-    def observations(self) -> list[Observation]:
-        return example_observations(GOLDEN_TASKS)
+    @pytest.fixture(scope="class")
+    def policy(self, golden_pi0: Path) -> Pi0:
+        return load_pi0(str(golden_pi0 / "checkpoint"))
 
 
-class TestGoldenSmolVLA(AdapterContract):
-    @pytest.fixture
-    def policy(self, smolvla: SmolVLA) -> SmolVLA:
-        return smolvla
-
-    @pytest.fixture
-    def observations(self) -> list[Observation]:
-        return example_observations(GOLDEN_TASKS)
+class TestGoldenSmolVLA(_Golden, AdapterContract):
+    @pytest.fixture(scope="class")
+    def policy(self, golden_smolvla: Path) -> SmolVLA:
+        return load_smolvla(str(golden_smolvla / "checkpoint"))

@@ -1,7 +1,8 @@
 """Who decides: a captured policy, or the scripted expert that knows the answer."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract.play.ensemble import ensemble
 from probe_kit.extract.store.layout import StoredStream
+from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.views import view_names
 from probe_kit.identity import derive_seed
@@ -98,11 +100,14 @@ class PolicyController:
         execute: int | None,
         captured_calls: int,
         with_tokens: bool,
+        edits: Sequence[Edit] = (),
+        vectors: Vectors | None = None,
     ) -> None:
         """examples: an observation per instruction of the suite, as the scene will show them."""
         self.policy = policy
         self.execute = execute or policy.card.execute
         self.captured_calls, self.with_tokens = captured_calls, with_tokens
+        self._edits, self._vectors = edits, vectors
         self.streams = _stored_streams(policy, examples)
         card = policy.card
         self.script: str | None = None
@@ -120,6 +125,7 @@ class PolicyController:
             self.identity["policy"] = dict(card.settings)
         self._fires: dict[str, int] = {}
         self._check: dict[str, Any] = {}
+        self._ledger: list[dict[str, Any]] = []
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
@@ -132,7 +138,8 @@ class PolicyController:
         if captured:
             chunks = self._act_and_capture(observations, seeds, captured)
         else:
-            chunks = self.policy.act(observations, seeds)
+            with self._edited(observations):
+                chunks = self.policy.act(observations, seeds)
         self.flagged = self.policy.flagged
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
 
@@ -149,7 +156,20 @@ class PolicyController:
             "policy": self.policy.card.to_json(),
             "fires_per_inference": self._fires,
             "capture_check": self._check,
+            **({"edits": self._ledger} if self._edits else {}),
         }
+
+    @contextmanager
+    def _edited(self, observations: Sequence[Observation]) -> Iterator[None]:
+        """The edits of this run, for one inference; the certificate shows what the last one did."""
+        if not self._edits:
+            yield
+            return
+        from probe_kit.hooks import applied
+
+        with applied(self.policy, self._edits, observations, self._vectors) as ledger:
+            yield
+        self._ledger = [asdict(entry) for entry in ledger.entries]
 
     def _act_and_capture(
         self, observations: Sequence[Observation], seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
@@ -162,7 +182,9 @@ class PolicyController:
         def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
             return _pool_rows(activation, roles[site.stream], views[site.stream])
 
-        with capture(self.policy, self.policy.sites(), None if self.with_tokens else pool_rows) as tape:
+        reduce = None if self.with_tokens else pool_rows
+        # The capture is entered last, so that it reads what the edits left.
+        with self._edited(observations), capture(self.policy, self.policy.sites(), reduce) as tape:
             chunks = self.policy.act(observations, seeds)
         if not self._fires:
             self._prove_harmless(observations, seeds, chunks)
@@ -175,7 +197,8 @@ class PolicyController:
         self, observations: Sequence[Observation], seeds: Sequence[int], chunks: NDArray[np.float32]
     ) -> None:
         """Once per process: the same inference without hooks gives the same actions, bit for bit."""
-        plain = self.policy.act(observations, seeds)
+        with self._edited(observations):
+            plain = self.policy.act(observations, seeds)
         self._check = {
             "actions_with_hooks_sha256": _sha256(chunks),
             "actions_without_hooks_sha256": _sha256(plain),

@@ -48,6 +48,7 @@ class StoredStream:
     label: str = ""
     quantities: tuple[str, ...] = QUANTITIES
     probed: bool = True
+    sums: bool = True
 
     @classmethod
     def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":

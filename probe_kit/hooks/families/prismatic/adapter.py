@@ -4,6 +4,7 @@ One stack serves two streams, told apart by position: `backbone` is the prompt w
 one the positions whose logits choose the output: the prompt's last token, then every token fed back but the last.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import takewhile
@@ -106,9 +107,9 @@ class PrismaticModel(Model):
             self.loaded.folders, self._chosen_tokenizer, text.bos_token_id, self.config.action_vocabulary
         )
 
+    @abstractmethod
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of a whole prompt; a vision-language model takes the text as it is."""
-        return self.tokenizer.encode(instruction)
+        """Ids of a whole prompt."""
 
     def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
         """Prompts of ids as a batch. Raises InstructionError for one that is too long, CheckpointError for ids
@@ -188,6 +189,10 @@ class Prismatic(PrismaticModel, Reader):
 
     family: ClassVar[str] = "prismatic"
     output: ClassVar[str] = "answer"
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of a question in the frame around it."""
+        return self.tokenizer.encode(_FRAME.format(instruction))
 
     def read(self, questions: Sequence[Question]) -> Reading:
         """One prefill; see the contract. Raises UsageError if the model was loaded for more than one step."""

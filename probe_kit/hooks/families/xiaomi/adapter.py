@@ -7,6 +7,7 @@ its halves add, gated; `middle` is the normed sum between them.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -69,7 +70,8 @@ class Xiaomi(QwenVLA):
         self._robot = robot
         layers = len(self.network.dit.layers)
         self.streams = {
-            "backbone": self.backbone_stream(),
+            # DeepStack adds pictures between its first blocks.
+            "backbone": replace(self.backbone_stream(), sums=False),
             "expert": Stream(
                 "expert",
                 layers + 1,
@@ -77,6 +79,7 @@ class Xiaomi(QwenVLA):
                 steps,
                 part="action",
                 quantities=("residual", "attention", "middle", "mlp"),
+                sums=False,
             ),
         }
         self.further_streams = {"vision": self.vision_stream()}

@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,18 @@ def loaded(run: Path) -> InternVLA:
 
 
 class TestInternVLA(AdapterContract):
+    family = "internvla-m1"
+    configuration = "config.yaml"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, run: Path) -> Path:
+        return run
+
+    @pytest.fixture
+    def other_options(self, run: Path) -> dict[str, Any]:
+        vlm = str(run.parent / "vlm")
+        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm}
+
     @pytest.fixture
     def policy(self, loaded: InternVLA) -> InternVLA:
         return loaded

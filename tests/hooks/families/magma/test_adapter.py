@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,23 @@ def unsteered(tmp_path_factory: pytest.TempPathFactory) -> Magma:
 
 
 class TestMagma(AdapterContract):
+    family = "magma"
+    # They need files of their own: test_every_option_reaches_the_card below and test_checkpoint.py.
+    unloadable_options = frozenset({"unnorm_key", "statistics", "layer_scale"})
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def other_options(self, folder: Path) -> dict[str, Any]:
+        return {
+            "shrink": 0,
+            "prompt": "act2answer",
+            "temperature": 0.7,
+            "tokenizer": str(folder),
+        }
+
     @pytest.fixture
     def policy(self, loaded: Magma) -> Magma:
         return loaded

@@ -2,6 +2,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint(tmp_path_factory.mktemp("openvla"))
+    bridge = config_values()["norm_stats"]["bridge_orig"]
+    other = {"action": {**bridge["action"], "q99": [0.2] * 7}}
+    statistics = {"bridge_orig": bridge, "other": other}
+    return write_checkpoint(tmp_path_factory.mktemp("openvla"), norm_stats=statistics)
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +45,19 @@ def golden(golden_openvla: Path) -> OpenVLA:
 
 
 class TestFusedLlama(AdapterContract):
+    family = "openvla"
+    options = {"tokenizer": "bytes"}
+    unloadable_options = frozenset({"bits"})
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def other_options(self, tmp_path: Path) -> dict[str, Any]:
+        words = str(write_tokenizer(tmp_path))
+        return {"unnorm_key": "other", "prompt": "openvla-v01", "centre_crop": True, "tokenizer": words}
+
     @pytest.fixture
     def policy(self, fused: OpenVLA) -> OpenVLA:
         return fused
@@ -57,6 +74,10 @@ class TestSingleTowerMistralWithATokenizerFile(AdapterContract):
             replace(observation, instruction=text)
             for text in ("Put the cube on the star", "take the red cube to the star")
         ]
+
+    @pytest.fixture
+    def alike(self, observation: Observation) -> list[Observation]:
+        return [replace(observation, instruction=f"Put the cube on the {noun}") for noun in ("star", "shape")]
 
 
 class TestGoldenOpenVLA(AdapterContract):

@@ -1,15 +1,17 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import Observation, Site, capture, load_model, load_policy
+from probe_kit.hooks import Observation, Question, Site, capture, load_model, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
+from probe_kit.hooks.testing import ReaderContract
 from probe_kit.hooks.verify import verify_reference
-from tests.prismatic_checkpoints import write_checkpoint
+from tests.prismatic_checkpoints import write_checkpoint, write_tokenizer
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +68,46 @@ def test_roles_name_what_every_position_is(model: Prismatic, observation: Observ
     asked = replace(observation, instruction="Why?")
     longer = replace(observation, instruction="Why not?")
     short, long = model.roles([asked, longer])["backbone"]
-    patches = model.network.patches
+    patches, prompt = model.network.patches, len("In: Why?\nOut:")
     assert short.spans == (
         ("special", 0, 1),
         ("image.primary", 1, 1 + patches),
-        ("language", 1 + patches, 4 + patches),
-        ("padding", 4 + patches, 8 + patches),
+        ("language", 1 + patches, patches + prompt),
+        ("padding", patches + prompt, 4 + patches + prompt),
     )
     assert len(short) == len(long)
+
+
+class TestPrismatic(ReaderContract):
+    family = "prismatic"
+    options = {"tokenizer": "bytes"}
+    unloadable_options = frozenset({"bits"})
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_checkpoint(tmp_path_factory.mktemp("prismatic"), model_type="prismatic")
+
+    @pytest.fixture
+    def other_options(self, tmp_path: Path) -> dict[str, Any]:
+        return {"steps": 2, "tokenizer": str(write_tokenizer(tmp_path))}
+
+    @pytest.fixture(scope="class")
+    def reader(self, checkpoint: Path) -> Prismatic:
+        return load_prismatic(str(checkpoint), tokenizer="bytes")
+
+
+def test_a_reading_compares_what_may_stand_behind_the_prompt(
+    model: Prismatic, tmp_path: Path, observation: Observation
+) -> None:
+    reader = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")), tokenizer="bytes")
+    reading = reader.read([Question(observation, "Which?", ("A", "B"))])
+    ids = reader.tokenizer.encode("In: Which?\nOut:")
+    logits = reader.generate(reader.pixel_values([observation.image]), [ids]).logits[0, 0]
+    expected = logits[[3 + ord(letter) for letter in "AB"]]
+    np.testing.assert_allclose(reading.option_logits[0], expected, atol=1e-6)
+    np.testing.assert_allclose(reading.option_mass[0], logits.softmax(0)[[3 + 65, 3 + 66]].sum(), rtol=1e-5)
+    with pytest.raises(UsageError, match="steps=1"):
+        model.read([Question(observation, "Which?", ("A",))])
 
 
 def test_a_vision_language_model_is_no_policy() -> None:

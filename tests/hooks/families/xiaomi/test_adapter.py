@@ -2,6 +2,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,16 @@ def loaded(folder: Path) -> Xiaomi:
 
 
 class TestXiaomi(AdapterContract):
+    family = "xiaomi-r0"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def other_options(self, folder: Path) -> dict[str, Any]:
+        return {"robot": "fractal", "steps": 3, "tokenizer": str(folder)}
+
     @pytest.fixture
     def policy(self, loaded: Xiaomi) -> Xiaomi:
         return loaded
