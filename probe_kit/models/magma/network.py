@@ -60,11 +60,15 @@ class MagmaNetwork(nn.Module):
         rows, columns = map_size(grid, side, self.vision_tower.reduction, self.config.vision.strategy)
         return PictureSpan(placeholder(ids, self.config.image_token), rows, columns)
 
+    def shown(self, picture: Picture) -> Tensor:
+        """What the trunk sees of a picture: its crops (N, 3, S, S), or the whole of it (1, 3, H, W)."""
+        return whole_picture(picture) if self.config.vision.strategy == "global" else picture.crops
+
     def look(self, pictures: Sequence[Picture]) -> list[Tensor]:
         """Per picture its tokens (h · (w + 1), D), separators at the end of every row of its map."""
         reference = self.multi_modal_projector.row_seperator
         if self.config.vision.strategy == "global":
-            maps = [self._projected(whole_picture(picture).to(reference))[0] for picture in pictures]
+            maps = [self._projected(self.shown(picture).to(reference))[0] for picture in pictures]
         else:
             crops = self._projected(torch.cat([picture.crops for picture in pictures]).to(reference))
             parts = torch.split(crops, [len(picture.crops) for picture in pictures])

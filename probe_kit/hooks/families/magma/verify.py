@@ -125,16 +125,17 @@ class _Reference:
         return np.array([(grid.rows, grid.columns) for grid in chosen])
 
     def _map(self, stream: str, layer: int) -> NDArray[Any]:
-        """(N, C, h, w) of the tokens that a vision stream's tap gives; maps of crops are square."""
+        """(N, C, h, w) of the tokens that a vision stream's tap gives; maps have the shape of what was shown."""
         layers = self.model.further_streams[stream].layers
         tokens = self.first.tape[Site(stream, layer % layers)]
-        side = int(np.sqrt(tokens.shape[1]))
-        return _numpy(tokens.transpose(1, 2).reshape(len(tokens), -1, side, side))
+        height, width = self.model.network.shown(self.first.picture).shape[-2:]
+        high = round(np.sqrt(tokens.shape[1] * height / width))
+        return _numpy(tokens.transpose(1, 2).reshape(len(tokens), -1, high, tokens.shape[1] // high))
 
     @torch.inference_mode()
     def _projected(self) -> NDArray[Any]:
         network = self.model.network
-        maps = network.vision_tower(self.first.picture.crops)
+        maps = network.vision_tower(network.shown(self.first.picture))
         return _numpy(network.multi_modal_projector(maps.permute(0, 2, 3, 1)))
 
     def _streams(self) -> dict[str, Produce]:

@@ -1,8 +1,7 @@
-"""`probe-kit verify magma`, on the golden reference and on one that is damaged on purpose."""
+"""`probe-kit verify magma`: the golden reference, references made here at other sizes, and damaged ones."""
 
 import gzip
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,29 @@ import pytest
 
 from probe_kit.hooks.verify import verify_keys, verify_reference
 from probe_kit.models.magma import UNUSED_WEIGHTS
+from tests.magma_reference import write_reference
 
 INPUTS = 11
+VARIANTS = {
+    "one crop, then four": (((40, 50), (130, 121)), 6, {}),
+    "crops side by side, then above each other": (((40, 130), (130, 40)), 9, {"vision": {"img_size": 96}}),
+    "the whole picture at once": (((64, 190), (130, 130)), 3, {"vision": {"img_anyres_strategy": "global"}}),
+    "other sizes": (
+        ((65, 64), (30, 400)),
+        5,
+        {
+            "vision": {
+                "max_num_crops": 6,
+                "mm_hidden_size": 48,
+                "mm_projector_type": "mlp3x_gelu",
+                "mm_use_im_start_end": True,
+                "timm_overrides": {"depths": [2, 1, 1, 2], "dims": [8, 16, 24, 48], "norm_eps": 1e-3},
+            },
+            "text": {"hidden_size": 48, "num_hidden_layers": 2, "num_key_value_heads": 4, "rms_norm_eps": 1e-3},
+            "mm_use_image_start_end": False,
+        },
+    ),
+}
 
 
 def test_everything_recorded_is_compared_and_within_its_tolerance(golden_magma: Path) -> None:
@@ -22,19 +42,29 @@ def test_everything_recorded_is_compared_and_within_its_tolerance(golden_magma: 
         assert len(by_status) == len(recorded.files) - INPUTS
 
 
-@pytest.mark.parametrize("name", ["hidden_states", "batch_logits", "stage2", "generated_ids", "detok_table"])
-def test_an_output_that_differs_is_over(golden_magma: Path, tmp_path: Path, name: str) -> None:
-    folder = tmp_path / "reference"
-    shutil.copytree(golden_magma / "checkpoint", folder / "checkpoint")
-    with np.load(golden_magma / "reference.npz") as stored:
-        recorded = dict(stored)
-    changed = recorded[name].copy()
-    changed[..., -1] += 1  # of the last row, which is no padding
-    np.savez(folder / "reference.npz", **{**recorded, name: changed})
-    statuses = {
-        comparison.output: comparison.status for comparison in verify_reference("magma", folder).comparisons
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nothing_is_tuned_to_one_reference(tmp_path: Path, variant: str) -> None:
+    sizes, steps, fields = VARIANTS[variant]
+    folder = write_reference(tmp_path, sizes, steps, seed=len(variant), **fields)
+    verification = verify_reference("magma", folder)
+    by_status = {
+        comparison.output: (comparison.status, comparison.note) for comparison in verification.comparisons
     }
-    assert {output for output, status in statuses.items() if status == "over"} == {name}
+    assert {status for status, _ in by_status.values()} == {"ok"}, by_status
+    with np.load(folder / "reference.npz") as recorded:
+        assert len(by_status) == len(recorded.files) - INPUTS + 1  # the choice of crops is recorded elsewhere
+
+
+@pytest.mark.parametrize("name", ["hidden_states", "batch_logits", "stage2", "generated_ids", "detok_table"])
+def test_an_output_that_differs_is_over(tmp_path: Path, name: str) -> None:
+    sizes, steps, fields = VARIANTS["one crop, then four"]
+    folder = write_reference(tmp_path, sizes, steps, seed=1, **fields)
+    with np.load(folder / "reference.npz") as stored:
+        recorded = dict(stored)
+    recorded[name][..., -1] += 1  # of the last row, which is no padding
+    np.savez(folder / "reference.npz", **recorded)
+    comparisons = verify_reference("magma", folder).comparisons
+    assert {comparison.output for comparison in comparisons if comparison.status == "over"} == {name}
 
 
 def test_the_full_size_has_the_recorded_keys_but_for_the_declared_ones(golden_magma: Path) -> None:
