@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.retention import RetentionRow, retention
-from probe_kit.retention.cells import beats, debiased_value, number, percent
+from probe_kit.retention.cells import beats, bounded_value, number, percent
 from probe_kit.retention.success import Regime
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -121,7 +121,7 @@ def to_rich(findings: Sequence[Finding]) -> "FittingTable":
     agree = sum(finding.agrees for finding in findings)
     return FittingTable(
         title="Model organisms",
-        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention debiased",
+        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention bounded",
         name="policy",
         names=tuple(finding.organism for finding in findings),
         styles=("",) * len(findings),
@@ -153,6 +153,6 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
     row = finding.row
     texts = (
         percent(row.sr), percent(row.delta), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
-        beats(row), percent(row.action_accuracy), debiased_value(row),
+        beats(row), percent(row.action_accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

@@ -46,6 +46,20 @@ def retention_value(row: RetentionRow) -> str:
     return " ".join(filter(None, [number(row.retention), row.retention_note and f"({row.retention_note})"]))
 
 
+def bounded_value(row: RetentionRow) -> str:
+    """Bounded retention with its interval; a dash where retention is not defined."""
+    if not row.retention_defined:
+        return "–"
+    return with_limits(number(row.retention_bounded), row.retention_bounded_ci, number)
+
+
+def area_value(row: RetentionRow) -> str:
+    """Area retention with its interval; a dash where retention is not defined."""
+    if not row.retention_defined:
+        return "–"
+    return with_limits(number(row.retention_area), row.retention_area_ci, number)
+
+
 def debiased_value(row: RetentionRow) -> str:
     """Debiased retention with its interval; a dash where retention is not defined."""
     if not row.retention_defined:

@@ -11,7 +11,9 @@ from probe_kit.retention.cells import (
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
     Column,
+    area_value,
     beats,
+    bounded_value,
     controlled,
     debiased_value,
     difference_title,
@@ -109,8 +111,10 @@ _RETENTION: dict[str, Sequence[Column]] = {
         ("p", lambda row: number(row.action_p_fwe, 3)),
     ],
     "What is retained": [
-        ("retention", _retention),
+        ("bounded [95 %]", bounded_value),
+        ("area [95 %]", area_value),
         ("debiased [95 %]", debiased_value),
+        ("plain", _retention),
         ("gap", lambda row: percent(row.gap)),
     ],
 }

@@ -21,11 +21,13 @@ _NO_VARIANCE = 1e-12
 class GroupScores:
     """Correct decisions per group of items, the unit of every resampling here.
 
-    sums: (S, G) correctly decided episodes per site and group. sizes: (G,) episodes per group.
+    sums: (S, G) correctly decided episodes per site and group. sizes: (G,) episodes per group. guide: (S, G) what
+    sites are chosen by, `sums` themselves by default.
     """
 
     sums: Matrix
     sizes: Matrix
+    guide: Matrix | None = None
 
     @classmethod
     def of(cls, correct: NDArray[np.bool_], groups: ArrayLike) -> "GroupScores":
@@ -34,6 +36,10 @@ class GroupScores:
         sums = np.zeros((len(correct), names.size))
         np.add.at(sums.T, group_of, correct.T.astype(np.float64))
         return cls(sums, np.bincount(group_of).astype(np.float64))
+
+    def guided(self, weights: Matrix) -> "GroupScores":
+        """The same, chosen by `weights` (S, S) of the sums."""
+        return GroupScores(self.sums, self.sizes, weights @ self.sums)
 
     def only(self, sites: NDArray[np.intp]) -> "GroupScores":
         """The same for some of the sites."""
@@ -57,14 +63,28 @@ class Crossfit:
     @property
     def scoring(self) -> Matrix:
         """(2, 2) part of the covariance that is there with the chosen sites given: from group to group."""
-        shares = self.held_out.sum(axis=1, keepdims=True) / self.sizes.sum()
-        rest = self.held_out - shares * self.sizes
-        n_groups = self.sizes.size
-        covariance: Matrix = rest @ rest.T * n_groups / (n_groups - 1) / self.sizes.sum() ** 2
-        return covariance
+        return scoring_covariance(self.held_out, self.sizes)
 
 
-def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: int) -> Crossfit:
+def scoring_covariance(held_out: Matrix, sizes: Matrix) -> Matrix:
+    """(2, 2) of two shares, from their (2, G) correct decisions per group and (G,) sizes; groups vary."""
+    shares = held_out.sum(axis=1, keepdims=True) / sizes.sum()
+    rest = held_out - shares * sizes
+    covariance: Matrix = rest @ rest.T * sizes.size / (sizes.size - 1) / sizes.sum() ** 2
+    return covariance
+
+
+def with_unseen(covariance: Matrix, shares: Matrix, n_groups: int, seed: int) -> Matrix:
+    """`covariance` of (2,) shares, where all groups of a stream agree that of what unseen groups may hold."""
+    for stream in np.flatnonzero(covariance.diagonal() < _NO_VARIANCE):
+        share = shares[stream]
+        covariance[stream, stream] = ((unseen(share, n_groups, seed) - share) ** 2).mean()
+    return covariance
+
+
+def crossfit(
+    backbone: GroupScores, expert: GroupScores, chance: float, seed: int, peak_share: float = 0.0
+) -> Crossfit:
     """Choose each stream's best site on one half of the groups, score it on the other, a hundred times over.
 
     Halves, not five folds: bias is the same, and the spread of the average a third less, because the choices
@@ -75,17 +95,19 @@ def crossfit(backbone: GroupScores, expert: GroupScores, chance: float, seed: in
     part of it. A bootstrap would count what its copies of a group agree on as signal. A half averages over
     fewer splits than the whole, which errs on the side of width. Where all groups agree there is no difference to
     see, and the variance is that of what unseen groups may hold.
+
+    peak_share: weight of the best site on all groups, scored on them too; it has no part in the covariance.
     """
     generator = np.random.default_rng(seed)
     sizes = backbone.sizes
     everyone = np.arange(sizes.size)
     splits = random_halves(generator, everyone, sizes.size, REPEATS)
-    held_out = np.array([held_out_scores(stream, splits).mean(axis=0) for stream in (expert, backbone)])
+    chosen = np.array([held_out_scores(stream, splits).mean(axis=0) for stream in (expert, backbone)])
+    peaks = np.array([stream.sums[stream.sums.sum(axis=1).argmax()] for stream in (expert, backbone)])
+    held_out = (1 - peak_share) * chosen + peak_share * peaks
     above = held_out.sum(axis=1) / sizes.sum() - chance
     covariance = _covariance_by_halving((expert, backbone), generator)
-    for stream in np.flatnonzero(covariance.diagonal() < _NO_VARIANCE):
-        share = above[stream] + chance
-        covariance[stream, stream] = ((unseen(share, sizes.size, seed) - share) ** 2).mean()
+    covariance = with_unseen(covariance, above + chance, sizes.size, seed)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
 
@@ -101,7 +123,8 @@ def random_halves(generator: np.random.Generator, groups: NDArray[np.intp], n_gr
 
 def held_out_scores(scores: GroupScores, sides: Sides) -> Matrix:
     """(R, G) correct decisions, in every split, of the site that is best on the other half; 0 outside both."""
-    best = {side: np.argmax(scores.sums @ (sides == side).T, axis=0)[:, None] for side in (1, -1)}
+    guide = scores.sums if scores.guide is None else scores.guide
+    best = {side: np.argmax(guide @ (sides == side).T, axis=0)[:, None] for side in (1, -1)}
     chosen = np.where(sides == 1, best[-1], best[1])
     held_out: Matrix = np.take_along_axis(scores.sums, chosen, axis=0) * (sides != 0)
     return held_out

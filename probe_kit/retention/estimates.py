@@ -55,7 +55,7 @@ class Estimate:
 
 
 Estimates = Mapping[str, Estimate]
-"""Estimates by quantity: `sr`, `prefix_accuracy`, `action_accuracy`, `retention_debiased`."""
+"""Estimates by quantity: `sr`, `prefix_accuracy`, `action_accuracy`, `retention_debiased`, `_bounded`, `_area`."""
 
 
 def average(estimates: Sequence[Estimate]) -> Estimate:
@@ -82,7 +82,7 @@ def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
 def probe_estimates(
     curve: Curve, peaks: Mapping[str, Peak], retention: Retention | None, suite: str
 ) -> dict[str, Estimate]:
-    """Accuracy of the best sites, and debiased retention where it is defined, whole groups drawn."""
+    """Accuracy of the best sites, and retention's three estimates where it is defined, whole groups drawn."""
     units = units_seed(curve.groups, suite)
     rows = [curve.sites.index(peak.site) for peak in peaks.values()]
     draws = bootstrap_means(curve.correct[rows].T, curve.groups, units)
@@ -91,8 +91,10 @@ def probe_estimates(
         for column, (name, peak) in enumerate(peaks.items())
     }
     if retention is not None and retention.defined:
-        ratios = retention_draws(retention.fit, curve.chance, units)
-        found["retention_debiased"] = Estimate(retention.debiased, ratios, units, curve.n_groups)
+        for name in ("debiased", "bounded", "area"):
+            fit = retention.fit if name == "debiased" else getattr(retention, f"{name}_fit")
+            draws = retention_draws(fit, curve.chance, units)
+            found[f"retention_{name}"] = Estimate(getattr(retention, name), draws, units, curve.n_groups)
     return found
 
 

@@ -10,7 +10,10 @@ from probe_kit.retention.rows import RetentionRow
 if TYPE_CHECKING:
     import pandas as pd
 
-_UNDEFINED = ("retention", "retention_debiased", "retention_ci")
+_UNDEFINED = (
+    "retention", "retention_debiased", "retention_ci", "retention_bounded", "retention_bounded_ci",
+    "retention_area", "retention_area_ci",
+)  # fmt: skip
 """Fields that mean nothing where `retention_defined` is False."""
 _DTYPES = {float: "float64", int: "Int64", bool: "bool", str: "string"}
 

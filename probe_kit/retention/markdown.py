@@ -8,7 +8,9 @@ from probe_kit.retention.cells import (
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
     Column,
+    area_value,
     beats,
+    bounded_value,
     controlled,
     debiased_value,
     difference_title,
@@ -57,6 +59,8 @@ RETENTION_COLUMNS: list[Column] = [
     ("chance %", lambda row: percent(row.chance)),
     ("groups", lambda row: "–" if row.n_groups is None else str(row.n_groups)),
     ("backbone beats", beats),
+    ("bounded [95 %]", bounded_value),
+    ("area [95 %]", area_value),
 ]
 
 

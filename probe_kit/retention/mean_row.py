@@ -52,7 +52,8 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         twin=first.twin,
         retention=_mean(counted, "retention"),
         retention_debiased=_mean(counted, "retention_debiased"),
-        retention_ci=_retention_limits(counted, estimates),
+        retention_ci=_retention_limits(counted, estimates, "retention_debiased", "retention_ci"),
+        **_other_retention(counted, estimates),
         retention_defined=bool(counted),
         retention_note=note if counted else first.retention_note,
         categories=tuple(row.category for row in rows),
@@ -71,13 +72,24 @@ def _limits(estimates: Estimates, name: str) -> Limits | None:
     return None if found is None else found.ci
 
 
-def _retention_limits(counted: Sequence[RetentionRow], estimates: Estimates) -> Limits | None:
+def _other_retention(counted: Sequence[RetentionRow], estimates: Estimates) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in ("retention_bounded", "retention_area"):
+        found[name] = _mean(counted, name)
+        found[f"{name}_ci"] = _retention_limits(counted, estimates, name, f"{name}_ci")
+    return found
+
+
+def _retention_limits(
+    counted: Sequence[RetentionRow], estimates: Estimates, name: str, limits: str
+) -> Limits | None:
     """The category's own where there is one, and none where one category has none: a mean knows no more."""
     if len(counted) == 1:
-        return counted[0].retention_ci
-    if any(row.retention_ci == UNBOUNDED for row in counted):
+        own: Limits | None = getattr(counted[0], limits)
+        return own
+    if any(getattr(row, limits) == UNBOUNDED for row in counted):
         return UNBOUNDED
-    return _limits(estimates, "retention_debiased")
+    return _limits(estimates, name)
 
 
 def _mean(rows: Sequence[RetentionRow], name: str) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
+from probe_kit.retention.bounded import area_fit, bounded_fit
 from probe_kit.retention.crossfit import HALVINGS, Crossfit, GroupScores, crossfit
 from probe_kit.retention.fieller import Interval, fieller_interval
 from probe_kit.train.controls import BINDING, TWIN, Beats, Controls, signal
@@ -43,7 +44,8 @@ class Retention:
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
     means nothing, and than binding and twin where they were run; `note` then says so. debiased: the same ratio
     scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two scores
-    it is the ratio of.
+    it is the ratio of. bounded: the same between that and the plug-in peaks, which are too low and too high on
+    average. area: the ratio of mean scores over all sites, how much of the stack carries the answer.
     """
 
     chance: float
@@ -55,6 +57,12 @@ class Retention:
     debiased: float
     interval: Interval
     fit: Crossfit
+    bounded: float
+    bounded_interval: Interval
+    bounded_fit: Crossfit
+    area: float
+    area_interval: Interval
+    area_fit: Crossfit
 
 
 def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak | None:
@@ -85,12 +93,12 @@ def measure_retention(
         return None
     beats = beats or Controls().beats("", "", str(backbone.site), backbone.p_fwe)
     scores = GroupScores.of(curve.correct, curve.groups)
-    fit = crossfit(
-        scores.only(_rows(curve, "backbone", "all")),
-        scores.only(_rows(curve, stream, iterations)),
-        curve.chance,
-        derive_seed("crossfit", seed),
-    )
+    rows = [_rows(curve, "backbone", "all"), _rows(curve, stream, iterations)]
+    streams = scores.only(rows[0]), scores.only(rows[1])
+    places = tuple([curve.sites[row] for row in chosen] for chosen in rows)
+    fit = crossfit(*streams, curve.chance, derive_seed("crossfit", seed))
+    bounded = bounded_fit(*streams, (places[0], places[1]), curve.chance, derive_seed("crossfit", seed))
+    area = area_fit(*streams, curve.chance, derive_seed("area", seed))
     return Retention(
         chance=curve.chance,
         backbone=backbone,
@@ -101,6 +109,12 @@ def measure_retention(
         debiased=_ratio(fit.expert, fit.backbone),
         interval=retention_interval(fit),
         fit=fit,
+        bounded=_ratio(bounded.expert, bounded.backbone),
+        bounded_interval=retention_interval(bounded),
+        bounded_fit=bounded,
+        area=_ratio(area.expert, area.backbone),
+        area_interval=retention_interval(area),
+        area_fit=area,
     )
 
 

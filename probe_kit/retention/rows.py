@@ -14,7 +14,8 @@ class RetentionRow:
 
     Shares and accuracies run from 0 to 1, depths from 0 to 1 of the stream. `retention` is the published ratio
     even when `retention_defined` is False, and then no category mean contains it. `retention_ci` is the 95 %
-    interval of `retention_debiased`, (None, None) when the data set no limit. `gap` = prefix accuracy − SR.
+    interval of `retention_debiased`, (None, None) when the data set no limit; `retention_bounded` lies between
+    that and the peaks, `retention_area` is the ratio of means over all sites. `gap` = prefix accuracy − SR.
     sr_by_epsilon: SR by zone radius in metres. prefix_selectivity, action_selectivity: accuracy of the best site
     above that of the same probe on random labels of items. baselines: accuracy of each control that never sees the
     model; leaks: those above chance.
@@ -94,6 +95,10 @@ class RetentionRow:
     prefix_beats: dict[str, bool | None] = field(default_factory=dict)
     action_beats: dict[str, bool | None] = field(default_factory=dict)
     delta_regime: float | None = None
+    retention_bounded: float | None = None
+    retention_bounded_ci: tuple[float | None, float | None] | None = None
+    retention_area: float | None = None
+    retention_area_ci: tuple[float | None, float | None] | None = None
 
     @property
     def prefix_signal(self) -> bool:

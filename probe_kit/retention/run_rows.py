@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
-from probe_kit.retention.estimates import Estimates, probe_estimates, sr_estimate
+from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_estimates, sr_estimate
+from probe_kit.retention.fieller import Interval
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
@@ -154,13 +155,16 @@ def _probes(curve: Curve, peaks: dict[str, Peak], success: SuccessRate, estimate
 def _retention(retention: Retention | None) -> dict[str, Any]:
     if retention is None:
         return {"retention_note": "n/a (one stream only)"}
-    interval = retention.interval
     return {
         "retention": _number(retention.plain),
         "retention_defined": retention.defined,
         "retention_note": retention.note,
         "retention_debiased": _number(retention.debiased),
-        "retention_ci": (interval.low, interval.high) if interval.bounded else (None, None),
+        "retention_ci": _limits(retention.interval),
+        "retention_bounded": _number(retention.bounded),
+        "retention_bounded_ci": _limits(retention.bounded_interval),
+        "retention_area": _number(retention.area),
+        "retention_area_ci": _limits(retention.area_interval),
     }
 
 
@@ -174,6 +178,10 @@ def _controls(controls: Controls, category: str, view: str, action_stream: str |
         if stream is not None and (score := controls.twin_peak(category, view, stream)) is not None:
             found |= {"twin": score.twin, f"{name}_twin": score.difference, f"{name}_twin_ci": score.ci}
     return found
+
+
+def _limits(interval: Interval) -> Limits:
+    return (interval.low, interval.high) if interval.bounded else UNBOUNDED
 
 
 def _number(value: float) -> float | None:

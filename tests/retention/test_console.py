@@ -78,6 +78,9 @@ def rounded(values: list[object], scales: list[tuple[float, int]]) -> list[float
 SHARE, RATIO, WHOLE, PLACE, P = (100, 1), (1, 2), (100, 0), (1, 0), (1, 3)
 
 
+RETENTIONS = ("bounded", "bounded_ci", "area", "area_ci", "debiased", "ci")
+
+
 def expected(row: dict[str, object]) -> dict[str, list[float]]:
     defined = bool(row["retention_defined"])
     score = row["normalised_score"]
@@ -99,10 +102,11 @@ def expected(row: dict[str, object]) -> dict[str, list[float]]:
             [
                 *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer", "p_fwe")),
                 *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration", "p_fwe")),
-                *(row[name] if defined else None for name in ("retention", "retention_debiased", "retention_ci")),
+                *(row[f"retention_{name}"] if defined else None for name in RETENTIONS),
+                row["retention"] if defined else None,
                 row["gap"],
             ],
-            [SHARE, SHARE, PLACE, P, SHARE, SHARE, PLACE, PLACE, P, RATIO, RATIO, RATIO, SHARE],
+            [SHARE, SHARE, PLACE, P, SHARE, SHARE, PLACE, PLACE, P, *[RATIO] * 7, SHARE],
         ),
         "Controls": rounded(
             [

@@ -68,6 +68,14 @@ GLOSSARY = MappingProxyType(
             "(action − chance) / (backbone − chance): the share of what can be read in the backbone that can "
             "still be read where the action is made. Biased upwards when signals are weak: both are maxima."
         ),
+        "bounded": (
+            "Retention between its bounds: four fifths the debiased estimate, which is too low where the best "
+            "layer is missed, and one fifth the peaks, which are too high. The number to quote for one category."
+        ),
+        "area": (
+            "The same ratio with the mean over all layers (and iterations) in place of the best: how much of the "
+            "stack carries the answer. Nothing is chosen, so nothing is biased; the number to average."
+        ),
         "debiased": (
             "The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
             "interval; “unbounded” means that the backbone's signal is too weak for any ratio."

@@ -7,7 +7,9 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    area_value,
     beats,
+    bounded_value,
     controlled,
     debiased_value,
     difference_title,
@@ -105,6 +107,14 @@ def _retention(row: RetentionRow) -> float | None:
     return row.retention if row.retention_defined else None
 
 
+def _bounded(row: RetentionRow) -> float | None:
+    return row.retention_bounded if row.retention_defined else None
+
+
+def _area(row: RetentionRow) -> float | None:
+    return row.retention_area if row.retention_defined else None
+
+
 def _debiased(row: RetentionRow) -> float | None:
     return row.retention_debiased if row.retention_defined else None
 
@@ -181,6 +191,8 @@ _RETENTION = [
         "retention", lambda row: number(row.retention) if row.retention_defined else "n/a", _retention,
         "retention", _retention, note=lambda row: row.retention_note,
     ),
+    _Column("bounded [95 %]", bounded_value, _bounded, "bounded", _bounded),
+    _Column("area [95 %]", area_value, _area, "area", _area),
     _Column(
         "debiased [95 %]", debiased_value, _debiased, "debiased", _debiased,
     ),
