@@ -35,6 +35,19 @@ def _golden(family: str) -> Path:
     return folder
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """The whole suite takes every core, unless -n says otherwise; single files run in this process.
+
+    A file's tests stay together: what a file sets up once is not set up once per core.
+    """
+    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.option.collectonly
+    if whole and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
+        config.option.numprocesses = len(os.sched_getaffinity(0))
+        if config.option.dist == "no":
+            config.option.dist = "loadfile"
+
+
 @pytest.fixture(scope="session")
 def golden_pi0() -> Path:
     return _golden("pi0")

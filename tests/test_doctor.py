@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -50,8 +51,20 @@ def test_the_scene_that_is_tried_is_one_an_episode_shows() -> None:
 
 
 @pytest.mark.slow
-def test_the_policy_that_is_tried_acts() -> None:
-    assert doctor.let_policy_act()["seconds"] > 0
+def test_the_policy_that_is_tried_acts(monkeypatch: pytest.MonkeyPatch) -> None:
+    from probe_kit.hooks.families.pi0.adapter import Pi0
+
+    act, asked = Pi0.act, []
+
+    def spy(policy: Pi0, seen: list[Any], seeds: list[int]) -> Any:
+        chunk = act(policy, seen, seeds)
+        asked.append(chunk.shape)
+        return chunk
+
+    monkeypatch.setattr(Pi0, "act", spy)
+    found = doctor.let_policy_act()
+    assert asked == [(1, 16, 7)]
+    assert found["torch"] == __import__("torch").__version__
 
 
 def test_a_trial_that_crashes_is_a_finding_with_its_last_words(monkeypatch: pytest.MonkeyPatch) -> None:

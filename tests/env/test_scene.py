@@ -89,10 +89,13 @@ def test_a_state_that_is_not_finite_is_noticed_and_healed(own_scene):
 def test_a_spent_texture_budget_reloads_the_scene(own_scene):
     own_scene.reset(PLAIN, START, 0.0)
     before = own_scene.picture(own_scene.frame())
-    own_scene.textures._budget = 3
+    spent = own_scene.textures
+    spent._budget = 3
     for shade in range(0, 250, 50):
         own_scene.reset({"left": Image.new("L", (8, 8), shade), "right": PLAIN["right"]}, START, 0.0)
-        assert len(own_scene.textures._ids) <= 3 or own_scene.textures._budget > 3
+    assert own_scene.textures is not spent
+    assert len(spent._ids) <= 3
+    assert len(own_scene.textures._ids) >= 5, "of the scene loaded after it"
     own_scene.reset(PLAIN, START, 0.0)
     np.testing.assert_array_equal(own_scene.picture(own_scene.frame()), before)
 
