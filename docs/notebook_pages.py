@@ -46,9 +46,16 @@ def _output(output: dict[str, Any], stem: str, pictures: dict[str, bytes]) -> st
         name = f"{stem}-{len(pictures) + 1}.png"
         pictures[name] = base64.b64decode("".join(content["image/png"]))
         return f"![output]({name})"
+    if "<table" in "".join(content.get("text/html", "")):
+        return f"<div>\n{_unindented(''.join(content['text/html']))}\n</div>"
     if "text/markdown" in content:
         return "".join(content["text/markdown"])
     return _fenced("".join(content.get("text/plain", "")), "text")
+
+
+def _unindented(html: str) -> str:
+    """Without the white space that Markdown would take for code or the end of the table."""
+    return "\n".join(line.strip() for line in html.splitlines() if line.strip())
 
 
 def _fenced(text: str, language: str) -> str:

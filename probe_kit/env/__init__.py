@@ -1,6 +1,7 @@
 """The Act2Answer environment: a question asked on a table top and answered by putting a cube on a picture.
 
-`gymnasium.make("probe_kit/Act2Answer-v0", spec=SceneSpec())` and `Act2AnswerEnv(SceneSpec())` are the same.
+`gymnasium.make("probe_kit.env:probe_kit/Act2Answer-v0", spec=SceneSpec())`, which needs no import of ours, and
+`Act2AnswerEnv(SceneSpec())` are the same.
 Importing this module loads neither the simulator nor torch.
 """
 

@@ -167,7 +167,7 @@ def extract(
         allow_mixed=allow_mixed,
     )
     with err.status("loading suite and model"):
-        extraction = prepare(settings)
+        extraction = prepare(settings, out_folder)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     _print_plan(extraction, location)
     if dry_run:

@@ -101,19 +101,21 @@ class Extraction(Prepared):
         return error
 
 
-def prepare(settings: ExtractSettings) -> Extraction:
+def prepare(settings: ExtractSettings, out: Path | str | Location | None = None) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
+    out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
+    location = None if out is None else locate(out)
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
-        planned = load(replace(settings, device="cpu"))
+        planned = load(replace(settings, device="cpu"), location=location)
         return Extraction(settings, planned.plan, planned.card, None)
-    prepared = load(settings)
+    prepared = load(settings, location=location)
     return Extraction(settings, prepared.plan, prepared.card, prepared.controller)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
     """Extract a run to a folder or a URL such as `s3://bucket/prefix/run`, or continue the one that is there."""
-    return prepare(settings).run(out, progress=progress)
+    return prepare(settings, out).run(out, progress=progress)

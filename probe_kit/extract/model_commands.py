@@ -45,7 +45,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         {
             "model": family.name,
             "description": family.description,
-            "checkpoint": family.default_checkpoint or "embedded",
+            "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else "embedded"),
             "streams": family.streams,
             "embodiment": family.embodiment,
             "ready": f"needs {family.missing()}" if family.missing() else "yes",

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from probe_kit.extract.early import check_model, check_place
 from probe_kit.extract.plan import Plan, make_plan, plan_episodes
 from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
@@ -58,28 +59,23 @@ class Prepared:
         return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
 
 
-def load(settings: ExtractSettings, rehearsed: bool = False) -> Prepared:
+def load(settings: ExtractSettings, rehearsed: bool = False, location: Location | None = None) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
+    location: where it will be written, if that is known, so that it is looked at before the model is loaded.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
-    if settings.model not in SCRIPTED:
-        _find_family(settings.model)
+    check_model(settings, tuple(SCRIPTED))
     refuse_meaningless(settings)
     suite = _suite(settings)
+    if location is not None:
+        check_place(settings, suite, location)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
     controller = _controller(settings, suite)
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.captured_calls, with_tokens)
     return Prepared(settings, plan, controller.identity, controller)
-
-
-def _find_family(name: str) -> None:
-    """Refuse an unknown model before the suite is built."""
-    from probe_kit.hooks.registry import find_family
-
-    find_family(name, tuple(SCRIPTED))
 
 
 def _suite(settings: ExtractSettings) -> Suite:

@@ -1,10 +1,14 @@
-"""Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first."""
+"""Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first. Imports no torch."""
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from probe_kit.errors import CheckpointError
+from probe_kit.errors import CheckpointError, WeightsError
+
+CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
+WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
 
 # What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
 _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
@@ -51,3 +55,48 @@ def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
     return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+
+
+def check_files(folder: Path, types: Sequence[str], weights: bool = True) -> None:
+    """Look at what can be wrong with a checkpoint before anything heavy is imported.
+
+    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read.
+    Raises CheckpointError for a missing or unreadable config or one of another model, WeightsError for missing
+    weights.
+    A folder of a LoRA adapter is left to its loader, which knows its base.
+    """
+    if (folder / ADAPTER_FILE).is_file():
+        return
+    file = folder / CONFIG_FILE
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
+    try:
+        config = json.loads(file.read_text())
+    except ValueError as error:
+        raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
+    found = config.get("type") or config.get("model_type") if isinstance(config, dict) else None
+    if found not in types:
+        raise CheckpointError(
+            f"{file} holds a {found!r} model; expected {' or '.join(types)}. Pass the right --model"
+        )
+    if weights and (lacking := missing_weights(folder)):
+        raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
+
+
+def missing_weights(folder: Path) -> str:
+    """What is not there of a folder's weights; empty if all files are."""
+    index = folder / INDEX_FILE
+    if (folder / WEIGHTS_FILE).is_file():
+        return ""
+    if index.is_file():
+        try:
+            shards = sorted(set(json.loads(index.read_text())["weight_map"].values()))
+        except (ValueError, KeyError, AttributeError):
+            return f"{INDEX_FILE} is damaged"
+        absent = [name for name in shards if not (folder / name).is_file()]
+        return f"{', '.join(absent)} of {INDEX_FILE} are missing" if absent else ""
+    return (
+        ""
+        if len(list(folder.glob("*.pt"))) == 1
+        else f"neither {WEIGHTS_FILE} nor {INDEX_FILE} nor one .pt file is there"
+    )

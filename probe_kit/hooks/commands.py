@@ -23,10 +23,16 @@ def verify(
 
     Exit code 1 if anything is over its tolerance. What the adapter cannot produce is listed, never passed.
     """
-    from probe_kit.hooks.verify import verify_keys, verify_reference
+    from probe_kit.hooks.reference_files import check_key_list, check_reference
 
     if (folder is None) == (keys is None):
         raise UsageError("give either a golden reference folder or --keys FILE")
+    if keys is not None:
+        check_key_list(family, keys)
+    else:
+        check_reference(family, cast("Path", folder))
+    from probe_kit.hooks.verify import verify_keys, verify_reference
+
     verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))
     if as_json:
         print_json(verification.to_json())

@@ -5,10 +5,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import MissingExtraError, UsageError
+from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
+from probe_kit.hooks.machine import check_device_name, what_is_here
 from probe_kit.hooks.options import Option, check_options
 
 if TYPE_CHECKING:
@@ -30,6 +33,8 @@ class Family:
     config.json. packages: modules of an extra that it needs, with the name of that extra.
     unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
     `verify --keys` prints them.
+    config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
+    none, and then only the loader knows one when it sees it. needs_checkpoint: nothing is there by default.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -48,6 +53,8 @@ class Family:
     unstored: tuple[str, ...] = ()
     hub: tuple[tuple[str, str], ...] = ()
     packages: tuple[tuple[str, str], ...] = ()
+    config_types: tuple[str, ...] = ()
+    needs_checkpoint: bool = False
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -71,9 +78,7 @@ class Family:
         options: by name, as text or values. weights_seed: of a random twin's weights.
         Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
         """
-        chosen = check_options(self.name, self.options, options)
-        if weights_seed and not random_weights:
-            raise UsageError("weights_seed belongs to a random twin; ask for random weights too, or leave it out")
+        chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         check_machine(device, dtype)
         load = imported(self.loader)
         if weights_seed:
@@ -86,6 +91,37 @@ class Family:
         model.card = replace(model.card, settings={**said, **model.card.settings})
         return model
 
+    def check(
+        self,
+        checkpoint: str | None = None,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        options: Mapping[str, Any] = MappingProxyType({}),
+        weights_seed: int = 0,
+    ) -> dict[str, Any]:
+        """Everything about `load` that can be wrong without weights, in a second instead of a minute.
+
+        Returns the options as the loader gets them. A checkpoint on the hub is downloaded. Raises UsageError,
+        MissingExtraError, CheckpointError or WeightsError as loading would.
+        """
+        chosen = check_options(self.name, self.options, options)
+        if weights_seed and not random_weights:
+            raise UsageError("weights_seed belongs to a random twin; ask for random weights too, or leave it out")
+        if dtype not in (None, *DTYPES):
+            raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
+        check_device_name(device)
+        for module, extra in self._missing_packages():
+            raise MissingExtraError(
+                f"{self.name} needs {module}, which is not installed; `pip install 'probe-kit[{extra}]'`"
+            )
+        place = checkpoint or self.default_checkpoint
+        if place is None and self.needs_checkpoint:
+            raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
+        if place is not None and self.config_types:
+            check_files(checkpoint_folder(place), self.config_types, weights=not random_weights)
+        return chosen
+
     def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""
         path = getattr(self, purpose)
@@ -94,30 +130,42 @@ class Family:
         return imported(path)
 
     def missing(self) -> str:
-        """What this machine lacks to load the default checkpoint; empty if it is ready."""
-        from huggingface_hub import try_to_load_from_cache
-
-        files = self.hub
-        if self.default_checkpoint is not None and self.default_checkpoint not in dict(files):
-            files = ((self.default_checkpoint, "config.json"), *files)
-        absent = [name for name, file in files if not isinstance(try_to_load_from_cache(name, file), str)]
-        lacking = [f"extra {extra}" for module, extra in self.packages if find_spec(module) is None]
+        """What this machine lacks to run the family, its default checkpoint included; empty if it is ready."""
+        lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
+        if self.needs_checkpoint:
+            lacking.append("a checkpoint of yours (--checkpoint)")
+        default, files = self.default_checkpoint, self.hub
+        if default is not None and default not in dict(files):
+            files = ((default, CONFIG_FILE), *files)
+        absent = [name for name, file in files if self._is_absent(name, file)]
         if absent:
             lacking.append(f"download of {', '.join(absent)}")
         return " and ".join(lacking)
 
+    def _is_absent(self, repository: str, file: str) -> bool:
+        """Whether the hub's cache lacks a file, or the weights beside the default checkpoint's config."""
+        from huggingface_hub import try_to_load_from_cache
+
+        found = try_to_load_from_cache(repository, file)
+        whole = repository == self.default_checkpoint and bool(self.config_types)
+        return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))
+
+    def _missing_packages(self) -> list[tuple[str, str]]:
+        return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+
 
 def check_machine(device: str, dtype: str | None) -> None:
     """Raise UsageError for a dtype that is not offered or a device that this machine does not have."""
-    import torch
-
     if dtype not in (None, *DTYPES):
         raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
+    check_device_name(device)
+    import torch
+
     try:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:  # what torch raises: unknown, absent
         reason = str(error).partition("\n")[0]
-        raise UsageError(f"device {device!r} cannot be used: {reason}. Try 'cpu'") from error
+        raise UsageError(f"device {device!r} cannot be used: {reason}. {what_is_here()}") from error
 
 
 def imported(path: str) -> Callable[..., Any]:

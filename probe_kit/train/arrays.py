@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import MissingExtraError, UsageError
+from probe_kit.hooks.machine import check_device_name, what_is_here
 
 Array = Any
 """A numpy array, or a torch tensor on any device."""
@@ -35,6 +36,7 @@ def check_device(device: str | None) -> None:
     """Raises MissingExtraError without torch, and UsageError for a device torch does not know or see."""
     if device is None:
         return
+    check_device_name(device)
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -44,5 +46,5 @@ def check_device(device: str | None) -> None:
     except (RuntimeError, AssertionError, TypeError) as error:  # what torch raises: unknown, absent, no float64
         reason = str(error).partition("\n")[0]
         raise UsageError(
-            f"device {device!r} cannot be used: {reason}. Try 'cuda', or leave `device` out."
+            f"device {device!r} cannot be used: {reason}. {what_is_here()}; or leave `device` out"
         ) from error

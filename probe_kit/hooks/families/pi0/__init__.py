@@ -14,6 +14,7 @@ FAMILIES = (
         streams=_TINY_STREAMS,
         notes="State is readable in its backbone by training, and not acted on; nothing else was trained",
         verifier=_VERIFIER,
+        config_types=("pi0",),
     ),
     Family(
         "pi0-tiny-early",
@@ -23,6 +24,7 @@ FAMILIES = (
         streams=_TINY_STREAMS,
         notes="a model organism: see `probe-kit demo --compare`",
         verifier=_VERIFIER,
+        config_types=("pi0",),
     ),
     Family(
         "pi0",
@@ -34,6 +36,7 @@ FAMILIES = (
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes="Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
         verifier=_VERIFIER,
+        config_types=("pi0",),
         full_size="probe_kit.models.pi0:full_size_pi0",
     ),
 )

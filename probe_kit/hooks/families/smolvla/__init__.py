@@ -13,6 +13,7 @@ FAMILIES = (
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
         notes="Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
         verifier="probe_kit.hooks.families.lerobot_verify:verify_smolvla",
+        config_types=("smolvla",),
         full_size="probe_kit.models.smolvla:full_size_smolvla",
     ),
 )

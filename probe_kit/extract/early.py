@@ -1,0 +1,77 @@
+"""What can be wrong with an extraction before its model is loaded, found in a second instead of a minute."""
+
+import json
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.errors import MissingExtraError, UsageError
+from probe_kit.extract.settings import ExtractSettings, refuse_other_settings
+from probe_kit.extract.store.layout import RUN_FILE
+from probe_kit.identity import canonical_json
+
+if TYPE_CHECKING:
+    from probe_kit.extract.store.location import Location
+    from probe_kit.suite import Suite
+
+_OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "weights_seed")
+"""Settings whose value the loaded model may decide."""
+
+
+def check_model(settings: ExtractSettings, scripted: tuple[str, ...]) -> None:
+    """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
+
+    scripted: names of models that are none. Raises UnknownModelError and what `Family.check` raises.
+    """
+    if settings.ray is not None and find_spec("ray") is None:
+        raise MissingExtraError("--ray needs ray, which is not installed; `pip install 'probe-kit[ray]'`")
+    if settings.model in scripted:
+        return
+    from probe_kit.hooks.registry import find_family
+
+    # Elsewhere there may be other devices than here.
+    device = "cpu" if settings.workers or settings.ray else settings.device
+    find_family(settings.model, scripted).check(
+        settings.checkpoint, device, settings.dtype, settings.random_weights, settings.options,
+        settings.weights_seed,
+    )  # fmt: skip
+
+
+def check_place(settings: ExtractSettings, suite: "Suite", location: "Location") -> None:
+    """Refuse a place that cannot be written, or where a run with other settings lies.
+
+    Only settings that are known without the model are compared; the writer compares all of them.
+    Raises UsageError or SettingsMismatchError.
+    """
+    _check_writable(location)
+    with location.in_words():
+        if not location.exists(RUN_FILE):
+            return
+        stored: dict[str, Any] = json.loads(location.read(RUN_FILE))["settings"]
+    known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
+    refuse_other_settings({name: stored[name] for name in known}, known, str(location))
+
+
+def _known_settings(settings: ExtractSettings, suite: "Suite") -> dict[str, Any]:
+    chosen = {name: value for name, value in settings.choices().items() if name not in _OF_THE_CHECKPOINT}
+    known = {
+        **chosen,
+        "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
+        "categories": list(suite.categories),
+        "items": len(suite.items),
+        "scene": settings.scene.to_json(),
+    }
+    as_stored: dict[str, Any] = json.loads(canonical_json(known))
+    return as_stored
+
+
+def _check_writable(location: "Location") -> None:
+    if "://" in location.address:
+        return  # a bucket says so itself, and creating anything there is no check
+    place = Path(location.address)
+    there = next(folder for folder in (place, *place.parents) if folder.exists())
+    if not there.is_dir():
+        raise UsageError(f"{location} cannot be used: {there} is no folder. Give another path")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UsageError(f"{location} cannot be used: {there} cannot be written. Give another path")
