@@ -14,6 +14,7 @@ import yaml
 from transformers import Qwen2_5_VLConfig
 
 from probe_kit.errors import CheckpointError
+from probe_kit.models.qwen import without_precision
 
 RUN_FILE, DIMS_FILE = "config.yaml", "dims.json"
 FRAMEWORKS = ("InternVLA-M1", "InternVLA_M1")
@@ -88,7 +89,7 @@ class InternVLAConfig:
         data = (values.get("datasets") or {}).get("vla_data") or {}
         size = data.get("image_size")
         config = cls(
-            vlm=Qwen2_5_VLConfig(**{name: value for name, value in vlm.items() if name != "architectures"}),
+            vlm=Qwen2_5_VLConfig(**without_precision(vlm)),
             dino=_dino(values, framework, source),
             query=_query(values, framework, source),
             head=_head(values, framework, source),

@@ -1,10 +1,19 @@
 """Building networks that hold one of transformers' Qwen vision-language models."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import nn
+
+
+def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration's values without the precision its files are stored in, in its parts too.
+
+    transformers builds every part in the precision its own configuration names, whatever is asked for around it.
+    """
+    kept = {name: value for name, value in values.items() if name not in ("dtype", "torch_dtype")}
+    return {name: without_precision(value) if isinstance(value, dict) else value for name, value in kept.items()}
 
 
 def build_empty[Network: nn.Module](

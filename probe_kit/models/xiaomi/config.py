@@ -9,6 +9,7 @@ from typing import Any
 from transformers import Qwen3VLConfig
 
 from probe_kit.errors import CheckpointError
+from probe_kit.models.qwen import without_precision
 
 MODEL_TYPE = "mibot"
 
@@ -60,7 +61,7 @@ class XiaomiConfig:
         if missing:
             raise CheckpointError(f"{source} lacks {', '.join(missing)}; the checkpoint is not whole")
         config = cls(
-            vlm=Qwen3VLConfig(**values["vlm_config"]),
+            vlm=Qwen3VLConfig(**without_precision(values["vlm_config"])),
             flow=_flow(values.get("dit_config") or {}),
             state_length=int(values.get("state_length", 1)),
             state_dim=int(values["state_dim"]),

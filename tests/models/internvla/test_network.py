@@ -16,7 +16,7 @@ from probe_kit.models.internvla import (
     full_size_internvla,
 )
 from probe_kit.models.qwen import QwenInputs, pack_inputs
-from tests.internvla_checkpoints import config, network
+from tests.internvla_checkpoints import config, network, vlm_values
 from tests.qwen_checkpoints import ID
 
 
@@ -86,6 +86,16 @@ def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
     empty = build_internvla(config(), torch.bfloat16)
     assert all(parameter.is_meta and parameter.dtype == torch.bfloat16 for parameter in empty.parameters())
     assert all(buffer.dtype == torch.float32 and not buffer.is_meta for buffer in empty.buffers())
+
+
+@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(asked: torch.dtype) -> None:
+    stored = {"torch_dtype": "float16"}
+    values = vlm_values() | stored
+    values["text_config"] |= stored
+    values["vision_config"] |= stored
+    empty = build_internvla(config(values), asked, device="cpu")
+    assert {parameter.dtype for parameter in empty.parameters()} == {asked}
 
 
 @torch.inference_mode()

@@ -118,6 +118,14 @@ def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
     assert torch.get_default_dtype() == torch.float32
 
 
+@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(asked: torch.dtype) -> None:
+    vlm = config_values()["vlm_config"] | {"dtype": "float16"}
+    vlm["text_config"]["torch_dtype"] = vlm["vision_config"]["dtype"] = "float16"
+    built = build_xiaomi(XiaomiConfig.from_json(config_values(vlm_config=vlm)), asked, device="cpu")
+    assert {parameter.dtype for parameter in built.parameters()} == {asked}
+
+
 @torch.inference_mode()
 def test_bfloat16_runs_and_stays_near(network: XiaomiNetwork) -> None:
     rounded = build_xiaomi(XiaomiConfig.from_json(config_values()), torch.bfloat16)
