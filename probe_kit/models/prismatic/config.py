@@ -148,7 +148,9 @@ def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerC
 
 
 def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any:
-    stored = dict(values.get("text_config") or {})
+    # Its own precision would win over the one that is asked for.
+    ignored = ("dtype", "torch_dtype")
+    stored = {name: value for name, value in (values.get("text_config") or {}).items() if name not in ignored}
     found = stored.setdefault("model_type", model_type)
     if found != model_type:
         raise CheckpointError(

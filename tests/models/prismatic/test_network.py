@@ -94,6 +94,14 @@ def test_rotary_frequencies_stay_float32_and_real_on_a_network_built_without_mem
     assert torch.get_default_dtype() == torch.float32
 
 
+@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_file_says(asked: torch.dtype) -> None:
+    values = config_values()
+    values["text_config"]["torch_dtype"] = "float16"
+    built = build_prismatic(PrismaticConfig.from_json(values), asked, device="cpu")
+    assert {parameter.dtype for parameter in built.parameters()} == {asked}
+
+
 def test_the_full_size_has_the_released_number_of_parameters() -> None:
     assert sum(parameter.numel() for parameter in full_size_openvla().parameters()) == 7_541_237_184
     assert full_size_prismatic().state_dict().keys() == full_size_openvla().state_dict().keys()
