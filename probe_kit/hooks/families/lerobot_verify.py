@@ -43,7 +43,7 @@ def verify_flow(load: Callable[[str], LerobotFlow], folder: Path, recorded: Arra
     mean nothing.
     """
     policy = load(str(folder / "checkpoint"))
-    policy = policy.showing(policy.cameras)
+    policy = policy.showing([camera for camera in policy.cameras if f"in_image_{camera}" in recorded])
     batch = _batch(policy, recorded)
     noise = torch.from_numpy(recorded["in_noise"])
     calls: dict[str, list[Tensor]] = {}
@@ -71,7 +71,7 @@ def verify_flow(load: Callable[[str], LerobotFlow], folder: Path, recorded: Arra
 
 
 def _batch(policy: LerobotFlow, recorded: Arrays) -> dict[str, Tensor]:
-    images = {f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.cameras}
+    images = {f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.shown}
     return images | {
         STATE: torch.from_numpy(policy.state_units.normalise(recorded["in_raw_state"])),
         TOKENS: torch.from_numpy(recorded["in_lang_tokens"]),

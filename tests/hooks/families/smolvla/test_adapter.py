@@ -1,0 +1,46 @@
+"""SmolVLA's packing, held against lerobot's own masks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.errors import ObservationError
+from probe_kit.hooks.families.smolvla.adapter import load_smolvla
+from probe_kit.hooks.testing import example_observations
+from tests.smolvla_checkpoints import write_smolvla
+
+
+@pytest.mark.parametrize("shown", [1, 2])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"empty_cameras": 1},
+        {"add_image_special_tokens": True, "empty_cameras": 1},
+        {"prefix_length": 40},
+        {"add_image_special_tokens": True, "prefix_length": 50},
+    ],
+)
+def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dict, shown: int) -> None:
+    cameras = ("top", "wrist")
+    policy = load_smolvla(str(write_smolvla(tmp_path, cameras=cameras, **fields))).showing(cameras[:shown])
+    seen = example_observations(["Put the cube on the star", "Put the cube on the red shape"], cameras)
+    batch = policy.batch(seen)
+    images, masks = policy.network.prepare_images(batch)
+    tokens, valid = policy.tokenise([one.instruction for one in seen])
+    state = policy.network.prepare_state(batch)
+    with torch.no_grad():
+        _, expected, _ = policy.network.model.embed_prefix(images, masks, tokens, valid, state)
+    ours = np.stack([row.valid for row in policy.roles(seen)["backbone"]])
+    np.testing.assert_array_equal(ours, expected.bool().numpy())
+    assert {f"image.{camera}" for camera in cameras[:shown]} <= set(policy.role_names["backbone"])
+
+
+def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:
+    policy = load_smolvla(str(write_smolvla(tmp_path, cameras=("top", "wrist")))).showing(["top", "wrist"])
+    with pytest.raises(ObservationError, match=r"no camera\.wrist"):
+        policy.act(example_observations(["Put the cube on the star"]), [0])
+    with pytest.raises(ObservationError, match="in order"):
+        policy.showing(["wrist"])
