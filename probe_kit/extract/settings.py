@@ -107,8 +107,8 @@ def run_label(settings: ExtractSettings) -> str:
     if settings.checkpoint is not None:
         parts.append(Path(settings.checkpoint).name)
     parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
-    if settings.random_weights:
-        parts.append(f"random {settings.weights_seed}" if settings.weights_seed else "random")
+    if settings.random_weights and settings.weights_seed:
+        parts.append(f"twin {settings.weights_seed}")
     if settings.edits:
         parts.append(f"edited {sha256_json([edit.to_json() for edit in settings.edits])[:6]}")
     return " · ".join(parts)

@@ -22,7 +22,8 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def model_name(row: RetentionRow) -> str:
     """The model, marked if its weights are random, and its group if there are groups."""
-    name = f"{row.model} (random weights)" if row.random_weights else row.model
+    name = row.label or row.model
+    name += " (random weights)" if row.random_weights else ""
     return name if row.group is None else f"{row.group}: {name}"
 
 

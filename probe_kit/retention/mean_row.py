@@ -29,6 +29,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
     return RetentionRow(
         run=first.run,
         model=first.model,
+        label=first.label,
         random_weights=first.random_weights,
         weights_sha256=first.weights_sha256,
         suite=first.suite,

@@ -16,6 +16,7 @@ class RetentionRow:
     even when `retention_defined` is False, and then no category mean contains it. `retention_ci` is the 95 %
     interval of `retention_debiased`, (None, None) when the data set no limit; `retention_bounded` lies between
     that and the peaks, `retention_area` is the ratio of means over all sites. `gap` = prefix accuracy − SR.
+    label: what the run is called in tables and legends.
     sr_by_epsilon: SR by zone radius in metres. prefix_selectivity, action_selectivity: accuracy of the best site
     above that of the same probe on random labels of items. baselines: accuracy of each control that never sees the
     model; leaks: those above chance.
@@ -89,6 +90,7 @@ class RetentionRow:
     prefix_twin_ci: tuple[float, float] | None = None
     action_twin: float | None = None
     action_twin_ci: tuple[float, float] | None = None
+    label: str = ""
     group: str | None = None
     categories: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()

@@ -89,6 +89,7 @@ def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
     return {
         "run": str(run.location),
         "model": run.model,
+        "label": run.label,
         "random_weights": run.random_weights,
         "weights_sha256": run.weights_sha256,
         "suite": run.suite,

@@ -1,8 +1,9 @@
 """The retention table: several runs joined, and the ways to write it down."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from probe_kit.env.outcome import SENSITIVITY_RADII
@@ -143,7 +144,22 @@ def retention(
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
     differences = group_differences(by_group)
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
-    return RetentionTable([one.row for one in drawn], means, differences, results, iterations, tuple(notes))
+    names = _distinct_labels([run for _, run in listed])
+    rows, means = (
+        [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
+    )
+    return RetentionTable(rows, means, differences, results, iterations, tuple(notes))
+
+
+def _distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
+    """By run what it is called; runs that share a name are told apart by the hash of their settings."""
+    shared = Counter((run.label, run.random_weights) for run in runs)
+    return {
+        str(run.location): run.label
+        if shared[run.label, run.random_weights] == 1
+        else f"{run.label} · {run.settings_sha256[:6]}"
+        for run in runs
+    }
 
 
 def _refuse_doubles(runs: Sequence[RunReader]) -> None:

@@ -52,6 +52,11 @@ class ArrayRun:
                 )
 
     @property
+    def label(self) -> str:
+        """The model's name."""
+        return self.model
+
+    @property
     def location(self) -> Location:
         """The folder `path`."""
         return locate(self.path)

@@ -41,6 +41,10 @@ class RunReader(Protocol):
         """Name of the policy."""
 
     @property
+    def label(self) -> str:
+        """What tables and legends call the run; two runs of one model differ in it."""
+
+    @property
     def weights_sha256(self) -> str | None:
         """Hash of the weights that acted; None for a policy without weights."""
 

@@ -176,7 +176,7 @@ def _settings(
         if category not in (*known, POOLED):
             raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
     return ProbeSettings(
-        model=run.model,
+        model=run.label,
         random_weights=run.random_weights,
         weights=run.weights_sha256,
         suite=run.suite,

@@ -101,6 +101,11 @@ class Run:
         return str(self.settings["model"])
 
     @property
+    def label(self) -> str:
+        """What tables and legends call the run: the model and what sets it apart, or as it was named."""
+        return str(self.settings.get("label", self.model))
+
+    @property
     def weights_sha256(self) -> str | None:
         """Hash of the weights that acted; None for a scripted run."""
         weights: str | None = self.settings["weights_sha256"]

@@ -25,6 +25,10 @@ class Summarised(Protocol):
         """Name of the model."""
 
     @property
+    def label(self) -> str:
+        """What the run is called."""
+
+    @property
     def weights_sha256(self) -> str | None:
         """Hash of the weights that acted."""
 
@@ -52,7 +56,7 @@ class Summarised(Protocol):
 def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
-    return f"<Run {run.model}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
+    return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
 
 
 def run_html(run: Summarised) -> str:
@@ -66,7 +70,7 @@ def run_html(run: Summarised) -> str:
         "streams": streams_text(run.streams.values()),
         "at": str(run.location),
     }
-    return facts_html(f"Run of {run.model}", facts, "run.episodes is the table, run.column(site) one site of it")
+    return facts_html(f"Run of {run.label}", facts, "run.episodes is the table, run.column(site) one site of it")
 
 
 def _episodes(run: Summarised) -> str:

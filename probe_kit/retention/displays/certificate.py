@@ -33,7 +33,7 @@ class Certificate:
     def of_run(cls, run: RunReader) -> Self:
         """Of a run's behaviour."""
         n = f"n = {len(run.episodes)} episodes"
-        return cls(run.model, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
+        return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
     @classmethod
     def of_results(cls, results: ProbeResults, view: str) -> Self:
@@ -51,7 +51,13 @@ class Certificate:
         """Of a row of the retention table, usually a mean."""
         n = f"n = {row.n_episodes} episodes"
         return cls(
-            row.model, row.random_weights, row.weights_sha256, row.suite, n, row.run_settings, row.probe_settings
+            row.label or row.model,
+            row.random_weights,
+            row.weights_sha256,
+            row.suite,
+            n,
+            row.run_settings,
+            row.probe_settings,
         )
 
     @property

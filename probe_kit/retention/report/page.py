@@ -72,7 +72,7 @@ def report_html(
     sentence, bibtex = citation(runs)
     rows = table.all_rows
     return _render(
-        title=" and ".join(dict.fromkeys(run.model for run in runs)),
+        title=" and ".join(dict.fromkeys(run.label for run in runs)),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         random_weights=any(run.random_weights for run in runs),

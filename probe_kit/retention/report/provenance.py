@@ -29,6 +29,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
     certificate: dict[str, Any] = getattr(run, "certificate", {})
     probes = _probe_settings(results)
     facts = {
+        "run": run.label,
         "model": run.model,
         "weights": "random: nobody trained them" if run.random_weights else "",
         "weights sha256": run.weights_sha256 or "none (scripted)",

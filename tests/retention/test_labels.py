@@ -1,0 +1,26 @@
+"""Two runs never share a name in a table."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from probe_kit.retention import retention
+from probe_kit.train import ArrayRun
+
+
+def test_runs_of_one_name_are_told_apart_in_every_table(probed_run: Callable[..., ArrayRun], tmp_path: Any) -> None:
+    one = probed_run({"color": ([0.5, 0.8], [[0.6]])})
+    features = {key: np.ones_like(values) for key, values in one.features.items()}
+    other = ArrayRun(tmp_path / "other", one.model, one.suite, one.episodes, features)
+    table = retention([one, other])
+    labels = {row.label for row in table.rows}
+    assert len(labels) == 2
+    assert all(label.startswith("pi0 · ") for label in labels)
+    assert {row.model for row in table.rows} == {"pi0"}
+    assert all(label in table.to_markdown() for label in labels)
+
+
+def test_a_run_alone_keeps_its_name(probed_run: Callable[..., ArrayRun]) -> None:
+    table = retention([probed_run({"color": ([0.5, 0.8], [[0.6]])})])
+    assert {row.label for row in (*table.rows, *table.means)} == {"pi0"}
