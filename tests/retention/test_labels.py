@@ -1,7 +1,7 @@
 """Two runs never share a name in a table."""
 
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from probe_kit.retention import retention
 from probe_kit.train import ArrayRun
 
 
-def test_runs_of_one_name_are_told_apart_in_every_table(probed_run: Callable[..., ArrayRun], tmp_path: Any) -> None:
+def test_runs_of_one_name_are_told_apart(probed_run: Callable[..., ArrayRun], tmp_path: Path) -> None:
     one = probed_run({"color": ([0.5, 0.8], [[0.6]])})
     features = {key: np.ones_like(values) for key, values in one.features.items()}
     other = ArrayRun(tmp_path / "other", one.model, one.suite, one.episodes, features)
