@@ -20,8 +20,8 @@ from scipy.special import ndtri
 
 from probe_kit.retention.crossfit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimates import Estimate, average, retention_draws
-from probe_kit.retention.fieller import Interval
 from probe_kit.retention.measure import retention_interval
+from probe_kit.statistics.fieller import Interval
 from probe_kit.train.permutation import family_p, flip_items
 from probe_kit.train.probe import nested_folds, probe_site
 from probe_kit.train.samples import Samples

@@ -8,13 +8,15 @@ from typing import Any
 def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
     """A module-level `__getattr__` (PEP 562) for `package`.
 
-    homes: name → module inside the package, or `module:other_name` where it is called otherwise there.
+    homes: name → module inside the package, or `module:other_name` where it is called otherwise there; a module of
+    another package begins with `probe_kit.`.
     """
 
     def load(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, _, original = homes[name].partition(":")
-        return getattr(import_module(f"{package}.{module}"), original or name)
+        home = module if module.startswith("probe_kit.") else f"{package}.{module}"
+        return getattr(import_module(home), original or name)
 
     return load

@@ -9,7 +9,8 @@ from tests.import_graph import circles, import_graph, upward
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
-BASE = {"child", "cluster", "console", "errors", "extras", "identity", "lazy", "notebook", "version"}
+TOP = {"__init__", "__main__", "cli", "commands", "demo", "doctor", "organisms"}
+BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP
 ROOMS = {
     **dict.fromkeys(BASE, BASE),
     "statistics": BASE,

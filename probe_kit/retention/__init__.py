@@ -28,12 +28,12 @@ if TYPE_CHECKING:
         PairedItems,
         Regime,
         SuccessRate,
-        chance_margin,
         normalised_score,
         sensitivity,
         success_rate,
     )
     from probe_kit.retention.table import RetentionTable, retention
+    from probe_kit.statistics.significance import chance_margin
 
 __all__ = [
     "Difference",
@@ -87,7 +87,7 @@ __getattr__ = lazy_names(
         "SuccessRate": "success",
         "SuccessTableDisplay": "displays",
         "best_site": "measure",
-        "chance_margin": "success",
+        "chance_margin": "probe_kit.statistics.significance",
         "layer_curve": "displays",
         "measure_retention": "measure",
         "normalised_score": "success",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.train.scores import unseen
+from probe_kit.statistics.bootstrap import unseen
 
 Matrix = NDArray[np.float64]
 Sides = NDArray[np.int8]

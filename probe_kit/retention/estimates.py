@@ -12,8 +12,16 @@ from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.measure import Peak, Retention
 from probe_kit.retention.success import units_of
+from probe_kit.statistics.bootstrap import (
+    GAINS,
+    bootstrap_means,
+    constant,
+    draw_groups,
+    interval,
+    units_seed,
+    unseen,
+)
 from probe_kit.train.curve import Curve
-from probe_kit.train.scores import GAINS, bootstrap_means, constant, draw_groups, interval, units_seed, unseen
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,7 +15,7 @@ from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
 from probe_kit.retention.bounded import area_fit, bounded_fit
 from probe_kit.retention.crossfit import HALVINGS, Crossfit, GroupScores, crossfit
-from probe_kit.retention.fieller import Interval, fieller_interval
+from probe_kit.statistics.fieller import Interval, fieller_interval
 from probe_kit.train.controls import BINDING, TWIN, Beats, Controls, signal
 from probe_kit.train.curve import Curve
 

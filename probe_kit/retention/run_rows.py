@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
 from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_estimates, sr_estimate
-from probe_kit.retention.fieller import Interval
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
+from probe_kit.statistics.bootstrap import units_seed
+from probe_kit.statistics.fieller import Interval
 from probe_kit.train.controls import Controls
 from probe_kit.train.curve import Curve
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
-from probe_kit.train.scores import units_seed
 
 if TYPE_CHECKING:
     import pandas as pd

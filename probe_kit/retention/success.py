@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import comb, sqrt
-from statistics import NormalDist, fmean
+from math import comb
+from statistics import fmean
 from typing import TYPE_CHECKING
 
 from probe_kit.env.outcome import SENSITIVITY_RADII, zone
 from probe_kit.errors import UsageError
-from probe_kit.train.scores import group_bootstrap
+from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.significance import chance_margin
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,13 +75,6 @@ class SuccessRate:
     reason: str
     side_preference: float | None
     paired: PairedItems
-
-
-def chance_margin(n: float, alpha: float = 0.05) -> float:
-    """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
-    if n < 1:
-        raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
-    return NormalDist().inv_cdf(1 - alpha / 2) * sqrt(0.25 / n)
 
 
 def regime(sr: float, delta: float, p_wrong: float, p_oob: float) -> tuple[Regime, str]:

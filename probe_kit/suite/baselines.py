@@ -15,6 +15,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from probe_kit.identity import derive_seed
+from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.folds import assign_folds
+from probe_kit.statistics.significance import chance_margin
 from probe_kit.suite.items import Episode, Side
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite
@@ -64,7 +67,7 @@ class Baseline:
 
 def limit_for(items: int) -> float:
     """0.5 plus the half width of a coin's 95 % interval over that many items."""
-    return 0.5 + 1.96 * float(np.sqrt(0.25 / items))
+    return 0.5 + chance_margin(items)
 
 
 def run_baselines(
@@ -102,7 +105,7 @@ def _category_baselines(suite: Suite, category: str, seed: int) -> Iterator[Base
     if len(names) < 2:
         return
     correct = np.array([episode.side_correct == "left" for episode in episodes])
-    folds = _folds(groups, seed)
+    folds = assign_folds(correct, groups, min(FOLDS, len(names)), derive_seed("folds", seed))
     words, pixels, statistics = _words(episodes), _pixels(episodes), _statistics(episodes)
     predictors: dict[str, Callable[[Rows, Rows], Labels]] = {
         "position": lambda train, test: np.full(len(test), correct[train].mean() >= 0.5),
@@ -135,29 +138,10 @@ def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
     return np.array([episode.item.pair_id for episode in episodes]), "pair_id"
 
 
-def _folds(groups: npt.NDArray[np.str_], seed: int) -> npt.NDArray[np.intp]:
-    """A fold per episode; whole groups, dealt out at random, the largest first."""
-    names, inverse, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-    rng = np.random.default_rng(derive_seed("folds", seed))
-    order = rng.permutation(len(names))
-    order = order[np.argsort(-sizes[order], kind="stable")]
-    load = np.zeros(min(FOLDS, len(names)))
-    fold_of = np.zeros(len(names), np.intp)
-    for group in order:
-        fold_of[group] = np.argmin(load)
-        load[fold_of[group]] += sizes[group]
-    folds: npt.NDArray[np.intp] = fold_of[inverse]
-    return folds
-
-
 def _interval(hits: Array, groups: npt.NDArray[np.str_], seed: int) -> tuple[float, float]:
     """95 % of the accuracies when whole groups are drawn with replacement."""
-    _, inverse = np.unique(groups, return_inverse=True)
-    found, sizes = np.bincount(inverse, hits), np.bincount(inverse)
-    rng = np.random.default_rng(derive_seed("bootstrap", seed))
-    drawn = rng.integers(len(sizes), size=(_RESAMPLES, len(sizes)))
-    low, high = np.quantile(found[drawn].sum(axis=1) / sizes[drawn].sum(axis=1), (0.025, 0.975))
-    return round(float(low), 4), round(float(high), 4)
+    low, high = group_bootstrap(hits[:, None], groups, derive_seed("bootstrap", seed), _RESAMPLES)
+    return round(float(low[0]), 4), round(float(high[0]), 4)
 
 
 # -- features ----------------------------------------------------------------------------------------

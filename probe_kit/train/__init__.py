@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.array_run import ArrayRun
     from probe_kit.train.baselines import BASELINES, Baseline
     from probe_kit.train.controls import BaselineScore, Controls, Excess, TwinScore
     from probe_kit.train.curve import Curve
     from probe_kit.train.directions import Direction
-    from probe_kit.train.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.reader import RunReader
     from probe_kit.train.results import ProbeResults
     from probe_kit.train.settings import ProbeSettings
@@ -58,8 +58,8 @@ __getattr__ = lazy_names(
         "Curve": "curve",
         "Direction": "directions",
         "Excess": "controls",
-        "FOLD_UNITS": "folds",
-        "FoldUnit": "folds",
+        "FOLD_UNITS": "probe_kit.statistics.folds",
+        "FoldUnit": "probe_kit.statistics.folds",
         "INCOMPLETE": "targets",
         "Incomplete": "targets",
         "ProbeResults": "results",

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.identity import derive_seed
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.train.baselines import Baseline, baseline_features, needed
 from probe_kit.train.binding import BindingInputs, binding_scores
 from probe_kit.train.controls import BINDING, TWIN, BaselineScore, Excess, TwinScore
@@ -19,7 +20,7 @@ from probe_kit.train.problem import POOLED, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 from probe_kit.train.samples import Samples
-from probe_kit.train.scores import GAINS, chance_level, correctness, group_bootstrap, units_seed
+from probe_kit.train.scores import chance_level, correctness
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.targets import target_labels
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
+from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train.baselines import Features, suite_of, tile_pixels, word_counts
 from probe_kit.train.controls import BINDING, BaselineScore, Excess
 from probe_kit.train.paired import better_than_reference
@@ -20,7 +21,7 @@ from probe_kit.train.problem import CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 from probe_kit.train.samples import Samples
-from probe_kit.train.scores import chance_level, correctness, group_bootstrap
+from probe_kit.train.scores import chance_level, correctness
 
 SIDE = 12
 """Pixels along a tile: enough for colours and coarse shapes."""

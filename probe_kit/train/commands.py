@@ -237,7 +237,7 @@ def _beats(best: "pd.Series[Any]") -> str:
     """What a site is better than, of what was tried."""
     from pandas import isna
 
-    from probe_kit.train.controls import SIGNIFICANCE
+    from probe_kit.statistics.significance import SIGNIFICANCE
 
     chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
     tried = {"chance": chance, "binding": best["beats_binding"], "twin": best["beats_twin"]}

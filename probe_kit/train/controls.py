@@ -6,7 +6,8 @@ from functools import cached_property
 from math import isnan
 from typing import Any
 
-SIGNIFICANCE = 0.05
+from probe_kit.statistics.significance import SIGNIFICANCE
+
 BINDING, TWIN = "binding", "twin"
 """The controls that a site must beat, where they were run, before its signal counts as knowledge."""
 

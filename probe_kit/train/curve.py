@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.sites import Site, part_of
-from probe_kit.train.folds import Fold
+from probe_kit.statistics.folds import Fold
 from probe_kit.train.permutation import family_p
 from probe_kit.train.scores import chance_level, correctness
 

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import NonFiniteActivationError
+from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.arrays import to_numpy
 from probe_kit.train.features import Coordinates
-from probe_kit.train.folds import Fold, grouped_folds
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness, log_loss
 from probe_kit.train.solver import LogisticSolver

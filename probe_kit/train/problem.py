@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.identity import derive_seed
-from probe_kit.train.controls import SIGNIFICANCE
-from probe_kit.train.folds import fold_units
+from probe_kit.statistics.folds import fold_units
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.permutation import exchange_groups, flip_groups, smallest_p
 from probe_kit.train.probe import NestedFold, SiteProbe, nested_folds, probe_site
 from probe_kit.train.samples import Samples

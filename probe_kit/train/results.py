@@ -11,12 +11,13 @@ import numpy as np
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import sha256_json
+from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
 from probe_kit.train.controls import Controls, signal
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction, Place
 from probe_kit.train.permutation import site_p, smallest_p
 from probe_kit.train.reader import RunReader
-from probe_kit.train.scores import balanced_accuracy, fold_auc, group_bootstrap, log_loss, units_seed
+from probe_kit.train.scores import balanced_accuracy, fold_auc, log_loss
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.summary import results_html, results_text
 

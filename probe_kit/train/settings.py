@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 
 from probe_kit.identity import sha256_json
-from probe_kit.train.folds import FoldUnit
+from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.targets import Incomplete, Target
 
 FORMAT = 4  # raise when settings have other fields or would give other numbers

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.notebook import rows_html
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.settings import ProbeSettings
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ import numpy as np
 
 from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
 from probe_kit.notebook import notebook_progress
+from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.add_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.arrays import check_device
 from probe_kit.train.at_call import at_call
@@ -15,7 +16,6 @@ from probe_kit.train.baselines import Baseline
 from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.curve import Curve
 from probe_kit.train.directions import Direction
-from probe_kit.train.folds import FoldUnit
 from probe_kit.train.problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, episodes_sha256

@@ -7,8 +7,8 @@ import pytest
 from probe_kit.retention import best_site, measure_retention
 from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.estimates import Estimate, average, probe_estimates, retention_draws, sr_estimate
+from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train import Curve
-from probe_kit.train.scores import group_bootstrap
 
 CurveOf = Callable[..., Curve]
 Outcomes = Callable[..., pd.DataFrame]

@@ -9,9 +9,9 @@ import pytest
 
 from probe_kit.retention import Difference, RetentionRow, RetentionTable, layer_curve, retention
 from probe_kit.retention.displays import LayerCurveDisplay
+from probe_kit.statistics.bootstrap import GAINS, SHARES, group_bootstrap, unseen
 from probe_kit.train import ArrayRun, load_results
 from probe_kit.train.add_controls import add_twin
-from probe_kit.train.scores import GAINS, SHARES, group_bootstrap, unseen
 
 ProbedRun = Callable[..., ArrayRun]
 PERFECT = ([1.0, 1.0], [[1.0, 1.0]])

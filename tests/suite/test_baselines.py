@@ -4,10 +4,11 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
+from probe_kit.statistics.folds import assign_folds
 from probe_kit.suite import Item, Suite, build_suite, load_suite, validate_suite
 from probe_kit.suite.baselines import Baseline, limit_for, run_baselines
 
@@ -49,11 +50,18 @@ def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -
     assert found["instruction"] == found["position"] == 0.5
 
 
-def test_folds_never_separate_layouts_or_twins(embedded: Suite) -> None:
-    from probe_kit.suite.baselines import _folds
+def test_folds_never_separate_layouts_or_twins(embedded: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
+    from probe_kit.suite import baselines
 
-    groups = np.array([episode.item.group_id for episode in embedded.select(["time"]).episodes()])
-    folds = _folds(groups, seed=0)
+    made = []
+
+    def spy(*arguments: Any) -> Any:
+        made.append((arguments[1], assign_folds(*arguments)))
+        return made[-1][1]
+
+    monkeypatch.setattr(baselines, "assign_folds", spy)
+    run_baselines(embedded.select(["time"]))
+    ((groups, folds),) = made
     for group in set(groups):
         assert len(set(folds[groups == group])) == 1
     assert len(set(folds)) == 5

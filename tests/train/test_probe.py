@@ -6,7 +6,7 @@ from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import NonFiniteActivationError, TooFewGroupsError
 from probe_kit.extract.store.rows import TokenBlock
-from probe_kit.train.folds import Fold
+from probe_kit.statistics.folds import Fold
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import STRENGTHS, NestedFold, nested_folds, probe_site
 from probe_kit.train.samples import Samples

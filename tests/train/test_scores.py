@@ -3,14 +3,9 @@ import pytest
 from scipy.stats import binomtest
 from sklearn import metrics
 
-from probe_kit.train.folds import Fold
-from probe_kit.train.scores import (
-    balanced_accuracy,
-    chance_level,
-    fold_auc,
-    group_bootstrap,
-    log_loss,
-)
+from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.folds import Fold
+from probe_kit.train.scores import balanced_accuracy, chance_level, fold_auc, log_loss
 
 GENERATOR = np.random.default_rng(0)
 LABELS = GENERATOR.random(80) < 0.3

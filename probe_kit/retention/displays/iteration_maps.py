@@ -13,7 +13,7 @@ from probe_kit.retention.displays.layer_curves import DEPTH
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import OTHER_STREAM, STREAMS, axes_for, caption, panels, spell
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from probe_kit.retention.displays.style import (
     plain,
     spell,
 )
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:

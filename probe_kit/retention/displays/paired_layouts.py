@@ -7,7 +7,7 @@ from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, plain, spell
 from probe_kit.retention.success import PairedItems, paired_items
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from probe_kit.retention.cells import model_name, percent
 from probe_kit.retention.displays.style import spell
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
-from probe_kit.train.controls import SIGNIFICANCE, Beats
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.controls import Beats
 
 _MOSTLY = 0.5  # share of episodes above which something is said first
 

@@ -28,7 +28,7 @@ from probe_kit.retention.heat import heat_colour
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
-from probe_kit.train.controls import SIGNIFICANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 _REGIMES: dict[str | None, str] = {
     Regime.KNOWLEDGE: "knowledge",

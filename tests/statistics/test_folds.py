@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.train.folds import assign_folds, grouped_folds
+from probe_kit.statistics.folds import assign_folds, grouped_folds
 
 GROUPS = np.repeat(np.arange(30), [2, 4, 6] * 10)
 LABELS = np.tile([True, False], 60)

@@ -1,0 +1,16 @@
+"""The level of every test and interval, and how far guessing alone may lie from one half."""
+
+from math import sqrt
+from statistics import NormalDist
+
+from probe_kit.errors import UsageError
+
+SIGNIFICANCE = 0.05
+"""Below this a p-value is called evidence; intervals cover one minus it."""
+
+
+def chance_margin(n: float, alpha: float = SIGNIFICANCE) -> float:
+    """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
+    if n < 1:
+        raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
+    return NormalDist().inv_cdf(1 - alpha / 2) * sqrt(0.25 / n)
