@@ -97,6 +97,14 @@ def test_every_public_name_is_described_in_the_reference() -> None:
     assert missing == ["ProbeKitError"]  # described, with all of its children, on the page of errors
 
 
+def test_the_reference_knows_names_of_packages_only() -> None:
+    """In which file of a package something lies is nobody's business."""
+    reference = re.findall(r"^::: (.+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    modules = [import_module(path.rpartition(".")[0]) for path in reference]
+    assert len(reference) > 40
+    assert [module.__name__ for module in modules if not hasattr(module, "__path__")] == []
+
+
 def _resolved(path: str) -> object:
     module, _, name = path.rpartition(".")
     return getattr(import_module(module), name)
