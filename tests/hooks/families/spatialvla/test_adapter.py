@@ -50,7 +50,14 @@ def seen() -> list[Observation]:
     return [replace(one, intrinsics=SCENE * [[1 + row], [1], [1]]) for row, one in enumerate(examples)]
 
 
-class TestOneStepHeard(AdapterContract):
+class _Letters:
+    @pytest.fixture
+    def alike(self, seen: list[Observation]) -> list[Observation]:
+        """One letter of a tokenizer of letters."""
+        return [replace(seen[0], instruction=text) for text in ("Put it on the star", "Put it on the stir")]
+
+
+class TestOneStepHeard(_Letters, AdapterContract):
     family = "spatialvla"
 
     @pytest.fixture(scope="class")
@@ -66,11 +73,6 @@ class TestOneStepHeard(AdapterContract):
         }  # fmt: skip
 
     @pytest.fixture
-    def alike(self, seen: list[Observation]) -> list[Observation]:
-        """One letter of a tokenizer of letters."""
-        return [replace(seen[0], instruction=text) for text in ("Put it on the star", "Put it on the stir")]
-
-    @pytest.fixture
     def policy(self, plain: SpatialVLA) -> SpatialVLA:
         return plain
 
@@ -79,13 +81,13 @@ class TestOneStepHeard(AdapterContract):
         return seen
 
 
-class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(AdapterContract):
+class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(_Letters, AdapterContract):
     @pytest.fixture
     def policy(self, chunked: SpatialVLA) -> SpatialVLA:
         return chunked
 
 
-class TestWithoutDepth(AdapterContract):
+class TestWithoutDepth(_Letters, AdapterContract):
     @pytest.fixture
     def policy(self, flat: SpatialVLA) -> SpatialVLA:
         return flat
@@ -314,7 +316,7 @@ def test_options_are_declared_and_checked(folder: Path) -> None:
 def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:
     choices: list[dict[str, Any]] = [
         {"lowercase": False}, {"prompt": "question"}, {"camera": "default"}, {"constrained": True},
-        {"ensemble": True},        {"iterations": "chunk"}, {"tokenizer": "bytes"},
+        {"ensemble": True}, {"iterations": "chunk"}, {"tokenizer": "bytes"},
     ]  # fmt: skip
     for choice in choices:
         assert load_spatialvla(str(folder), **choice).card.settings != plain.card.settings
