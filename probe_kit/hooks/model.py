@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -216,6 +216,13 @@ class Reader(Model):
         Raises InstructionError or ObservationError for what the model cannot take in whole, UsageError for an
         option that is not one token behind the prompt.
         """
+
+    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+        """Like `roles`, of the sequences that `read` makes of these questions.
+
+        A family whose prompt depends on more than a question's text, or that also acts, says so itself.
+        """
+        return self.roles([replace(question.seen, instruction=question.text) for question in questions])
 
     @abstractmethod
     def speak(self, reading: Reading, tokens: int) -> list[str]:

@@ -159,7 +159,7 @@ class ModelContract:
         self, model: Model, observations: list[Observation]
     ) -> None:
         seen = self.shown(model, observations)
-        roles = model.roles(seen)
+        roles = self.roles_of(model, seen)
         with capture(model, model.sites()) as tape:
             self.run(model, seen)
         assert roles.keys() == model.streams.keys()
@@ -172,7 +172,7 @@ class ModelContract:
     def test_what_blocks_add_makes_the_next_residual(self, model: Model, observations: list[Observation]) -> None:
         """residual(l) + attention(l) + mlp(l) = residual(l + 1), where a stream declares all three."""
         seen = self.shown(model, observations)
-        roles = model.roles(seen)
+        roles = self.roles_of(model, seen)
         for name, stream in model.streams.items():
             if not (stream.sums and set(_SUM) <= set(stream.quantities)):
                 continue
@@ -258,6 +258,10 @@ class ModelContract:
             alone = self.run_row(model, observation, row)
             np.testing.assert_allclose(together[row], alone, atol=self.tolerance)
 
+    def roles_of(self, model: Model, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Roles of what `run` makes of these observations."""
+        return model.roles(seen)
+
     def run_row(self, model: Model, observation: Observation, row: int) -> NDArray[np.float32]:
         """What `run` gives for row `row` of a batch, alone."""
         del row
@@ -278,7 +282,7 @@ class ModelContract:
     def test_roles_cover_every_position_and_are_the_declared_ones(
         self, model: Model, observations: list[Observation]
     ) -> None:
-        for name, rows in model.roles(self.shown(model, observations)).items():
+        for name, rows in self.roles_of(model, self.shown(model, observations)).items():
             for row in rows:
                 assert {span.role for span in row.spans} <= set(model.role_names[name])
                 assert row.valid.any()
@@ -298,7 +302,7 @@ class ModelContract:
 
     def _assert_moves(self, model: Model, one: Observation, other: Observation, role: str) -> None:
         stream = next(own for own in model.streams.values() if own.part == "backbone" and own.probed)
-        before, after = model.roles([one])[stream.name][0], model.roles([other])[stream.name][0]
+        before, after = (self.roles_of(model, [own])[stream.name][0] for own in (one, other))
         assert before == after, "override `alike` with instructions of equally many tokens"
         site, kept = stream.sites()[0], []
         for observation in (one, other):
@@ -311,7 +315,7 @@ class ModelContract:
         assert all(plays(name, role) for name in labels), f"another {role} moved {sorted(labels)}"
 
     def test_padding_is_never_pooled(self, model: Model, observations: list[Observation]) -> None:
-        for name, rows in model.roles(self.shown(model, observations)).items():
+        for name, rows in self.roles_of(model, self.shown(model, observations)).items():
             for row in rows:
                 self._poison_padding(model, name, row)
 
@@ -461,6 +465,11 @@ class ReaderContract(ModelContract):
     def run(self, model: Model, seen: Sequence[Observation]) -> NDArray[np.float32]:
         """The logits of the options."""
         return self._read(model, seen).option_logits
+
+    def roles_of(self, model: Model, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Of the questions asked about them."""
+        assert isinstance(model, Reader)
+        return model.asked_roles(self.questions(seen))
 
     def _read(self, model: Model, seen: Sequence[Observation]) -> Reading:
         assert isinstance(model, Reader)

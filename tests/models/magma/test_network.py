@@ -113,6 +113,14 @@ def test_a_network_without_memory_has_real_rotary_frequencies_in_float32() -> No
     assert torch.get_default_dtype() == torch.float32
 
 
+@pytest.mark.parametrize(("stored", "asked"), [("bfloat16", torch.float32), ("float32", torch.bfloat16)])
+def test_a_network_has_one_precision_whatever_a_part_of_its_configuration_says(
+    stored: str, asked: torch.dtype
+) -> None:
+    config = MagmaConfig.from_json(config_values(text={"torch_dtype": stored}))
+    assert {parameter.dtype for parameter in build_magma(config, asked, device="cpu").parameters()} == {asked}
+
+
 def test_the_full_size_has_the_released_number_of_parameters() -> None:
     network = full_size_magma()
     head = 1024 * 3072 + 2 * 3072

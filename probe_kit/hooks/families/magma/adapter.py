@@ -214,7 +214,7 @@ class Magma(Policy, Reader):
     def read(self, questions: Sequence[Question]) -> Reading:
         """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
         self.check([question.seen for question in questions])
-        prompts = [self.text.prompt(question.text, question.begun).ids for question in questions]
+        prompts = [self._question(question).ids for question in questions]
         options = [
             [self.text.option(question.text, question.begun, option) for option in question.options]
             for question in questions
@@ -222,6 +222,9 @@ class Magma(Policy, Reader):
         pictures = [self.picture(question.seen.image) for question in questions]
         decoded = self.generate(prompts, pictures)
         return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
+
+    def _question(self, question: Question) -> Prompt:
+        return self.text.prompt(question.text, question.begun)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text up to the end of the turn; see the contract. Raises UsageError for another's reading."""
@@ -238,7 +241,13 @@ class Magma(Policy, Reader):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
-        rows = [self._labels(self.prompt(one.instruction), one.image) for one in seen]
+        return self._roles([self._labels(self.prompt(one.instruction), one.image) for one in seen])
+
+    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+        """As `roles`, of other questions than what to do; how an answer has begun is `special`."""
+        return self._roles([self._labels(self._question(own), own.seen.image) for own in questions])
+
+    def _roles(self, rows: Sequence[list[str]]) -> dict[str, list[Roles]]:
         longest = max(map(len, rows))
         backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
         return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}

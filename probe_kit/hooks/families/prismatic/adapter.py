@@ -140,7 +140,9 @@ class PrismaticModel(Model):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
-        rows = [self.prompt(observation.instruction) for observation in seen]
+        return self._roles([self.prompt(observation.instruction) for observation in seen])
+
+    def _roles(self, rows: Sequence[Sequence[int]]) -> dict[str, list[Roles]]:
         longest, special = max(map(len, rows)), self.tokenizer.special
         image = [f"image.{CAMERA}"] * self.network.patches
         backbone = []
@@ -201,7 +203,7 @@ class Prismatic(PrismaticModel, Reader):
                 f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
             )
         self.check([question.seen for question in questions])
-        texts = [_FRAME.format(question.text) + question.begun for question in questions]
+        texts = _asked(questions)
         rows = [self.tokenizer.encode(text) for text in texts]
         options = [
             [id_behind(self.tokenizer, text, option) for option in question.options]
@@ -210,6 +212,10 @@ class Prismatic(PrismaticModel, Reader):
         pixels = self.pixel_values(question.seen.image for question in questions)
         logits = self.generate(pixels, rows).logits[:, 0].float().cpu()
         return Reading.of(logits.numpy(), options, (pixels, rows))
+
+    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+        """As `roles`; how an answer has begun is language too."""
+        return self._roles([self.tokenizer.encode(text) for text in _asked(questions)])
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text behind every prompt, up to its end-of-sequence token; see the contract."""
@@ -220,6 +226,10 @@ class Prismatic(PrismaticModel, Reader):
         end = self.config.text.eos_token_id
         spoken = [list(takewhile(lambda number: number != end, row)) for row in decoded.ids.tolist()]
         return [self.tokenizer.decode(row) for row in spoken]
+
+
+def _asked(questions: Sequence[Question]) -> list[str]:
+    return [_FRAME.format(question.text) + question.begun for question in questions]
 
 
 def load_prismatic(

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks import Observation, Site, capture
 from probe_kit.hooks.families.magma.adapter import Magma, load_magma
 from probe_kit.hooks.model import Question
-from probe_kit.hooks.testing import AdapterContract, example_observations
+from probe_kit.hooks.testing import AdapterContract, ReaderContract, example_observations
 from tests.magma_checkpoints import IDS, small_network, weights, write_checkpoint
 
 INSTRUCTIONS = ["Put the cube on the star", "Put the cube on the red shape"]
@@ -70,6 +71,29 @@ class TestMagmaDrawn(AdapterContract):
     @pytest.fixture
     def policy(self, folder: Path) -> Magma:
         return load_magma(str(folder), temperature=0.7)
+
+
+class TestMagmaAsked(ReaderContract):
+    """Its own questions, not those for an action; a begun answer behind the frames."""
+
+    family = "magma"
+    unloadable_options = TestMagma.unloadable_options
+    question_options = ("A", "B")
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_checkpoint(tmp_path_factory.mktemp("asked"), steered=False)
+
+    @pytest.fixture
+    def other_options(self, checkpoint: Path) -> dict[str, Any]:
+        return {"shrink": 0, "prompt": "act2answer", "temperature": 0.7, "tokenizer": str(checkpoint)}
+
+    @pytest.fixture
+    def reader(self, unsteered: Magma) -> Magma:
+        return unsteered
+
+    def questions(self, seen: Sequence[Observation]) -> list[Question]:
+        return [Question(own, own.instruction, self.question_options, "It is ") for own in seen]
 
 
 # -- acting ----------------------------------------------------------------------------------------------
