@@ -117,11 +117,12 @@ def write_vlm(folder: Path, **text: Any) -> Path:
     return folder
 
 
-def write_checkpoint(folder: Path, seed: int = 1) -> Path:
-    """A run's folder; the weights as a pickled state dict."""
+def write_checkpoint(folder: Path, seed: int = 1, side: int = 224) -> Path:
+    """A run's folder; the weights as a pickled state dict. side: of the pictures it asks for, in pixels."""
     run = folder / "run"
     (run / "checkpoints").mkdir(parents=True)
     values = run_values(base=str(write_vlm(folder / "vlm")))
+    values["datasets"]["vla_data"]["image_size"] = [side, side]
     (run / "config.yaml").write_text(yaml.safe_dump(values))
     (run / "dims.json").write_text(json.dumps(dims_values()))
     (run / "dataset_statistics.json").write_text(json.dumps(statistics()))

@@ -68,6 +68,10 @@ class QwenVLA(Policy):
     def look(self, seen: Observation) -> Any:
         """(H, W, 3) uint8 the processor gets."""
 
+    def shown(self, seen: Observation) -> Any:
+        """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
+        return self.look(seen)
+
     @property
     @abstractmethod
     def merger_entry(self) -> nn.Module:
@@ -115,7 +119,7 @@ class QwenVLA(Policy):
         """The observations as the backbone reads them, on the model's device. Raises ObservationError."""
         for observation in seen:
             checked_picture(observation.image)
-        pixels, grid = self.pictures.patches([self.look(observation) for observation in seen])
+        pixels, grid = self.pictures.patches([self.shown(observation) for observation in seen])
         padding = self.vlm.config.text_config.pad_token_id
         packed = pack_inputs(
             self.rows(seen), pixels, grid, self._image_token, 0 if padding is None else int(padding)

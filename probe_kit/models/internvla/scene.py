@@ -24,7 +24,7 @@ def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np
     squeezed = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     if size is None or size == (SIDE, SIDE):
         return np.asarray(squeezed, np.uint8)
-    return np.asarray(Image.fromarray(squeezed).resize(size, Image.Resampling.BICUBIC))
+    return np.array(Image.fromarray(squeezed).resize(size, Image.Resampling.BICUBIC))
 
 
 def dino_pixels(picture: NDArray[np.uint8], side: int) -> Tensor:

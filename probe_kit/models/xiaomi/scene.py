@@ -21,7 +21,7 @@ def look(picture: NDArray[np.uint8], robot: Robot) -> NDArray[np.uint8]:
     width, height = (int(side * CROP) for side in size)
     left, top = (robot.width - width) // 2, (robot.height - height) // 2
     middle = scaled.crop((left, top, left + width, top + height))
-    return np.asarray(middle.resize(size, Image.Resampling.BILINEAR))
+    return np.array(middle.resize(size, Image.Resampling.BILINEAR))
 
 
 def prompt(instruction: str, heading: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, UsageError
@@ -147,6 +148,15 @@ class InternVLA(QwenVLA):
     def look(self, seen: Observation) -> NDArray[np.uint8]:
         """The whole picture, squeezed to a square."""
         return look(seen.image, self.config.picture)
+
+    def shown(self, seen: Observation) -> NDArray[np.uint8]:
+        """Qwen's utilities bring the picture to whole patches with PIL, before its processor sees it."""
+        picture = self.look(seen)
+        rows, columns = self.pictures.grid(*picture.shape[:2])
+        size = (columns * self.pictures.patch, rows * self.pictures.patch)
+        if picture.shape[:2] == size[::-1]:
+            return picture
+        return np.array(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
     def views(self, seen: Sequence[Observation]) -> Tensor:
         """(B, 3, H, W) float32 for DINOv2."""

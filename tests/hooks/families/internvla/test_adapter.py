@@ -6,14 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.capture_context import edit
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
+from probe_kit.hooks.families.internvla.convert import convert
 from probe_kit.hooks.sites import first_of
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.hooks.verify import verify_keys, verify_reference
+from probe_kit.models.internvla import dino_pixels
 from tests.internvla_checkpoints import write_checkpoint
 
 
@@ -43,6 +46,24 @@ class TestInternVLA(AdapterContract):
     @pytest.fixture
     def policy(self, loaded: InternVLA) -> InternVLA:
         return loaded
+
+
+class TestConvertedInternVLA(AdapterContract):
+    """One folder of safetensors, whose tensors can be damaged one by one."""
+
+    family = "internvla-m1"
+    options = {"steps": 2}
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        out = tmp_path_factory.mktemp("converted") / "out"
+        convert(str(run), out)
+        return out
+
+    @pytest.fixture
+    def other_options(self, run: Path) -> dict[str, Any]:
+        vlm = str(run.parent / "vlm")
+        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm}
 
 
 class TestInternVLAWithoutGuidance(AdapterContract):
@@ -154,6 +175,23 @@ def test_roles_follow_the_picture_and_the_chat(loaded: InternVLA, observation: O
         loaded.act([observation], [0])
     assert tape[vision[0]].shape == (1, 256, 32)
     assert tape[vision[1]].shape == (1, 17, 24)
+
+
+def test_a_picture_that_is_no_whole_patches_is_resized_with_pil_for_qwen_and_not_for_dino(
+    tmp_path: Path, observation: Observation
+) -> None:
+    policy = load_internvla(str(write_checkpoint(tmp_path, side=200)))
+    picture = policy.look(observation)
+    assert picture.shape == (200, 200, 3)
+    by_hand = np.asarray(Image.fromarray(picture).resize((196, 196), Image.Resampling.BICUBIC))
+    np.testing.assert_array_equal(policy.shown(observation), by_hand)
+    expected, grid = policy.pictures.patches([by_hand])
+    seen = policy.inputs([observation])
+    assert torch.equal(seen.pixel_values, expected)
+    assert torch.equal(seen.grid, grid)
+    assert torch.equal(policy.views([observation])[0], dino_pixels(picture, 56))
+    assert policy.roles([observation])["backbone"][0].mask("image").sum() == 49
+    assert np.isfinite(policy.act([observation], [0])).all()
 
 
 # -- acting ----------------------------------------------------------------------------------------------------
