@@ -103,7 +103,15 @@ def success_by_radius(
     distances = [(o.distance_correct, o.distance_wrong) for o in outcomes]
     if not distances:
         raise ValueError("no outcomes to score; expected at least one.")
-    return {radius: float(np.mean([zone(*pair, radius) == "correct" for pair in distances])) for radius in radii}
+    return {radius: success_at(distances, radius) for radius in radii}
+
+
+def success_at(distances: Iterable[tuple[float, float]], radius: float) -> float:
+    """Success rate at a zone radius, metres, from distances to the correct and the wrong tile, metres.
+
+    Raises SceneError if the radius makes the zones overlap.
+    """
+    return float(np.mean([zone(correct, wrong, radius) == "correct" for correct, wrong in distances]))
 
 
 def _plain(value: Any) -> Any:

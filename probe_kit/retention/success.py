@@ -7,7 +7,7 @@ from math import comb
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from probe_kit.env.outcome import SENSITIVITY_RADII, zone
+from probe_kit.env.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.significance import chance_margin
@@ -174,11 +174,8 @@ def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_R
     columns = ["distance_correct", "distance_wrong"]
     if not set(columns) <= set(episodes):
         return {}
-    distances = episodes[columns].astype(float).to_numpy()
-    return {
-        radius: fmean(zone(correct, wrong, radius) == "correct" for correct, wrong in distances)
-        for radius in radii
-    }
+    distances = [(correct, wrong) for correct, wrong in episodes[columns].astype(float).to_numpy()]
+    return {radius: success_at(distances, radius) for radius in radii}
 
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:

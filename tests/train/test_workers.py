@@ -1,3 +1,5 @@
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -6,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.errors import MissingExtraError, TooFewGroupsError
+from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
 from probe_kit.hooks import Site
 from probe_kit.train.crew import CrewSettings, Key, Probed
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import nested_folds
 from probe_kit.train.problem import CategoryProblem
+from probe_kit.train.process_crew import ProcessCrew
 from probe_kit.train.samples import Samples
 from probe_kit.train.workers import probe_columns
 
@@ -49,6 +52,33 @@ def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -
 
 def test_processes_give_the_same_numbers_as_this_one() -> None:
     assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(jobs=2)))
+
+
+def test_what_a_process_raises_keeps_its_class() -> None:
+    of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
+    with pytest.raises(TooFewGroupsError, match="same label"):
+        list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(jobs=2)))
+
+
+def test_a_process_that_dies_is_named_with_a_way_out() -> None:
+    crew = ProcessCrew({"color": PROBLEM}, 1)
+    samples = next(columns([]))[1]
+
+    def probe() -> None:
+        crew.first_of([crew.submit(samples)])
+
+    with crew:
+        os.kill(crew._children[0].pid, signal.SIGKILL)
+        with pytest.raises(WorkerDiedError, match=r"code -9.*fewer --jobs"):
+            probe()
+
+
+@pytest.mark.slow
+def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
+    """Slow: Ray asks for half a minute before it gives up."""
+    pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
+    with pytest.raises(UsageError, match=r"no Ray cluster answers at '127\.0\.0\.1:9'"):
+        columns_of(CrewSettings(ray="127.0.0.1:9"))
 
 
 def test_columns_are_read_only_when_they_are_needed() -> None:
