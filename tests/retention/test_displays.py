@@ -36,6 +36,7 @@ from probe_kit.retention.displays import (
 )
 from probe_kit.retention.displays.heat_table import heat_colour
 from probe_kit.retention.displays.labels import place_labels
+from probe_kit.retention.displays.style import FILLED, OPEN
 from probe_kit.train import ArrayRun, load_results
 
 ProbedRun = Callable[..., ArrayRun]
@@ -75,17 +76,21 @@ def test_one_panel_per_category_with_both_streams(probed_run: ProbedRun) -> None
     results = load_results(probed_run({"color": SIGNAL, "traffic_sign": SIGNAL}))
     figure = layer_curve(results)
     panels = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title(loc="left") for axes in panels] == ["color", "traffic sign"]
-    labels = panels[0].get_legend_handles_labels()[1]
-    assert {"backbone", "action expert, best iteration", "action expert, all iterations", "chance"} <= set(labels)
+    titles = [axes.get_title(loc="left") for axes in panels if axes.get_title(loc="left")]
+    assert titles == [
+        f"{name}: {part}" for name in ("color", "traffic sign") for part in ("backbone", "action expert")
+    ]
+    labels = [label for axes in panels for label in axes.get_legend_handles_labels()[1]]
+    assert {"backbone", "action expert, by iteration", "iteration 0", "iteration 1", "chance"} <= set(labels)
     figure.savefig(io.BytesIO(), format="png")
 
 
 def test_the_caption_names_model_weights_suite_sizes_and_random_weights(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": SIGNAL}, "pi0-tiny", random_weights=True))
-    caption = layer_curve(results).get_supxlabel()
+    figure = layer_curve(results)
     for part in ("pi0-tiny", "RANDOM WEIGHTS", "suite@1#0123456789ab", "n = 200", results.key):
-        assert part in caption
+        assert part in figure.get_supxlabel()
+        assert part in figure.caption  # type: ignore[attr-defined]
 
 
 def test_a_layer_curve_carries_the_best_iteration_and_the_span_of_all(probed_run: ProbedRun) -> None:
@@ -104,7 +109,7 @@ def test_a_layer_curve_carries_the_best_iteration_and_the_span_of_all(probed_run
 def test_significant_sites_are_filled(probed_run: ProbedRun) -> None:
     axes = layer_curve(load_results(probed_run({"color": SIGNAL}))).axes[0]
     filled = [line for line in axes.lines if line.get_linestyle() == "None" and line.get_marker() == "o"]
-    assert [round(depth, 1) for line in filled for depth in line.get_xdata()] == [0.5, 1.0]
+    assert [layer for line in filled for layer in line.get_xdata()] == [1, 2]
 
 
 def test_views_and_categories_that_were_not_probed_are_errors(probed_run: ProbedRun) -> None:
@@ -127,7 +132,7 @@ def test_plot_draws_on_the_given_axes_and_returns_the_display(probed_run: Probed
     assert axes.lines
     own = display.plot().ax_
     assert own is not axes
-    assert "settings" in own.figure.get_supxlabel()
+    assert "settings" in own.figure.caption
 
 
 # -- maps, roles, depths ---------------------------------------------------------------------------------------
@@ -137,7 +142,7 @@ def test_an_iteration_map_holds_every_site_and_frames_the_best(probed_run: Probe
     results = load_results(probed_run({"color": SIGNAL, "shape": NOISE}))
     display = IterationMapDisplay.from_results(results, "color")
     np.testing.assert_allclose(display.accuracy, [[0.6, 0.7], [0.5, 0.65]])
-    assert display.peak == (0, 1)
+    assert display.peaks == ((0, 1),)
     assert display.significant.tolist() == [[True, True], [False, True]]
     axes = display.plot().ax_
     (frame,) = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
@@ -170,9 +175,10 @@ def test_models_are_compared_by_accuracy_above_chance_averaged_over_categories(p
     np.testing.assert_allclose(second.depth, [0, 1])
     with pytest.raises(UsageError, match="vision"):
         ModelDepthDisplay.from_results(results, "vision")
-    caption = model_depths(results).get_supxlabel()
-    assert "pi0 ·" in caption
-    assert "smolvla ·" in caption
+    figure = model_depths(results)
+    assert figure.get_supxlabel().startswith("pi0, smolvla · ")
+    assert "pi0 · " in figure.caption  # type: ignore[attr-defined]
+    assert "smolvla · " in figure.caption  # type: ignore[attr-defined]
 
 
 # -- tables ----------------------------------------------------------------------------------------------------
@@ -226,8 +232,8 @@ def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_
     ]
     axes = display.plot().ax_
     assert {"color", "shape"} <= {text.get_text() for text in axes.texts}
-    labels = axes.get_legend_handles_labels()[1]
-    assert labels == ["pi0: probe above chance", "pi0: probe not above chance"]
+    words = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+    assert words == ["pi0", FILLED, OPEN]
     assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == 0.7
 
 

@@ -61,13 +61,24 @@ class Certificate:
         )
 
     @property
+    def parts(self) -> tuple[str, str, str, str, str, str]:
+        """What a line under a figure says, most important first; random weights are named in capitals.
+
+        Model, suite, n, target, probes, weights; empty where there is nothing to say.
+        """
+        return (
+            f"{self.model} {RANDOM}" if self.random_weights else self.model,
+            self.suite,
+            self.n,
+            f"target {self.target}" if self.target != "correct" else "",
+            f"probes {self.probes}" if self.probes else "",
+            f"weights {self.weights[:SHOWN]}" if self.weights else "",
+        )
+
+    @property
     def line(self) -> str:
-        """One line for a caption; random weights are named in capitals."""
-        parts = [self.model, RANDOM if self.random_weights else ""]
-        parts += [f"weights {self.weights[:SHOWN]}" if self.weights else "", self.suite, self.n]
-        parts += [f"settings {self.settings[:SHOWN]}", f"probes {self.probes}" if self.probes else ""]
-        parts += [f"target {self.target}" if self.target != "correct" else ""]
-        return " · ".join(filter(None, parts))
+        """Everything in one line, for a caption."""
+        return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
 
 
 def _span(numbers: list[int]) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, panels, spell
+from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, panels, spell
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class FinalPositionsDisplay(Shown):
         axes.set_xlabel(self._summary(), fontsize=7.5, color="0.3", labelpad=3)
         if figure is not None:
             _draw_legend(figure, axes)
-        caption(figure, self.certificate.line)
+        caption(figure, self.certificate)
         self.ax_ = axes
         return self
 
@@ -110,7 +110,7 @@ def final_positions(run: RunReader) -> "Figure":
     figure, grid = panels(len(displays), width=3.1, height=2.35)
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)
-    caption(figure, displays[0].certificate.line)
+    caption(figure, displays[0].certificate)
     _draw_legend(figure, grid[0])
     return figure
 
@@ -165,4 +165,4 @@ def _draw_legend(figure: "Figure", panel: "Axes") -> None:
 
     zone = Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")
     handles = [*panel.get_legend_handles_labels()[0], zone]
-    figure.legend(handles=handles, loc="outside upper left", ncols=4, fontsize=8, frameon=False)
+    legend_above(figure, handles)

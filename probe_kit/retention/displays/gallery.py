@@ -22,6 +22,7 @@ from probe_kit.retention.displays.layer_curves import layer_curve
 from probe_kit.retention.displays.model_depth import model_depths
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
+from probe_kit.retention.measure import Iterations
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
@@ -75,7 +76,7 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
     exhibits = _of_table(table, [one for one in results if one is not None])
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
         exhibits += _of_run(name, position, run)
-        exhibits += [] if probed is None else _of_probes(name, position, probed)
+        exhibits += [] if probed is None else _of_probes(name, position, probed, table.iterations)
     return exhibits
 
 
@@ -86,9 +87,20 @@ def save_figures(exhibits: Sequence[Exhibit], folder: Path) -> Iterator[Path]:
         path = folder / f"{exhibit.name}{SUFFIXES[0]}"
         with exhibit.drawn() as figure:
             for suffix in SUFFIXES:
-                metadata = {"CreationDate": None} if suffix == ".pdf" else None
-                figure.savefig(path.with_suffix(suffix), metadata=metadata)
+                figure.savefig(path.with_suffix(suffix), metadata=_metadata(suffix, exhibit, caption_of(figure)))
         yield path
+
+
+def caption_of(figure: "Figure") -> str:
+    """What the figure is about, in full; its footer holds the beginning."""
+    return str(getattr(figure, "caption", ""))
+
+
+def _metadata(suffix: str, exhibit: Exhibit, caption: str) -> dict[str, str | None]:
+    """The caption goes with the file, in what readers of its format show of it."""
+    if suffix == ".pdf":
+        return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
+    return {"Title": exhibit.title, "Description": f"{caption}. {exhibit.reading}"}
 
 
 def run_names(runs: Sequence[RunReader]) -> list[str]:
@@ -127,7 +139,7 @@ def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Ex
                 "model-depths", "Models by depth", "probes",
                 "How far above chance the answer can be read, against depth as a fraction, so that models with "
                 "different numbers of layers can be compared.",
-                None, partial(model_depths, results),
+                None, partial(model_depths, results, iterations=table.iterations),
             )
         )  # fmt: skip
     return exhibits
@@ -156,16 +168,17 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
     return exhibits
 
 
-def _of_probes(name: str, position: int, results: ProbeResults) -> list[Exhibit]:
+def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iterations) -> list[Exhibit]:
     views = results.settings.views
     exhibits = [
         Exhibit(
             f"{name}-layer-curves{_suffix(view, views)}", "Layer curves" + (f", view {view}" * (len(views) > 1)),
             "probes",
             "How often a linear probe names the side of the correct picture in episodes it has not seen, layer by "
-            "layer. Only filled markers are evidence: they beat the best layer of relabelled data. Open markers "
-            "within the grey band are what no knowledge looks like.",
-            position, partial(layer_curve, results, view),
+            "layer; the part that makes the action has a line per iteration. Only filled markers are evidence: "
+            "they beat the best layer of relabelled data. The grey band is what no knowledge looks like; a caret "
+            "marks the best layer, or all that tie.",
+            position, partial(layer_curve, results, view, iterations),
         )
         for view in views
     ]  # fmt: skip
@@ -188,7 +201,7 @@ def _of_probes(name: str, position: int, results: ProbeResults) -> list[Exhibit]
                 Exhibit(
                     f"{name}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
                     "The same probes on the mean of one kind of token at a time.",
-                    position, partial(role_curves, results, str(stream)),
+                    position, partial(role_curves, results, str(stream), iterations=iterations),
                 )
             )  # fmt: skip
     return exhibits

@@ -17,6 +17,7 @@ from probe_kit.retention.table import RetentionTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _CELL_WIDTH, _ROW_HEIGHT = 0.66, 0.36  # inches
 _NAME_WIDTH = 0.085  # inches per character of a model's name
@@ -72,16 +73,18 @@ class HeatTableDisplay(Shown):
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with the key of colours and captions."""
         width = _CELL_WIDTH * len(self.columns) + _NAME_WIDTH * max(map(len, self.rows)) + 0.3
-        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.6 + 0.13 * len(set(self.certificates))
+        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.75
         axes, figure = axes_for(ax, max(6.2, width), height)
         for number, line in enumerate(self.cells):
             for column, cell in enumerate(line):
                 self._draw_cell(axes, column, number, cell)
         self._draw_names(axes)
-        axes.set_title(self.title, fontsize=10, loc="left", pad=34)
-        if figure is not None:
-            self._draw_key(axes)
-        caption(figure, *(certificate.line for certificate in self.certificates))
+        if figure is None:
+            axes.set_title(self.title, fontsize=10, loc="left", pad=34)
+        else:
+            figure.suptitle(self.title, x=0.01, ha="left", fontsize=10)
+            self._draw_key(figure)
+        caption(figure, *self.certificates)
         self.ax_ = axes
         return self
 
@@ -110,17 +113,16 @@ class HeatTableDisplay(Shown):
         if self.columns[-1] == "mean" and len(self.columns) > 1:
             axes.axvline(len(self.columns) - 1, color="0.35", lw=0.9)
 
-    def _draw_key(self, axes: "Axes") -> None:
+    def _draw_key(self, figure: "Figure") -> None:
         from matplotlib.patches import Patch
 
         bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
         labels = [f"{self.scale * bound:g}–{self.scale * (bound + 0.2):g}" for bound in bounds]
         labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
         patches = [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
-        axes.legend(
-            handles=patches, loc="upper left", bbox_to_anchor=(0, -0.04 / len(self.rows)), ncols=5, fontsize=7,
-            frameon=False, handlelength=1.2, columnspacing=1.2, borderaxespad=0.6, title=self.note,
-            title_fontsize=7, alignment="left",
+        figure.legend(
+            handles=patches, loc="outside lower left", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
+            columnspacing=1.2, borderaxespad=0.6, title=self.note, title_fontsize=7, alignment="left",
         )  # fmt: skip
 
 
@@ -144,7 +146,7 @@ class SideTableDisplay(HeatTableDisplay):
 
     title = "Success rate (%) where the correct picture is left | right"
     digits = 0
-    note = "equal halves: no side is favoured; one green, one red: the policy goes to a side, not to an answer"
+    note = "equal halves: no side is favoured; one blue, one pale: the policy goes to a side, not to an answer"
     parts = ("left", "right")
 
     @classmethod

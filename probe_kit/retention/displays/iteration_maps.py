@@ -9,21 +9,28 @@ from numpy.typing import NDArray
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.layer_curves import DEPTH
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import OTHER_STREAM, STREAMS, axes_for, caption, panels, spell
-from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.retention.displays.style import (
+    FILLED,
+    OTHER_STREAM,
+    STREAMS,
+    axes_for,
+    caption,
+    legend_above,
+    panels,
+    spell,
+)
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
 
 _LEAST_SPAN = 0.2  # so that noise around chance does not look like signal
-_LEGEND = f"dot: above chance, family-wise p < {SIGNIFICANCE} · frame: most accurate site · grey: below chance"
 
 
 @dataclass
@@ -31,14 +38,15 @@ class IterationMapDisplay(Shown):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
     accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream.
-    peak: iteration and layer of the most accurate site. depth: (L,) of each layer.
+    layers, iterations: the numbers along both sides, (L,) and (I,).
     """
 
     category: str
     view: str
     stream: str
     chance: float
-    depth: NDArray[np.float64]
+    layers: NDArray[np.int64]
+    iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
     certificate: Certificate
@@ -65,17 +73,18 @@ class IterationMapDisplay(Shown):
             view=view,
             stream=stream,
             chance=curve.chance,
-            depth=np.sort(scores["depth"].unique()),
+            layers=grid["accuracy"].columns.to_numpy(dtype=np.int64),
+            iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
             significant=grid["signal"].to_numpy(dtype=bool),
             certificate=Certificate.of_results(results, view),
         )
 
     @property
-    def peak(self) -> tuple[int, int]:
-        """Iteration and layer of the most accurate site, the first one on ties."""
-        iteration, layer = np.unravel_index(int(self.accuracy.argmax()), self.accuracy.shape)
-        return int(iteration), int(layer)
+    def peaks(self) -> tuple[tuple[int, int], ...]:
+        """Positions (iteration, layer) of the most accurate site, of all of them where several tie."""
+        best = np.argwhere(self.accuracy >= self.accuracy.max() - 1e-12)
+        return tuple((int(iteration), int(layer)) for iteration, layer in best)
 
     def plot(self, ax: "Axes | None" = None, top: float | None = None) -> Self:
         """Draw on `ax`, or on a figure of its own with colour bar and caption.
@@ -87,7 +96,8 @@ class IterationMapDisplay(Shown):
         if figure is not None:
             axes.set_ylabel("iteration", fontsize=9)
             _scale(figure, [axes], drawn, self)
-            caption(figure, f"{self.certificate.line} · {_LEGEND}", label=DEPTH)
+            _draw_legend(figure)
+            caption(figure, self.certificate)
         self.ax_ = axes
         return self
 
@@ -104,7 +114,8 @@ def iteration_maps(results: ProbeResults, view: str | None = None, stream: str =
         drawn = _draw(axes, display, _top(displays))
     figure.supylabel("iteration", fontsize=9)
     _scale(figure, grid, drawn, displays[0])
-    caption(figure, f"{displays[0].certificate.line} · {_LEGEND}", label=DEPTH)
+    _draw_legend(figure)
+    caption(figure, displays[0].certificate)
     return figure
 
 
@@ -115,6 +126,7 @@ def _top(displays: list[IterationMapDisplay]) -> float:
 def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMappable":
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
 
     norm = Normalize(100 * display.chance, 100 * top)
     colours = _colours(display.stream)
@@ -123,11 +135,17 @@ def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMapp
     for iteration, layer in np.argwhere(display.significant):
         ink = _ink(100 * display.accuracy[iteration, layer], norm)
         axes.plot(layer, iteration, marker="o", ms=2.2, color=ink, mew=0)
-    iteration, layer = display.peak
-    axes.add_patch(Rectangle((layer - 0.5, iteration - 0.5), 1, 1, fill=False, ec="black", lw=1.4, zorder=3))
-    middle = (layers - 1) / 2
-    axes.set_xticks([0, middle, layers - 1], ["0", "0.5", "1"])
-    axes.set_yticks([0, iterations - 1] if iterations > 1 else [0])
+    for iteration, layer in display.peaks:
+        frame = Rectangle((layer - 0.5, iteration - 0.5), 1, 1, fill=False, ec="black", lw=1.2, zorder=3)
+        frame.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
+        axes.add_patch(frame)
+    for ticks, numbers, axis in (
+        (layers, display.layers, axes.xaxis),
+        (iterations, display.iterations, axes.yaxis),
+    ):
+        shown = range(0, ticks, max(1, -(-ticks // 7)))
+        axis.set_ticks(list(shown), [str(numbers[at]) for at in shown])
+    axes.set_xlabel("layer", fontsize=8.5)
     axes.tick_params(labelsize=8)
     axes.set_title(spell(display.category), fontsize=10, loc="left")
     return image
@@ -140,6 +158,26 @@ def _colours(stream: str) -> "Colormap":
     colour = STREAMS.get(stream, OTHER_STREAM).colour
     dark = "#331400" if part_of(stream) == "action" else "#001B2E"
     return LinearSegmentedColormap.from_list(stream, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
+
+
+def _draw_legend(figure: "Figure") -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Artist] = [
+        Line2D(
+            [],
+            [],
+            color="0.3",
+            ls="none",
+            marker="o",
+            ms=3,
+            label=FILLED.removeprefix("filled: "),
+        ),
+        Patch(fill=False, ec="black", lw=1.4, label="best of its stream (all, where several tie)"),
+        Patch(fc="0.93", label="below chance"),
+    ]
+    legend_above(figure, handles)
 
 
 def _ink(value: float, norm: "Normalize") -> str:

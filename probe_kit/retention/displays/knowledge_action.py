@@ -10,7 +10,16 @@ from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.labels import place_labels
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import axes_for, caption, darker, plain, series, spell
+from probe_kit.retention.displays.style import (
+    axes_for,
+    caption,
+    darker,
+    legend_above,
+    plain,
+    series,
+    significance_handles,
+    spell,
+)
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.table import RetentionTable
 
@@ -67,16 +76,18 @@ class KnowledgeActionDisplay(Shown):
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and captions."""
-        axes, figure = axes_for(ax, 6.2, 6.4)
-        _draw_ground(axes, _lower_end(self.points))
         models = list(dict.fromkeys(point.model for point in self.points))
+        axes, figure = axes_for(ax, 6.2, 6.7 + 0.17 * len(models))
+        _draw_ground(axes, _lower_end(self.points))
         for position, model in enumerate(models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
         plain(axes)
-        axes.set_xlabel(f"best held-out probe in the {self.stream} (%)", fontsize=9)
+        place = "in the backbone" if self.stream == "backbone" else "where the action is made"
+        axes.set_xlabel(f"best held-out probe {place} (%)", fontsize=9)
         axes.set_ylabel("success rate (%)", fontsize=9)
-        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=8, frameon=False, borderaxespad=0.2)
-        caption(figure, *(certificate.line for certificate in self.certificates))
+        if figure is not None:
+            legend_above(figure, [*axes.get_legend_handles_labels()[0], *significance_handles()])
+        caption(figure, *self.certificates)
         if figure is not None:
             figure.draw_without_rendering()  # labels need the final places of points
         words = [spell(point.category) for point in self.points]
@@ -140,13 +151,11 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
         )  # fmt: skip
     for filled in (True, False):
         chosen = [point for point in points if point.significant == filled]
-        label = f"{model}: {'probe above chance' if filled else 'probe not above chance'}"
-        if chosen:
-            axes.plot(
-                [100 * point.accuracy for point in chosen], [100 * point.sr for point in chosen], ls="none",
-                marker=line.marker, ms=6, color=line.colour, mfc=line.colour if filled else "white", label=label,
-                zorder=3,
-            )  # fmt: skip
+        axes.plot(
+            [100 * point.accuracy for point in chosen], [100 * point.sr for point in chosen], ls="none",
+            marker=line.marker, ms=6, color=line.colour, mfc=line.colour if filled else "white",
+            label=model if filled else None, zorder=3,
+        )  # fmt: skip
 
 
 def _arms(value: float, limits: Limits) -> list[list[float]] | None:

@@ -1,7 +1,9 @@
-"""Layer curves: accuracy against depth, backbone beside action expert."""
+"""Layer curves: accuracy by layer, the backbone beside where the action is made, a line per iteration."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from math import ceil
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,78 +11,37 @@ from numpy.typing import NDArray
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.retention.displays.style import (
+    DPI,
     OTHER_STREAM,
-    STREAM_NAMES,
     STREAMS,
     Line,
-    axes_for,
     caption,
-    panels,
+    layer_axis,
+    legend_above,
     plain,
+    significance_handles,
     spell,
 )
-from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.retention.measure import Iterations
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-DEPTH = "depth (0 enters the first block, 1 leaves the last)"
-_SIDESTEP = 0.006  # in depth, so that the two streams' bars do not hide each other
-
+_SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
 _ENOUGH = 20  # relabellings, fewer than which have no 95 % band
-
-Shares = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class StreamCurve:
-    """One stream's held-out accuracy by layer; arrays (L,), accuracies as shares. depth: the layer as a fraction.
-
-    accuracy: of the best iteration where there are several, with its 95 % interval `low`, `high` over groups.
-    least, most: over all iterations. significant: above chance, family-wise. iterations: how many there are.
-    """
-
-    stream: str
-    layers: NDArray[np.int64]
-    depth: Shares
-    accuracy: Shares
-    low: Shares
-    high: Shares
-    least: Shares
-    most: Shares
-    significant: NDArray[np.bool_]
-    iterations: int
-
-    @classmethod
-    def of(cls, scores: "pd.DataFrame") -> Self:
-        """From the rows of one category, view and stream of `ProbeResults.scores`."""
-        by_depth = scores.groupby("depth")["accuracy"]
-        best = scores.loc[by_depth.idxmax()].sort_values("depth")
-        depth, accuracy, low, high = (
-            best[name].to_numpy(dtype=float) for name in ("depth", "accuracy", "ci_low", "ci_high")
-        )
-        return cls(
-            stream=str(best["stream"].iloc[0]),
-            layers=best["layer"].to_numpy(dtype=np.int64),
-            depth=depth,
-            accuracy=accuracy,
-            low=low,
-            high=high,
-            least=by_depth.min().to_numpy(dtype=float),
-            most=by_depth.max().to_numpy(dtype=float),
-            significant=best["signal"].to_numpy(dtype=bool),
-            iterations=int(scores["iteration"].nunique()) or 1,
-        )
+_PEAK = "best of its stream (all, where several tie)"
 
 
 @dataclass
 class LayerCurveDisplay(Shown):
-    """Held-out accuracy against depth, for one category in one view.
+    """Held-out accuracy by layer, for one category in one view.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above binding
     and twin where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
@@ -96,10 +57,14 @@ class LayerCurveDisplay(Shown):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_results(cls, results: ProbeResults, category: str, view: str | None = None) -> Self:
+    def from_results(
+        cls, results: ProbeResults, category: str, view: str | None = None, iterations: Iterations = "all"
+    ) -> Self:
         """From stored probes; view: the first probed one by default.
 
-        Raises UnknownSiteError for a view, and UnknownCategoryError for a category, that was not probed.
+        iterations: a line for each of `all`, for the `best` of every layer, for the `last` one or one by number.
+        Raises UnknownSiteError for a view, and UnknownCategoryError for a category, that was not probed, and
+        UsageError for an iteration that no stream has.
         """
         view = known_view(results, view)
         curve = curve_of(results, category, view)
@@ -110,93 +75,202 @@ class LayerCurveDisplay(Shown):
             view=view,
             chance=curve.chance,
             null_band=None if band is None else (float(band[0]), float(band[1])),
-            streams=tuple(StreamCurve.of(rows) for _, rows in scores.groupby("stream", sort=False)),
+            streams=tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False)),
             certificate=Certificate.of_results(results, view),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
+        """Draw all streams on `ax`, or each beside the other on a figure of its own with legend and caption."""
+        if ax is not None:
+            self._draw_ground(ax)
+            for number, curve in enumerate(self.streams):
+                _draw_stream(ax, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2))
+            _finish(ax, max(curve.layers.max() for curve in self.streams) + 1, spell(self.category))
+            self.ax_ = ax
+            return self
+        figure, grid = _pairs([self], own=True)
+        self.ax_ = grid[0][0]
+        _complete(figure, grid, [self])
+        return self
+
+    def plot_beside(self, axes: "Sequence[Axes]") -> Self:
+        """Draw each stream on axes of its own."""
+        for curve, ax in zip(self.streams, axes, strict=False):
+            self._draw_ground(ax)
+            _draw_stream(ax, curve)
+            _finish(ax, int(curve.layers.max()) + 1, f"{spell(self.category)}: {curve.label}")
+        self.ax_ = axes[0]
+        return self
+
+    def _draw_ground(self, axes: "Axes") -> None:
         if self.null_band is not None:
             low, high = self.null_band
             axes.axhspan(100 * low, 100 * high, color="0.92", lw=0, label="95 % of relabelled probes")
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
-        for curve in self.streams:
-            _draw_stream(axes, curve)
-        plain(axes)
-        axes.set_xlim(-0.04, 1.04)
-        axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "0.25", "0.5", "0.75", "1"])
-        axes.set_title(spell(self.category), fontsize=10, loc="left")
-        if figure is not None:
-            axes.set_ylabel(f"held-out accuracy (%), view {self.view}", fontsize=9)
-            _draw_legend(figure, axes)
-        caption(figure, self.certificate.line, label=DEPTH)
-        self.ax_ = axes
-        return self
 
 
-def layer_curve(results: ProbeResults, view: str | None = None) -> "Figure":
-    """Held-out accuracy against depth for every category, as a matplotlib figure (`figure.savefig(…)`).
+def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iterations = "all") -> "Figure":
+    """Held-out accuracy by layer for every category, as a matplotlib figure (`figure.savefig(…)`).
 
-    Lines: backbone, and the expert's best iteration with a band over all its iterations; bars: 95 % intervals
-    over groups. Filled markers are above chance against the best site of their stream (family-wise p < 0.05),
-    and above binding and twin where those were run.
-    Grey: chance, and the band that holds 95 % of the accuracies under relabelling. view: the first probed one
-    by default. Raises UnknownSiteError for a view that was not probed.
+    Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
+    for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only where
+    there are several lines. Filled markers are above chance against the best site of their stream (family-wise
+    p < 0.05), and above binding and twin where those were run. Grey: chance, and the band that holds 95 % of the
+    accuracies under relabelling. view: the first probed one by default. Raises UnknownSiteError for a view that
+    was not probed, UsageError for an iteration.
     """
-    view = known_view(results, view)
-    displays = [LayerCurveDisplay.from_results(results, name, view) for name in results.settings.categories]
-    figure, grid = panels(len(displays))
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    figure.supylabel(f"held-out accuracy (%), view {view}", fontsize=9)
-    caption(figure, displays[0].certificate.line, label=DEPTH)
-    _draw_legend(figure, grid[0])
+    view, names = known_view(results, view), results.settings.categories
+    displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]
+    figure, grid = _pairs(displays)
+    _complete(figure, grid, displays)
     return figure
 
 
-def _draw_stream(axes: "Axes", curve: StreamCurve) -> None:
+def _pairs(displays: Sequence[LayerCurveDisplay], own: bool = False) -> "tuple[Figure, list[list[Axes]]]":
+    """Axes for every stream of every display, those of one display side by side.
+
+    own: whether pyplot shall know the figure, so that it is shown where displays are.
+    """
+    from matplotlib import pyplot as plt
+
+    from probe_kit.retention.displays.shown_figure import ShownFigure
+
+    streams = max(len(display.streams) for display in displays)
+    across = 1 if len(displays) == 1 else max(1, 4 // streams)
+    rows = ceil(len(displays) / across)
+    size = (max(6.2, 2.75 * streams * across + 0.7), (2.9 if rows == 1 else 2.3) * rows + 1.0)
+    figure: Figure
+    if own:
+        figure = plt.figure(figsize=size, layout="constrained", dpi=DPI, FigureClass=ShownFigure)
+    else:
+        figure = ShownFigure(figsize=size, layout="constrained", dpi=DPI)
+    flat = list(figure.subplots(rows, across * streams, sharey=True, squeeze=False).flat)
+    grid = [flat[streams * number : streams * (number + 1)] for number in range(len(flat) // streams)]
+    for unused in (ax for pair in grid[len(displays) :] for ax in pair):
+        unused.set_visible(False)
+    return figure, grid[: len(displays)]
+
+
+def _complete(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[LayerCurveDisplay]) -> None:
+    for display, axes in zip(displays, grid, strict=True):
+        display.plot_beside(axes)
+        for unused in axes[len(display.streams) :]:
+            unused.set_visible(False)
+    figure.supylabel(f"held-out accuracy (%), view {displays[0].view}", fontsize=9)
+    caption(figure, displays[0].certificate)
+    handles: dict[str, Artist] = {}
+    for ax in grid[0]:
+        handles |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    drawn = [handle for label, handle in handles.items() if not label.startswith("iteration")]
+    drawn += [*significance_handles(), _peak_handle()]
+    legend_above(figure, drawn)
+    _draw_scales(figure, grid, displays)
+
+
+def _draw_scales(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[LayerCurveDisplay]) -> None:
+    """The scale of iterations, once per figure."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm
+
+    most = max((curve for display in displays for curve in display.streams), key=lambda curve: len(curve.lines))
+    if len(most.lines) == 1:
+        return
+    steps = [line.iteration or 0 for line in most.lines]
+    edges = [step - 0.5 for step in steps] + [steps[-1] + 0.5]
+    scale = ScalarMappable(BoundaryNorm(edges, 256), _colours())
+    bar = figure.colorbar(scale, ax=[ax for axes in grid for ax in axes], aspect=40, pad=0.01, ticks=_few(steps))
+    bar.set_label("iteration of the action", fontsize=8)
+    bar.ax.tick_params(labelsize=8, length=0)
+    bar.outline.set_visible(False)
+
+
+def _few(steps: Sequence[int]) -> list[int]:
+    return list(steps[:: max(1, ceil(len(steps) / 12))])
+
+
+def _colours() -> "Colormap":
+    """From pale to dark through the action's colour: lightness alone orders the iterations."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("iterations", ["#F7C79B", STREAMS["expert"].colour, "#3B1200"])
+
+
+def _finish(axes: "Axes", layers: int, title: str) -> None:
+    plain(axes)
+    layer_axis(axes, layers)
+    axes.tick_params(labelleft=True)
+    axes.set_title(title, fontsize=9, loc="left")
+
+
+def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
     line = STREAMS.get(curve.stream, OTHER_STREAM)
-    name = STREAM_NAMES.get(curve.stream, curve.stream)
-    sidestep = {"backbone": -_SIDESTEP, "expert": _SIDESTEP, "action": _SIDESTEP}.get(curve.stream, 0.0)
-    if curve.iterations > 1:
-        band = 100 * curve.least, 100 * curve.most
-        axes.fill_between(curve.depth, *band, color=line.colour, alpha=0.15, lw=0, label=f"{name}, all iterations")
-        name = f"{name}, best iteration"
-    draw_curve(axes, curve, line, name, sidestep)
+    if len(curve.lines) == 1:
+        draw_line(axes, curve.lines[0], line, curve.label, sidestep)
+    else:
+        colours = _colours()
+        for number, one in enumerate(curve.lines):
+            shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
+            draw_line(axes, one, shade, f"iteration {one.iteration}", sidestep, bars=_peak_layers(curve, one))
+        axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
+    mark_peaks(axes, curve, sidestep)
 
 
-def draw_curve(axes: "Axes", curve: StreamCurve, line: Line, name: str, sidestep: float = 0.0) -> None:
-    """One stream's line with intervals; filled markers where it is significant."""
-    depth, accuracy = curve.depth + sidestep, 100 * curve.accuracy
-    bars = [accuracy - 100 * curve.low, 100 * curve.high - accuracy]
-    axes.errorbar(depth, accuracy, yerr=bars, fmt="none", ecolor=line.colour, elinewidth=0.7, alpha=0.6)
-    axes.plot(
-        depth,
-        accuracy,
-        color=line.colour,
-        lw=1.3,
-        ls=line.dash,
-        marker=line.marker,
-        ms=4.5,
-        mfc="white",
-        label=name,
+def _peak_layers(curve: StreamCurve, line: LayerLine) -> NDArray[np.bool_]:
+    """(L,) the layers at which the line is the best of its stream; the first one if it ties with itself."""
+    found = np.isin(line.layers, [layer for layer, step in curve.peaks if step == line.iteration])
+    first = curve.peaks[0] if curve.peaks else None
+    return found & (line.layers == first[0]) if first is not None and first[1] == line.iteration else found & False
+
+
+def draw_line(
+    axes: "Axes",
+    line: LayerLine,
+    style: Line,
+    name: str,
+    sidestep: float = 0.0,
+    bars: NDArray[np.bool_] | None = None,
+) -> None:
+    """One line; filled markers where it is significant, intervals at the layers `bars` or everywhere."""
+    layers, accuracy = line.layers + sidestep, 100 * line.accuracy
+    shown = np.ones(layers.size, bool) if bars is None else bars
+    arms = np.array([accuracy - 100 * line.low, 100 * line.high - accuracy]).clip(min=0)
+    axes.errorbar(
+        layers[shown],
+        accuracy[shown],
+        yerr=arms[:, shown],
+        fmt="none",
+        ecolor=style.colour,
+        elinewidth=0.8,
+        alpha=0.7,
     )
-    clear = curve.significant
-    axes.plot(depth[clear], accuracy[clear], color=line.colour, ls="none", marker=line.marker, ms=4.5)
+    size = 4.5 if bars is None else 3.2
+    axes.plot(
+        layers, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, ms=size, mfc="white",
+        label=name,
+    )  # fmt: skip
+    clear = line.significant
+    axes.plot(layers[clear], accuracy[clear], color=style.colour, ls="none", marker=style.marker, ms=size)
 
 
-def _draw_legend(figure: "Figure", panel: "Axes") -> None:
-    handles, labels = panel.get_legend_handles_labels()
-    filled = filled_marker()
-    handles.append(filled)
-    labels.append(str(filled.get_label()))
-    figure.legend(handles, labels, loc="outside upper left", ncols=2, fontsize=8, frameon=False)
+def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
+    """A mark above every site that no other one of its stream beats."""
+    from matplotlib.transforms import ScaledTranslation
+
+    figure = axes.figure
+    layers = sorted({layer for layer, _ in curve.peaks})
+    above = axes.transData + ScaledTranslation(0, 5 / 72, figure.dpi_scale_trans)
+    height = 100 * float(curve.accuracy.max())
+    (mark,) = axes.plot(
+        [layer + sidestep for layer in layers], [height] * len(layers), ls="none", marker=_MARK, ms=5,
+        color="black", transform=above, clip_on=False, zorder=4,
+    )  # fmt: skip
+    mark.set_gid("peak")
 
 
-def filled_marker() -> "Line2D":
-    """The legend's entry for filled markers."""
+_MARK: Literal[7] = 7  # matplotlib's caret that points down, with its tip at the place
+
+
+def _peak_handle() -> "Line2D":
     from matplotlib.lines import Line2D
 
-    label = f"filled: above chance, family-wise p < {SIGNIFICANCE}"
-    return Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, label=label)
+    return Line2D([], [], color="black", ls="none", marker=_MARK, ms=5, label=_PEAK)

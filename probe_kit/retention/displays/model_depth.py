@@ -9,22 +9,32 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.layer_curves import DEPTH
-from probe_kit.retention.displays.selection import known_view, scores_of
+from probe_kit.retention.displays.selection import known_view, of_iterations, scores_of
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import STREAM_NAMES, axes_for, caption, plain, series
+from probe_kit.retention.displays.style import (
+    STREAM_NAMES,
+    axes_for,
+    caption,
+    layer_axis,
+    legend_above,
+    plain,
+    series,
+)
+from probe_kit.retention.measure import Iterations
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
 class ModelCurve:
-    """Accuracy above chance by depth, (L,) each, averaged over categories."""
+    """Accuracy above chance by layer, and by depth as its fraction; (L,) each, averaged over categories."""
 
     model: str
+    layers: NDArray[np.int64]
     depth: NDArray[np.float64]
     above_chance: NDArray[np.float64]
     categories: int
@@ -34,7 +44,8 @@ class ModelCurve:
 class ModelDepthDisplay(Shown):
     """Held-out accuracy above chance against depth, averaged over categories, one line per model.
 
-    At each depth the best iteration counts, in each category by itself.
+    At each layer the best of the iterations counts, in each category by itself. Lines have no markers: a mean over
+    categories has no p. Layer numbers are those of the deepest model, whose length the others are stretched to.
     """
 
     stream: str
@@ -44,7 +55,11 @@ class ModelDepthDisplay(Shown):
 
     @classmethod
     def from_results(
-        cls, results: Sequence[ProbeResults], stream: str = "backbone", view: str | None = None
+        cls,
+        results: Sequence[ProbeResults],
+        stream: str = "backbone",
+        view: str | None = None,
+        iterations: Iterations = "best",
     ) -> Self:
         """From the stored probes of several runs; view: the first probed one of each by default.
 
@@ -56,7 +71,7 @@ class ModelDepthDisplay(Shown):
             raise UsageError(f"none of the {len(results)} runs has probes of stream {stream!r}")
         return cls(
             stream=stream,
-            models=tuple(_curve(one, stream, shown) for one, shown in kept),
+            models=tuple(_curve(one, stream, shown, iterations) for one, shown in kept),
             certificates=tuple(Certificate.of_results(one, shown) for one, shown in kept),
         )
 
@@ -64,50 +79,76 @@ class ModelDepthDisplay(Shown):
         """Draw on `ax`, or on a figure of its own with legend and captions."""
         axes, figure = axes_for(ax, 6.2, 3.9)
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
+        last = max(int(model.layers.max()) for model in self.models)
         for position, model in enumerate(self.models):
             line = series(position)
+            label = f"{model.model}, {model.layers.max() + 1} layers"
             axes.plot(
-                model.depth, 100 * model.above_chance, color=line.colour, ls=line.dash, lw=1.4, marker=line.marker,
-                ms=4.5, mfc="white", label=model.model,
-            )  # fmt: skip
+                last * model.depth, 100 * model.above_chance, color=line.colour, ls=line.dash, lw=1.6, label=label
+            )
         plain(axes)
-        axes.set_xlim(-0.04, 1.04)
-        axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "0.25", "0.5", "0.75", "1"])
+        layer_axis(axes, last + 1)
+        if any(model.layers.max() < last for model in self.models):
+            axes.set_xlabel("layer (of the deepest model)", fontsize=8.5)
+        _draw_fractions(axes, last)
         axes.set_title(STREAM_NAMES.get(self.stream, self.stream), fontsize=10, loc="left")
         if figure is not None:
             axes.set_ylabel("accuracy above chance\n(points, mean of categories)", fontsize=9)
-            axes.legend(fontsize=8, frameon=False)
-        caption(figure, *(certificate.line for certificate in self.certificates), label=DEPTH)
+            legend_above(figure, axes.get_legend_handles_labels()[0])
+        caption(figure, *self.certificates)
         self.ax_ = axes
         return self
 
 
-def model_depths(results: Sequence[ProbeResults], view: str | None = None) -> "Figure":
-    """Backbones side by side, and action experts, on one scale. Raises UsageError if no run has either."""
+def model_depths(
+    results: Sequence[ProbeResults], view: str | None = None, iterations: Iterations = "best"
+) -> "Figure":
+    """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
     from probe_kit.retention.displays.shown_figure import ShownFigure
 
     streams = [name for name in STREAM_NAMES if any((one.scores["stream"] == name).any() for one in results)]
-    displays = [ModelDepthDisplay.from_results(results, stream, view) for stream in streams]
+    displays = [ModelDepthDisplay.from_results(results, stream, view, iterations) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")
     figure = ShownFigure(figsize=(4.1 * max(len(displays), 1.5), 3.6), layout="constrained", dpi=150)
     grid = figure.subplots(1, len(displays), sharey=True, squeeze=False)[0]
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)
-    grid[0].legend(fontsize=8, frameon=False)
+    handles: dict[str, Artist] = {}
+    for axes in grid:
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    legend_above(figure, list(handles.values()))
     figure.supylabel("accuracy above chance (points, mean of categories)", fontsize=8)
-    lines = (certificate.line for display in displays for certificate in display.certificates)
-    caption(figure, *lines, label=DEPTH)
+    caption(figure, *(certificate for display in displays for certificate in display.certificates))
     return figure
 
 
-def _curve(results: ProbeResults, stream: str, view: str) -> ModelCurve:
+def _draw_fractions(axes: "Axes", last: int) -> None:
+    """Depth as a fraction along the upper side."""
+    above = axes.secondary_xaxis(
+        "top",
+        functions=(
+            lambda layer: np.asarray(layer, float) / max(1, last),
+            lambda depth: np.asarray(depth, float) * last,
+        ),
+    )
+    above.set_ticks([0, 0.25, 0.5, 0.75, 1], labels=["0", "¼", "½", "¾", "1"])
+    above.set_xlabel("depth", fontsize=7.5, labelpad=5)
+    above.tick_params(labelsize=7.5, pad=1)
+    above.spines["top"].set_visible(False)
+
+
+def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations) -> ModelCurve:
     curves = []
     for category in results.settings.categories:
         scores = scores_of(results, category, view)
         scores = scores[scores["stream"] == stream]
         if not scores.empty:
-            curves.append(scores.groupby("depth")["accuracy"].max() - scores["chance"].iloc[0])
-    depth = curves[0].index.to_numpy(dtype=float)
+            scores = of_iterations(scores, iterations)
+            curves.append(scores.groupby("layer")["accuracy"].max() - scores["chance"].iloc[0])
+    layers = curves[0].index.to_numpy(dtype=np.int64)
+    depth = layers / max(1, layers.max())
     name = results.settings.model + (" (random weights)" if results.settings.random_weights else "")
-    return ModelCurve(name, depth, np.mean([curve.to_numpy(dtype=float) for curve in curves], axis=0), len(curves))
+    return ModelCurve(
+        name, layers, depth, np.mean([curve.to_numpy(dtype=float) for curve in curves], axis=0), len(curves)
+    )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, plain, spell
+from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain, spell
 from probe_kit.retention.success import PairedItems, paired_items
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
@@ -54,9 +54,8 @@ class PairedLayoutsDisplay(Shown):
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
         if figure is not None:
-            handles, labels = axes.get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper left", ncols=4, fontsize=7.5, frameon=False)
-        caption(figure, self.certificate.line)
+            legend_above(figure, axes.get_legend_handles_labels()[0])
+        caption(figure, self.certificate)
         self.ax_ = axes
         return self
 

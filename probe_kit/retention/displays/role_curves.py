@@ -6,10 +6,23 @@ from typing import TYPE_CHECKING, Self
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.layer_curves import DEPTH, StreamCurve, draw_curve, filled_marker
+from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.selection import curve_of, scores_of
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import STREAM_NAMES, axes_for, caption, panels, plain, series, spell
+from probe_kit.retention.displays.stream_curve import StreamCurve
+from probe_kit.retention.displays.style import (
+    STREAM_NAMES,
+    axes_for,
+    caption,
+    layer_axis,
+    legend_above,
+    panels,
+    plain,
+    series,
+    significance_handles,
+    spell,
+)
+from probe_kit.retention.measure import Iterations
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
@@ -19,9 +32,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class RoleCurvesDisplay(Shown):
-    """Held-out accuracy against depth, one line per view of one stream, for one category.
+    """Held-out accuracy by layer, one line per view of one stream, for one category.
 
-    curves: by view, such as `mean:language`; of iterative streams, the best iteration at each depth.
+    curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
     """
 
     category: str
@@ -33,9 +46,14 @@ class RoleCurvesDisplay(Shown):
 
     @classmethod
     def from_results(
-        cls, results: ProbeResults, category: str, stream: str = "backbone", views: Sequence[str] | None = None
+        cls,
+        results: ProbeResults,
+        category: str,
+        stream: str = "backbone",
+        views: Sequence[str] | None = None,
+        iterations: Iterations = "best",
     ) -> Self:
-        """From stored probes; views: all probed ones of the stream by default.
+        """From stored probes; views: all probed ones of the stream by default. iterations: which take part.
 
         Raises UnknownSiteError if none of them was probed there, UnknownCategoryError for a category.
         """
@@ -46,7 +64,7 @@ class RoleCurvesDisplay(Shown):
             scores = scores_of(results, category, view)
             rows = scores[scores["stream"] == stream]
             if not rows.empty:
-                found[view] = StreamCurve.of(rows)
+                found[view] = StreamCurve.of(rows, "best" if iterations == "all" else iterations)
         if not found:
             raise UnknownSiteError(f"none of the views {', '.join(asked)} was probed in stream {stream!r}")
         shown = next(iter(found))
@@ -62,31 +80,35 @@ class RoleCurvesDisplay(Shown):
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         axes, figure = axes_for(ax, 6.2, 3.9)
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls=(0, (1, 1)), label="chance")
-        spread = 0.008
+        spread = 0.1
         for position, (view, curve) in enumerate(self.curves.items()):
             sidestep = spread * (position - (len(self.curves) - 1) / 2)
-            draw_curve(axes, curve, series(position), view, sidestep)
+            draw_line(axes, curve.lines[0], series(position), view, sidestep)
         plain(axes)
-        axes.set_xlim(-0.04, 1.04)
-        axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "0.25", "0.5", "0.75", "1"])
+        layer_axis(axes, int(max(curve.layers.max() for curve in self.curves.values())) + 1)
         axes.set_title(spell(self.category), fontsize=10, loc="left")
         if figure is not None:
             axes.set_ylabel(_label(self.stream), fontsize=9)
             _draw_legend(figure, axes)
-        caption(figure, self.certificate.line, label=DEPTH)
+        caption(figure, self.certificate)
         self.ax_ = axes
         return self
 
 
-def role_curves(results: ProbeResults, stream: str = "backbone", views: Sequence[str] | None = None) -> "Figure":
+def role_curves(
+    results: ProbeResults,
+    stream: str = "backbone",
+    views: Sequence[str] | None = None,
+    iterations: Iterations = "best",
+) -> "Figure":
     """Curves of all probed views of one stream, a panel per category. Raises UnknownSiteError without any."""
     categories = results.settings.categories
-    displays = [RoleCurvesDisplay.from_results(results, name, stream, views) for name in categories]
+    displays = [RoleCurvesDisplay.from_results(results, name, stream, views, iterations) for name in categories]
     figure, grid = panels(len(displays))
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)
     figure.supylabel(_label(stream), fontsize=9)
-    caption(figure, displays[0].certificate.line, label=DEPTH)
+    caption(figure, displays[0].certificate)
     _draw_legend(figure, grid[0])
     return figure
 
@@ -96,5 +118,5 @@ def _label(stream: str) -> str:
 
 
 def _draw_legend(figure: "Figure", panel: "Axes") -> None:
-    handles = [*panel.get_legend_handles_labels()[0], filled_marker()]
-    figure.legend(handles=handles, loc="outside upper left", ncols=3, fontsize=8, frameon=False)
+    handles = [*panel.get_legend_handles_labels()[0], *significance_handles()]
+    legend_above(figure, handles)

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import UnknownCategoryError, UnknownSiteError
+from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
+from probe_kit.retention.measure import Iterations
 from probe_kit.train.curve import Curve
 from probe_kit.train.results import ProbeResults
 
@@ -31,3 +32,18 @@ def scores_of(results: ProbeResults, category: str, view: str) -> "pd.DataFrame"
     """Rows of `results.scores` of one category in one view."""
     scores = results.scores
     return scores[(scores["category"] == category) & (scores["view"] == view)]
+
+
+def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
+    """The rows of one stream that take part; all of a stream that runs once.
+
+    Raises UsageError if the stream has no such iteration.
+    """
+    steps = scores["iteration"].dropna()
+    if iterations in ("all", "best") or steps.empty:
+        return scores
+    step = int(steps.max()) if iterations == "last" else iterations
+    if not (steps == step).any():
+        stream = scores["stream"].iloc[0]
+        raise UsageError(f"the stream {stream} has iterations {steps.min()} to {steps.max()}, not {step}")
+    return scores[scores["iteration"] == step]

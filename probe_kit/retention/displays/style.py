@@ -1,13 +1,19 @@
 """What all figures share: colours, markers, axes without clutter, and the caption."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.statistics.significance import SIGNIFICANCE
+
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 # Okabe and Ito's palette: apart for every kind of colour vision.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
@@ -15,7 +21,8 @@ SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 
 DPI = 150
 _CAPTION_SIZE = 6.5
-_CAPTION_PER_INCH = 18.5  # characters of a caption that fit in one inch
+_LEGEND_SIZE = 8.0
+_USED = 0.97  # of the width, by a caption
 
 
 @dataclass(frozen=True)
@@ -31,7 +38,9 @@ STREAMS = MappingProxyType(
     {"backbone": Line(BLUE, "o"), "expert": Line(VERMILION, "s"), "action": Line(VERMILION, "D")}
 )
 OTHER_STREAM = Line(GREEN, "^")
-STREAM_NAMES = MappingProxyType({"backbone": "backbone", "expert": "action expert", "action": "action tokens"})
+STREAM_NAMES = MappingProxyType(
+    {"backbone": "backbone", "expert": "action expert", "action": "action tokens", "answer": "answer tokens"}
+)
 
 SERIES = (
     Line(BLUE, "o"),
@@ -91,26 +100,88 @@ def panels(
     return figure, grid[:count]
 
 
+def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
+    """Whole layer numbers below the axes."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xlim(-0.06 * layers - 0.2, 1.06 * (layers - 1) + 0.2)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=2))
+    if label:
+        axes.set_xlabel("layer", fontsize=8.5)
+
+
 def plain(axes: "Axes") -> None:
     """No frame above and to the right, small tick labels."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
 
 
-def caption(figure: "Figure | None", *certificates: str, label: str = "") -> None:
-    """Write `label` and under it the line of each certificate, wrapped where the figure is narrow."""
+def caption(figure: "Figure | None", *certificates: Certificate) -> None:
+    """One line under the figure says what it is about; the rest is kept as `figure.caption`.
+
+    The line names every model once, then what all have in common, and is cut between its parts where the figure
+    is too narrow for all of them.
+    """
     if figure is None:
         return
-    width = _CAPTION_PER_INCH * figure.get_figwidth()
-    lines = [line for certificate in dict.fromkeys(certificates) for line in _wrapped(certificate, width)]
-    figure.supxlabel("\n".join([label] * bool(label) + lines), fontsize=_CAPTION_SIZE, color="0.25")
+    known = tuple(dict.fromkeys(certificates))
+    figure.caption = "; ".join(certificate.line for certificate in known)  # type: ignore[attr-defined]
+    figure.supxlabel(_footer(known, figure.get_figwidth()), fontsize=_CAPTION_SIZE, color="0.25")
 
 
-def _wrapped(line: str, width: float) -> list[str]:
-    """`line` broken between its parts."""
-    first, *rest = line.split(" · ")
-    lines = [first]
-    for part in rest:
-        joined = f"{lines[-1]} · {part}"
-        lines[-1:] = [joined] if len(joined) <= width else [lines[-1], part]
-    return lines
+def _footer(certificates: Sequence[Certificate], width: float) -> str:
+    """As many parts as `width` inches hold, the first one always; what all certificates share comes once."""
+    parts = list(
+        dict.fromkeys(
+            ", ".join(dict.fromkeys(group)) for group in zip(*(c.parts for c in certificates), strict=True)
+        )
+    )
+    parts = [part for part in parts if part.strip(", ")]
+    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * width:
+        parts.pop()
+    return " · ".join(parts)
+
+
+def legend_above(figure: "Figure", handles: "Sequence[Artist]") -> None:
+    """A legend along the upper side, in as many columns as the figure has room for."""
+    labels = [str(handle.get_label()) for handle in handles]
+    widths = [text_width(label, _LEGEND_SIZE) for label in labels]
+    room = _USED * figure.get_figwidth()
+    fitting = [n for n in range(1, len(labels) + 1) if _legend_width(widths, n) <= room]
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=max(fitting, default=1), fontsize=_LEGEND_SIZE,
+        frameon=False,
+    )  # fmt: skip
+
+
+def _legend_width(widths: Sequence[float], columns: int) -> float:
+    """Inches of a legend, which fills column by column; each has a mark and gaps of five letters' width."""
+    rows, more = divmod(len(widths), columns)
+    total, start = 0.0, 0
+    for column in range(columns):
+        count = rows + (column < more)
+        total += max(widths[start : start + count]) + 5.2 * _LEGEND_SIZE / 72
+        start += count
+    return total
+
+
+def text_width(text: str, size: float) -> float:
+    """Inches that a line of text of `size` points takes."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    return float(TextPath((0, 0), text, prop=FontProperties(size=size)).get_extents().width) / 72
+
+
+def significance_handles(colour: str = "0.3") -> "list[Line2D]":
+    """The legend's entries for filled and open markers, which mean the same in every figure."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, label=FILLED),
+        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
+    ]
+
+
+FILLED = f"filled: signal (above chance and every control run, p < {SIGNIFICANCE})"
+OPEN = "open: no signal"

@@ -8,6 +8,7 @@ from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.gallery import Exhibit, gallery, run_names
+from probe_kit.retention.heat import heat_key
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.pictures import data_uri
@@ -29,12 +30,13 @@ _HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure in the page. run: its name, empty for a figure of all runs."""
+    """A figure in the page. run: its name, empty for a figure of all runs. caption: what it is about, in full."""
 
     title: str
     run: str
     reading: str
     source: str
+    caption: str
     extra: bool
 
 
@@ -93,6 +95,7 @@ def report_html(
             for name, run in zip(names, runs, strict=True)
         ],
         glossary=GLOSSARY,
+        heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
     )
@@ -127,5 +130,5 @@ def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -
             run = "" if exhibit.run is None else names[exhibit.run]
             kind = exhibit.title.partition(",")[0]
             extra = any(other.run == run and other.title.partition(",")[0] == kind for other in found)
-            found.append(Picture(exhibit.title, run, exhibit.reading, data_uri(exhibit), extra))
+            found.append(Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit), extra))
     return found

@@ -3,25 +3,26 @@
 from base64 import b64encode
 from io import BytesIO
 
-from probe_kit.retention.displays.gallery import Exhibit
+from probe_kit.retention.displays.gallery import Exhibit, caption_of
 
 SVG_LIMIT = 600_000
 """Bytes; a figure of more is kept as pixels."""
-_PIXELS_PER_INCH = 200
 
 
-def data_uri(exhibit: Exhibit) -> str:
-    """The drawn figure as SVG, or as PNG if that would be large. The same figure gives the same bytes."""
+def data_uri(exhibit: Exhibit) -> tuple[str, str]:
+    """The drawn figure as SVG, or PNG if that would be large, with its caption. A figure gives the same bytes."""
     import matplotlib as mpl
+
+    from probe_kit.retention.displays.shown_figure import PRINT_DPI
 
     with exhibit.drawn() as figure, mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "path"}):
         svg = BytesIO()
         figure.savefig(svg, format="svg", metadata={"Date": None})
         if svg.tell() <= SVG_LIMIT:
-            return encode("image/svg+xml", svg.getvalue())
+            return encode("image/svg+xml", svg.getvalue()), caption_of(figure)
         png = BytesIO()
-        figure.savefig(png, format="png", dpi=_PIXELS_PER_INCH, metadata={"Software": None})
-        return encode("image/png", png.getvalue())
+        figure.savefig(png, format="png", dpi=PRINT_DPI, metadata={"Software": None})
+        return encode("image/png", png.getvalue()), caption_of(figure)
 
 
 def encode(kind: str, content: bytes) -> str:

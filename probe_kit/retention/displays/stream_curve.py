@@ -1,0 +1,109 @@
+"""The numbers of a layer curve: one stream's accuracy by layer, as a line per iteration or the best of them."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.retention.displays.selection import of_iterations
+from probe_kit.retention.displays.style import STREAM_NAMES
+from probe_kit.retention.measure import Iterations
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Shares = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LayerLine:
+    """Held-out accuracy by layer; arrays (L,), accuracies as shares with their 95 % interval over groups.
+
+    iteration: of all values, None where the stream runs once or where every layer has its best one.
+    significant: above chance, family-wise, and above the controls that were run.
+    """
+
+    iteration: int | None
+    layers: NDArray[np.int64]
+    accuracy: Shares
+    low: Shares
+    high: Shares
+    significant: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, rows: "pd.DataFrame", iteration: int | None = None) -> Self:
+        """From rows of `ProbeResults.scores`, one per layer."""
+        rows = rows.sort_values("layer")
+        accuracy, low, high = (rows[name].to_numpy(dtype=float) for name in ("accuracy", "ci_low", "ci_high"))
+        significant = rows["signal"].to_numpy(dtype=bool)
+        return cls(iteration, rows["layer"].to_numpy(dtype=np.int64), accuracy, low, high, significant)
+
+
+@dataclass(frozen=True)
+class StreamCurve:
+    """One stream's held-out accuracy by layer; arrays (L,), accuracies as shares. depth: the layer as a fraction.
+
+    accuracy: of the best of the iterations that are shown, with its 95 % interval `low`, `high` over groups.
+    least, most: over these iterations. significant: above chance, family-wise, and above the controls that were
+    run. iterations: how many are shown.
+    lines: what is drawn: one per iteration, or the best. peaks: (layer, iteration) of the most accurate sites, all
+    of them where several tie.
+    """
+
+    stream: str
+    layers: NDArray[np.int64]
+    depth: Shares
+    accuracy: Shares
+    low: Shares
+    high: Shares
+    least: Shares
+    most: Shares
+    significant: NDArray[np.bool_]
+    iterations: int
+    lines: tuple[LayerLine, ...]
+    peaks: tuple[tuple[int, int | None], ...]
+
+    @classmethod
+    def of(cls, scores: "pd.DataFrame", iterations: Iterations = "best") -> Self:
+        """From the rows of one category, view and stream of `ProbeResults.scores`.
+
+        Raises UsageError if the stream has no such iteration.
+        """
+        scores = of_iterations(scores, iterations)
+        by_layer = scores.groupby("layer")["accuracy"]
+        best_rows = scores.loc[by_layer.idxmax()].sort_values("layer")
+        best = LayerLine.of(best_rows)
+        steps = sorted(int(step) for step in scores["iteration"].dropna().unique())
+        each = tuple(LayerLine.of(scores[scores["iteration"] == step], step) for step in steps)
+        tied = scores[scores["accuracy"] >= scores["accuracy"].max() - 1e-12]
+        return cls(
+            stream=str(scores["stream"].iloc[0]),
+            layers=best.layers,
+            depth=best_rows["depth"].to_numpy(dtype=float),
+            accuracy=best.accuracy,
+            low=best.low,
+            high=best.high,
+            least=by_layer.min().to_numpy(dtype=float),
+            most=by_layer.max().to_numpy(dtype=float),
+            significant=best.significant,
+            iterations=len(steps) or 1,
+            lines=each if each and iterations != "best" else (best,),
+            peaks=tuple(
+                (int(layer), None if np.isnan(step) else int(step))
+                for layer, step in zip(tied["layer"], tied["iteration"].astype("float64"), strict=True)
+            ),
+        )
+
+    @property
+    def name(self) -> str:
+        """What people call the stream."""
+        return STREAM_NAMES.get(self.stream, self.stream)
+
+    @property
+    def label(self) -> str:
+        """The name, and which iterations are shown if not all are."""
+        if self.iterations > 1:
+            return f"{self.name}, best iteration" if len(self.lines) == 1 else self.name
+        step = self.lines[0].iteration
+        return self.name if step is None else f"{self.name}, iteration {step}"
