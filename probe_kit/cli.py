@@ -22,9 +22,10 @@ from probe_kit.hooks.commands import verify
 from probe_kit.retention.commands import retention
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import show, train
+from probe_kit.train.power_commands import power
 
 INTERRUPTED = 130
-ORDER = ("demo", "doctor", "models", "suite", "extract", "run", "train", "retention", "export", "verify")
+ORDER = ("demo", "doctor", "models", "suite", "extract", "run", "train", "power", "retention", "export", "verify")
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
@@ -143,7 +144,7 @@ def _before_commands(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)
-for command in (extract, export, demo, models, verify, train, retention, doctor):
+for command in (extract, export, demo, models, verify, train, power, retention, doctor):
     app.command()(command)
 
 

@@ -119,6 +119,7 @@ CONTROL_PARTS: dict[str, Sequence[Column]] = {
         ("position", baseline("position")),
         ("instruction", baseline("instruction")),
         ("pixels", baseline("pixels")),
+        ("binding", baseline("binding")),
     ],
     "Selectivity": [
         ("selectivity: backbone", lambda row: percent(row.prefix_selectivity)),

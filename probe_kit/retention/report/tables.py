@@ -207,7 +207,7 @@ _RETENTION = [
 
 _CONTROL_MEANINGS = {
     **dict.fromkeys(("position", "instruction", "pixels"), "position, instruction, pixels"),
-    "selectivity: backbone": "selectivity", "action": "selectivity", "backbone − twin": "twin",
+    "binding": "beats", "selectivity: backbone": "selectivity", "action": "selectivity", "backbone − twin": "twin",
     "action − twin": "twin",
 }  # fmt: skip
 

@@ -1,0 +1,180 @@
+"""Coverage of bounded and area retention, for one category and for the mean of twelve.
+
+    python benchmarks/retention_coverage.py [--draws 200] [--mean-draws 50] [--first-seed 0]
+
+Cells: correctness of two layouts of every item at 19 backbone and 10 × 18 expert sites, neighbours correlated,
+items 0.3, streams 0.25. The truth of `bounded` is the ratio of the best sites' true accuracies above chance,
+that of `area` the ratio of their means over all sites. The last ten worlds took no part in any choice made in
+the package.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.special import ndtri
+from threadpoolctl import threadpool_limits
+
+from probe_kit.hooks.sites import Site
+from probe_kit.retention.bounded import area_fit, bounded_fit
+from probe_kit.retention.crossfit import Crossfit, GroupScores
+from probe_kit.retention.estimates import Estimate, average, retention_draws
+from probe_kit.retention.measure import retention_interval
+
+LAYERS, ITERATIONS = 19, 10
+PLACES = (
+    [Site("backbone", layer) for layer in range(LAYERS)],
+    [Site("expert", layer, iteration=step) for step in range(ITERATIONS) for layer in range(LAYERS - 1)],
+)
+DEPTH = np.linspace(0, 1, LAYERS)
+Matrix = NDArray[np.float64]
+Shape = Callable[[Matrix], Matrix]
+
+
+def bump(centre: float, width: float) -> Shape:
+    """A peak of height 1."""
+    return lambda depth: np.exp(-0.5 * ((depth - centre) / width) ** 2)
+
+
+def plateau(start: float) -> Shape:
+    """0 before `start`, then 1."""
+    return lambda depth: (depth >= start).astype(float)
+
+
+@dataclass(frozen=True)
+class World:
+    """top: best backbone accuracy above chance; retention: the expert's share of it, grown over iterations."""
+
+    name: str
+    top: float
+    retention: float
+    backbone: Shape
+    expert: Shape
+    growth: tuple[float, float] = (0.8, 1.0)
+    items: int = 150
+    neighbours: float = 0.9
+
+    def above(self) -> tuple[Matrix, Matrix]:
+        """True accuracy above chance: (19,) of the backbone, (180,) of the expert."""
+        growth = np.linspace(*self.growth, ITERATIONS)[:, None]
+        expert = self.retention * self.top * growth * self.expert(DEPTH[1:])
+        return self.top * self.backbone(DEPTH), expert.ravel()
+
+    def truth(self) -> tuple[float, float]:
+        """Ratio of maxima, and of means."""
+        backbone, expert = self.above()
+        return float(expert.max() / backbone.max()), float(expert.mean() / backbone.mean())
+
+
+TUNING = tuple(
+    World(f"{strength}, {shape}, {retention:.2f}", top, retention, bump(2 / 3, width), bump(2 / 3, width))
+    for strength, top in (("strong", 0.25), ("weak", 0.12))
+    for shape, width in (("broad", 0.35), ("narrow", 0.15))
+    for retention in (0.25, 0.5, 0.8, 1.0)
+)[:15]
+OWN = (
+    World("plateaus", 0.3, 0.6, plateau(0.4), plateau(0.5)),
+    World("early backbone, late expert", 0.25, 0.5, bump(0.3, 0.2), bump(0.9, 0.2)),
+    World("expert falls over iterations", 0.3, 0.7, bump(0.6, 0.3), bump(0.4, 0.3), growth=(1.0, 0.2)),
+    World("expert rises from nothing", 0.3, 0.7, bump(0.6, 0.3), bump(0.8, 0.2), growth=(0.0, 1.0)),
+    World("60 items", 0.25, 0.6, bump(0.6, 0.3), bump(0.6, 0.3), items=60),
+    World("neighbours 0.3", 0.25, 0.6, bump(0.6, 0.3), bump(0.6, 0.3), neighbours=0.3),
+    World("two layers wide", 0.3, 0.5, bump(0.6, 0.07), bump(0.6, 0.07)),
+    World("very strong", 0.45, 0.9, bump(0.7, 0.3), bump(0.7, 0.3)),
+    World("expert twice as narrow", 0.3, 0.8, bump(0.6, 0.3), bump(0.6, 0.12)),
+    World("expert better than backbone", 0.2, 1.2, bump(0.6, 0.3), bump(0.6, 0.3)),
+)
+
+
+def correlated(generator: np.random.Generator, cells: int, columns: int, neighbours: float) -> Matrix:
+    """(cells, columns) normal values, those of neighbouring cells correlated."""
+    values = generator.standard_normal((cells, columns))
+    for cell in range(1, cells):
+        values[cell] = neighbours * values[cell - 1] + np.sqrt(1 - neighbours**2) * values[cell]
+    return values
+
+
+def draw(world: World, generator: np.random.Generator) -> tuple[GroupScores, GroupScores]:
+    """Backbone and expert of one data set, an item as the group."""
+    shared = generator.standard_normal(2 * world.items)
+    found = []
+    for above in world.above():
+        of_item = np.repeat(correlated(generator, above.size, world.items, world.neighbours), 2, axis=1)
+        own = correlated(generator, above.size, 2 * world.items, world.neighbours)
+        values = 0.5 * shared + np.sqrt(0.75) * (np.sqrt(0.3) * of_item + np.sqrt(0.7) * own)
+        found.append(GroupScores.of(values < ndtri(0.5 + above)[:, None], np.repeat(np.arange(world.items), 2)))
+    return found[0], found[1]
+
+
+def fits(world: World, seed: int) -> tuple[Crossfit, Crossfit]:
+    """Bounded and area fit of one data set."""
+    backbone, expert = draw(world, np.random.default_rng(seed))
+    return bounded_fit(backbone, expert, PLACES, 0.5, seed), area_fit(backbone, expert, 0.5, seed)
+
+
+def study(world: World, draws: int, first_seed: int) -> str:
+    """Median and coverage of both estimates over `draws` data sets."""
+    found = [fits(world, first_seed + number) for number in range(draws)]
+    parts = [f"{world.name:30}"]
+    for name, truth, of_kind in zip(("bounded", "area"), world.truth(), zip(*found, strict=True), strict=True):
+        intervals = [retention_interval(fit) for fit in of_kind]
+        covered = np.mean([interval.low <= truth <= interval.high for interval in intervals])
+        median = np.median([fit.expert / fit.backbone for fit in of_kind])
+        width = np.median([interval.high - interval.low for interval in intervals])
+        parts.append(f"{name} true {truth:.2f} median {median:.2f} covered {covered:4.0%} width {width:.2f}")
+    return "  ".join(parts)
+
+
+def mean_of_twelve(world: World, draws: int, first_seed: int) -> str:
+    """Coverage of the interval of a mean over twelve categories of one world."""
+    covered: list[list[bool]] = []
+    values: list[list[float]] = []
+    for number in range(draws):
+        found = [fits(world, first_seed + 12 * number + category) for category in range(12)]
+        means = [_mean(kind) for kind in zip(*found, strict=True)]
+        values.append([mean.value for mean in means])
+        covered.append([_covers(mean, truth) for mean, truth in zip(means, world.truth(), strict=True)])
+    (bounded, area), (value, area_value) = np.mean(covered, axis=0), np.mean(values, axis=0)
+    truth, area_truth = world.truth()
+    return (
+        f"{world.name:30}  bounded true {truth:.2f} mean {value:.2f} covered {bounded:4.0%}  "
+        f"area true {area_truth:.2f} mean {area_value:.2f} covered {area:4.0%}"
+    )
+
+
+def _mean(of_kind: Sequence[Crossfit]) -> Estimate:
+    return average(
+        [
+            Estimate(fit.expert / fit.backbone, retention_draws(fit, 0.5, category), category, fit.sizes.size)
+            for category, fit in enumerate(of_kind)
+        ]
+    )
+
+
+def _covers(mean: Estimate, truth: float) -> bool:
+    low, high = mean.ci
+    return low is None or high is None or low <= truth <= high
+
+
+def main() -> None:
+    """Run both studies and print each world as it ends."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--mean-draws", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=0)
+    arguments = parser.parse_args()
+    console = Console(width=170)
+    with threadpool_limits(1):
+        console.print(f"mean of twelve categories, {arguments.mean_draws} draws")
+        for world in (TUNING[2], TUNING[4], TUNING[10], OWN[0], OWN[6]):
+            console.print(mean_of_twelve(world, arguments.mean_draws, arguments.first_seed), highlight=False)
+        console.print(f"one category, {arguments.draws} draws")
+        for world in (*OWN, *TUNING):
+            console.print(study(world, arguments.draws, arguments.first_seed), highlight=False)
+
+
+if __name__ == "__main__":
+    main()
