@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from probe_kit.hooks.families.pi0.adapter import Pi0
     from probe_kit.suite import Suite
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: every core has a worker
+
 GOLDEN = Path(__file__).parent / "golden"
 SHARED = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[2] / "shared"))
 
@@ -41,6 +44,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
     A file's tests stay together: what a file sets up once is not set up once per core.
     """
+    if hasattr(config, "workerinput"):  # a core of its own already; it must not ask for more
+        return
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.option.collectonly
     if whole and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
