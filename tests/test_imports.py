@@ -30,10 +30,11 @@ EXTRACT = {
     "store": {"plan", "settings"},
     "plan": {"store"},
     "settings": {"store"},
+    "early": {"store", "plan", "settings"},
     "play": {"store", "plan", "settings"},
-    "prepared": {"store", "plan", "settings", "play"},
+    "prepared": {"store", "plan", "settings", "early", "play"},
     "crews": {"store", "plan", "settings", "play", "prepared"},
-    "extraction": {"store", "plan", "settings", "play", "prepared", "crews"},
+    "extraction": {"store", "plan", "settings", "early", "play", "prepared", "crews"},
 }
 
 READS_ONLY = (

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.errors import MissingExtraError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
-from probe_kit.hooks.machine import check_device_name, what_is_here
 from probe_kit.hooks.options import Option, check_options
+from probe_kit.machine import check_device_name, what_is_here
 
 if TYPE_CHECKING:
     from probe_kit.hooks.model import Model

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import MissingExtraError, UsageError
-from probe_kit.hooks.machine import check_device_name, what_is_here
+from probe_kit.machine import check_device_name, what_is_here
 
 Array = Any
 """A numpy array, or a torch tensor on any device."""

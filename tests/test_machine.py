@@ -4,9 +4,9 @@ import sys
 
 import pytest
 
+from probe_kit import machine
 from probe_kit.errors import UsageError
-from probe_kit.hooks import machine
-from probe_kit.hooks.machine import check_device_name, what_is_here
+from probe_kit.machine import check_device_name, what_is_here
 
 
 @pytest.mark.parametrize("device", ["nonsense", "cpu:", "cuda:x", "", "meta", "CUDA"])
@@ -30,7 +30,7 @@ def test_a_gpu_is_refused_only_where_there_surely_is_none(monkeypatch: pytest.Mo
 
 def test_nothing_of_it_imports_torch() -> None:
     code = (
-        "import sys; from probe_kit.hooks.machine import check_device_name as check, what_is_here; check('cpu'); "
+        "import sys; from probe_kit.machine import check_device_name as check, what_is_here; check('cpu'); "
         "print(what_is_here(), 'torch' in sys.modules)"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
