@@ -21,7 +21,15 @@ from probe_kit.hooks.families.spatialvla.speech import Speech
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.verify import Comparison, Produce, compare
-from probe_kit.models.spatialvla import STEP_TOKENS, Decoded, Seen, depth_input, point_places, prepare_picture
+from probe_kit.models.spatialvla import (
+    STEP_TOKENS,
+    Decoded,
+    Seen,
+    depth_input,
+    known_cameras,
+    point_places,
+    prepare_picture,
+)
 
 TOLERANCE = 5e-5
 Arrays = Mapping[str, NDArray[Any]]
@@ -60,7 +68,8 @@ class _Reference:
         """The ordinary adapter, listening to every one of `steps` tokens."""
         loaded = self.loaded
         speech = Speech.of(loaded.config, loaded.folder, None, lowercase=True, tokenizer=None)
-        return SpatialVLA(loaded, speech, choose_statistics(loaded, None), SCENE, steps, steps, constrained=False)
+        camera = _camera(loaded, self.recorded)
+        return SpatialVLA(loaded, speech, choose_statistics(loaded, None), camera, steps, steps, constrained=False)
 
     def produced(self) -> dict[str, Produce]:
         """How to make every output the adapter can make, whether recorded or not."""
@@ -196,6 +205,15 @@ class _Reference:
                 "actions_from_tok_ids": partial(policy.actions, chunk),
             }
         return produced
+
+
+def _camera(loaded: LoadedSpatialVLA, recorded: Arrays) -> str:
+    """Key of the recorded camera, whatever took the picture; `scene` if the checkpoint knows none like it."""
+    matrix = recorded.get("intrinsic_raw")
+    for key, camera in known_cameras(loaded.processor, loaded.processor_file).items():
+        if matrix is not None and np.array_equal(camera.matrix.astype(np.float32), matrix.astype(np.float32)):
+            return key
+    return SCENE
 
 
 def _steps(spoken: tuple[Decoded, Tape], policy: SpatialVLA) -> NDArray[Any]:

@@ -47,8 +47,12 @@ def test_full_size_keys_are_equal(golden_spatialvla: Path) -> None:
     assert verify_keys("spatialvla", golden_spatialvla / "real_keys.json.gz").passed
 
 
-def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path) -> None:
-    """Other patches, points, bins, chunk, tokens and padding, recorded from the network itself."""
+@pytest.mark.parametrize("own_camera", [True, False])
+def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path, own_camera: bool) -> None:
+    """Other patches, points, bins, chunk, tokens and padding, recorded from the network itself.
+
+    The original takes the data set's camera, which belongs to pictures of another size than the recorded one.
+    """
     vision = {**config_values()["vision_config"], "image_size": 64, "patch_size": 16, "num_hidden_layers": 3}
     write_checkpoint(
         tmp_path / "checkpoint",
@@ -60,7 +64,7 @@ def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path) 
         ego3d_patch_reso=4,
         n_freqs=5,
     )
-    recorded = _record(tmp_path / "checkpoint")
+    recorded = _record(tmp_path / "checkpoint", own_camera)
     np.savez(tmp_path / "reference.npz", **recorded)
     verification = verify_reference("spatialvla", tmp_path)
     assert {c.output: c.status for c in verification.comparisons} == dict.fromkeys(
@@ -72,14 +76,17 @@ def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path) 
 
 
 @torch.inference_mode()
-def _record(checkpoint: Path) -> dict[str, NDArray[np.generic]]:
+def _record(checkpoint: Path, own_camera: bool) -> dict[str, NDArray[np.generic]]:
     loaded = load_checkpoint(str(checkpoint), "cpu", None, random_weights=False)
     network, config = loaded.network, loaded.config
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (50, 80, 3), dtype=np.uint8)
-    camera = np.array([[90, 0, 41], [0, 80, 26], [0, 0, 1]], np.float32)
+    camera, width, height = np.array([[90, 0, 41], [0, 80, 26], [0, 0, 1]], np.float32), 80, 50
+    if not own_camera:
+        known = loaded.processor["intrinsic_config"]["default"]
+        camera, width, height = np.array(known["intrinsic"], np.float32), known["width"], known["height"]
     pixels = torch.from_numpy(prepare_picture(image, PictureSettings(config.side)))[None]
-    scaled = torch.from_numpy((camera * [[64 / 80], [64 / 50], [1]]).astype(np.float32))
+    scaled = torch.from_numpy((camera * [[64 / width], [64 / height], [1]]).astype(np.float32))
     seen = network.look(pixels, scaled)
     assert seen.depth is not None
     assert seen.points is not None
