@@ -76,7 +76,7 @@ def _choose(robot: str | None, known: Mapping[str, Any]) -> str:
     fitting = [name for name in known if name.startswith(wanted)]
     if len(fitting) != 1:
         raise UsageError(
-            f"no robot {wanted!r} in this checkpoint; choose --robot among {', '.join(sorted(known))}"
+            f"no robot {wanted!r} in this checkpoint; choose -M robot among {', '.join(sorted(known))}"
         )
     return fitting[0]
 

@@ -100,7 +100,12 @@ class InternVLA(QwenVLA):
 
     def _card(self, filled: Filled[InternVLANetwork], checkpoint: str, tokenizer: str | None) -> Card:
         units = self._units_or_reason()
-        named = isinstance(units, ActionUnits)
+        if isinstance(units, ActionUnits):
+            note = f"units of {units.key}"
+            settings = {"unnorm_key": units.key, "action_statistics": units.sha256}
+        else:
+            note = f"cannot act: {units}"
+            settings = {"unnorm_key": "none", "action_statistics": "none"}
         files = side_files(self.parts.place) | side_files(self.parts.vlm, "vlm/")
         if tokenizer is not None:
             files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
@@ -116,12 +121,11 @@ class InternVLA(QwenVLA):
             cameras=(CAMERA,),
             chunk=self.config.head.length,
             execute=1,
-            notes=(f"units of {units.key}" if isinstance(units, ActionUnits) else f"cannot act: {units}",),
+            notes=(note,),
             audit=filled.audit.to_json(),
             settings={
                 **content_hashes(files),
-                "unnorm_key": units.key if isinstance(units, ActionUnits) else "none",
-                "action_statistics": units.sha256 if named and isinstance(units, ActionUnits) else "none",
+                **settings,
                 "steps": str(len(self.schedule)),
                 "guidance": str(self.guidance),
             },

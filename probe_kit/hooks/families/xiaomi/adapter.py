@@ -8,6 +8,7 @@ its halves add, gated; `middle` is the normed sum between them.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -88,8 +89,12 @@ class Xiaomi(QwenVLA):
 
     def _card(self, filled: Filled[XiaomiNetwork], checkpoint: str, tokenizer: str | None) -> Card:
         units = self._units_or_reason()
-        known = isinstance(units, ActionUnits)
-        chunk = len(units.mean) if isinstance(units, ActionUnits) else self.config.action_length
+        if isinstance(units, ActionUnits):
+            chunk, note = len(units.mean), f"robot: {units.robot}"
+            settings = {"robot": units.robot, "action_statistics": units.sha256}
+        else:
+            chunk, note = self.config.action_length, f"cannot act: {units}"
+            settings = {"robot": "none", "action_statistics": "none"}
         files = side_files(self.folder)
         if tokenizer is not None:
             files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
@@ -105,14 +110,9 @@ class Xiaomi(QwenVLA):
             cameras=(CAMERA,),
             chunk=chunk,
             execute=min(EXECUTE, chunk),
-            notes=(f"robot: {units.robot}" if isinstance(units, ActionUnits) else f"cannot act: {units}",),
+            notes=(note,),
             audit=filled.audit.to_json(),
-            settings={
-                **content_hashes(files),
-                "robot": units.robot if isinstance(units, ActionUnits) else "none",
-                "action_statistics": units.sha256 if known and isinstance(units, ActionUnits) else "none",
-                "steps": str(self.steps),
-            },
+            settings={**content_hashes(files), **settings, "steps": str(self.steps)},
             weights_seed=filled.weights_seed,
         )
 
@@ -127,12 +127,12 @@ class Xiaomi(QwenVLA):
         except CheckpointError as error:
             return str(error)
 
-    @property
+    @cached_property
     def units(self) -> ActionUnits:
         """What gives actions their units and the chunk its length. Raises CheckpointError, UsageError."""
         return read_units(self.folder, self._robot, self.config.action_dim)
 
-    @property
+    @cached_property
     def robot(self) -> Robot:
         """How its scene is shown. Raises UsageError for one that Act2Answer's arm cannot stand in for."""
         return robot_of(self.units.robot)
