@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from probe_kit.train.folds import Fold, grouped_folds
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
+from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.paired import better_than_best, better_than_reference
 from probe_kit.train.permutation import family_p, flip_groups, flip_items, site_p
 from probe_kit.train.probe import OUTER_FOLDS, nested_folds, probe_site

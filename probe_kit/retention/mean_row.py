@@ -12,7 +12,7 @@ from probe_kit.retention.success import normalised_score
 _AVERAGED = (
     "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
     "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
-    "action_twin",
+    "action_twin", "action_first_accuracy",
 )  # fmt: skip
 
 
@@ -30,6 +30,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         run=first.run,
         model=first.model,
         label=first.label,
+        call=first.call,
         random_weights=first.random_weights,
         weights_sha256=first.weights_sha256,
         suite=first.suite,

@@ -24,6 +24,8 @@ class RetentionRow:
     which decides `regime`.
     prefix_beats, action_beats: whether the best site is better than `chance`, `binding` and `twin`, family-wise;
     None for a control that was not run.
+    action_first_accuracy, action_first_layer: the best layer at the first iteration, which sees pure noise; None
+    where the stream runs once. call: the captured inference that was probed, from 0.
     prefix_twin, action_twin: how much more accurate the best site is than that of `twin`.
     action_stream: `expert`, or `action` in a policy without one, whose iterations are action tokens.
     In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
@@ -101,6 +103,9 @@ class RetentionRow:
     retention_bounded_ci: tuple[float | None, float | None] | None = None
     retention_area: float | None = None
     retention_area_ci: tuple[float | None, float | None] | None = None
+    action_first_accuracy: float | None = None
+    action_first_layer: int | None = None
+    call: int | None = None
 
     @property
     def prefix_signal(self) -> bool:

@@ -96,6 +96,7 @@ def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
         "action_stream": first_of("action", run.streams.values()),
         "run_settings": run.settings_sha256,
         "probe_settings": None if results is None else results.key,
+        "call": None if results is None else results.settings.call,
     }
 
 
@@ -150,7 +151,21 @@ def _probes(curve: Curve, peaks: dict[str, Peak], success: SuccessRate, estimate
         found["gap"] = peaks["prefix"].accuracy - success.sr
     if "action" in peaks:
         found["action_iteration"] = peaks["action"].site.iteration
+        found |= _first_iteration(curve, peaks["action"])
     return found
+
+
+def _first_iteration(curve: Curve, peak: Peak) -> dict[str, Any]:
+    """The best layer where the stream has seen nothing of the action yet; nothing for a stream that runs once."""
+    if peak.site.iteration is None:
+        return {}
+    steps = [
+        site.iteration for site in curve.sites if site.stream == peak.site.stream and site.iteration is not None
+    ]
+    first = best_site(curve, peak.site.stream, min(steps))
+    return (
+        {} if first is None else {"action_first_accuracy": first.accuracy, "action_first_layer": first.site.layer}
+    )
 
 
 def _retention(retention: Retention | None) -> dict[str, Any]:

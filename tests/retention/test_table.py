@@ -119,3 +119,14 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
 
 FLOATS = ("sr", "delta", "accuracy", "_ci_", "retention", "p_", "depth", "gap", "chance", "score", "paired_p")
 TEXTS = ("retention_note",)
+
+
+def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:
+    """Late iterations hold the decision itself as a noisy action; the first sees pure noise."""
+    table = retention([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
+    row, mean = table.all_rows
+    assert row.action_first_accuracy is not None
+    assert row.action_accuracy is not None
+    assert row.action_first_accuracy < row.action_accuracy
+    assert (row.call, mean.call) == (0, 0)
+    assert mean.action_first_accuracy == row.action_first_accuracy
