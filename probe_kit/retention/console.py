@@ -28,7 +28,7 @@ from probe_kit.retention.cells import (
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
-from probe_kit.train.power import detectable
+from probe_kit.statistics.significance import detectable
 
 if TYPE_CHECKING:
     from rich.console import Group

@@ -9,6 +9,17 @@ SIGNIFICANCE = 0.05
 """Below this a p-value is called evidence; intervals cover one minus it."""
 
 
+def detectable(items: int, power: float = 0.8) -> float:
+    """Accuracy that a single baseline must have to be red in a share `power` of suites with so many items.
+
+    One-sided at 0.05, an item as one trial: its two layouts are one question. Raises UsageError without items.
+    """
+    if items < 1:
+        raise UsageError(f"{items} items show nothing; expected at least one")
+    reach = NormalDist().inv_cdf(1 - SIGNIFICANCE) + NormalDist().inv_cdf(power)
+    return min(1.0, 0.5 + reach * sqrt(0.25 / items))
+
+
 def chance_margin(n: float, alpha: float = SIGNIFICANCE) -> float:
     """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
     if n < 1:

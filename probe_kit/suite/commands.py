@@ -70,6 +70,9 @@ def validate(
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Also run the leakage gates: pixels, text and side alone.")
     ] = False,
+    power: Annotated[
+        bool, typer.Option("--power", help="Also say how strong a leak must be to be found at this size.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """Check every rule of the item format; exit code 1 if one is broken.
@@ -78,13 +81,27 @@ def validate(
     """
     from probe_kit.suite import default_suite, validate_suite
 
+    place = default_suite().folder if folder is None else folder
     with err.status("checking"):
-        report = validate_suite(default_suite().folder if folder is None else folder, baselines=baselines)
+        report = validate_suite(place, baselines=baselines)
+    least = _least_leaks(place) if power and not report.errors else {}
     if as_json:
-        print_json(report.to_json())
+        print_json(report.to_json() | ({"power": least} if power else {}))
     else:
+        for category, accuracy in least.items():
+            seen = f"{category}: a leak is found in 4 of 5 suites of this size from {100 * accuracy:.1f} % on"
+            out.print(seen, highlight=False, markup=False, soft_wrap=True)
         out.print(report.to_text(), highlight=False, markup=False, soft_wrap=True)
     raise typer.Exit(0 if report.ok else 1)
+
+
+def _least_leaks(folder: Path) -> dict[str, float]:
+    """By category, the accuracy from which on a baseline is found above chance in four of five suites."""
+    from probe_kit.statistics.significance import detectable
+    from probe_kit.suite import load_suite
+    from probe_kit.suite.suite import count_by_category
+
+    return {name: detectable(count) for name, count in count_by_category(load_suite(folder).items).items()}
 
 
 @app.command()

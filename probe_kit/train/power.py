@@ -32,17 +32,6 @@ class Power:
     twin: float
 
 
-def detectable(items: int, power: float = 0.8) -> float:
-    """Accuracy that a single baseline must have to be red in a share `power` of suites with so many items.
-
-    One-sided at 0.05, an item as one trial: its two layouts are one question.
-    """
-    if items < 1:
-        raise UsageError(f"{items} items show nothing; expected at least one")
-    reach = NormalDist().inv_cdf(1 - SIGNIFICANCE) + NormalDist().inv_cdf(power)
-    return min(1.0, 0.5 + reach * sqrt(0.25 / items))
-
-
 def simulate(items: int, above: float, sites: int = 19, draws: int = 200, seed: int = 0) -> Power:
     """Power by simulated correctness of `draws` experiments.
 

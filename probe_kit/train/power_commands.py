@@ -59,7 +59,7 @@ def power(
 
 def _print(found: "list[Power]") -> None:
     from probe_kit.fitting_tables import Cell, FittingTable, Part
-    from probe_kit.train.power import detectable
+    from probe_kit.statistics.significance import detectable
 
     headings = (
         "signal, points",

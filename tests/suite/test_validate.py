@@ -6,10 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import UsageError
+from probe_kit.statistics.significance import detectable
 from probe_kit.suite import Suite, load_suite, validate_suite
 from probe_kit.suite.pictures import encode_png
+from probe_kit.suite.suite import count_by_category
 
 Record = dict[str, Any]
 EditRecords = Callable[[Callable[[list[Record]], None]], Path]
@@ -139,3 +143,13 @@ def test_validation_changes_nothing(small_suite: Suite) -> None:
     validate_suite(small_suite.folder)
     assert load_suite(small_suite.folder).identity == before
     assert not (small_suite.folder / "baselines.json").exists()
+
+
+def test_validate_says_how_strong_a_leak_must_be_to_be_found(small_suite: Suite) -> None:
+    """A baseline that is at chance shows little where it could not have been seen above."""
+    found = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power", "--json"])
+    power = json.loads(found.stdout)["power"]
+    counts = count_by_category(small_suite.items)
+    assert power == {name: pytest.approx(detectable(count)) for name, count in counts.items()}
+    text = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power"]).stdout
+    assert "a leak is found in 4 of 5 suites" in text
