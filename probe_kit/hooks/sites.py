@@ -98,7 +98,7 @@ class Stream:
                 f"the adapter: Stream({self.name!r}, …, part='action')"
             )
         object.__setattr__(self, "part", part)
-        object.__setattr__(self, "label", self.label or _LABELS.get(self.name, self.name.replace("_", " ")))
+        object.__setattr__(self, "label", self.label or label_of(self.name))
 
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity, ordered by iteration, then layer.
@@ -119,6 +119,11 @@ class Stream:
 def part_of(stream: str) -> Part:
     """The part of a stream known by name only, as in results of 0.2; `backbone` if the name tells nothing."""
     return _KNOWN_PARTS.get(stream, "backbone")
+
+
+def label_of(stream: str) -> str:
+    """What people call a stream of which only the name is left."""
+    return _LABELS.get(stream, stream.replace("_", " "))
 
 
 def first_of(part: Part, streams: Iterable[Stream]) -> str | None:

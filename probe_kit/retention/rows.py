@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from probe_kit.hooks.sites import label_of
 from probe_kit.train.controls import signal
 
 MEAN = "mean"
@@ -120,4 +121,4 @@ class RetentionRow:
     @property
     def action_name(self) -> str:
         """What `action_stream` is called in a sentence."""
-        return "action tokens" if self.action_stream == "action" else "action expert"
+        return label_of(self.action_stream or "expert")

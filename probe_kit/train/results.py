@@ -107,6 +107,7 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
             "view": view,
             "site": str(site),
             "stream": site.stream,
+            "part": part,
             "layer": site.layer,
             "depth": curve.depth(site),
             "iteration": site.iteration,
@@ -132,5 +133,5 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
             "beats_twin": beats[row]["twin"],
             "signal": signal(beats[row]),
         }
-        for row, site in enumerate(curve.sites)
+        for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True))
     ]

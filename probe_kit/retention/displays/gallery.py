@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
     HeatTableDisplay,
@@ -192,7 +191,7 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
             position, partial(iteration_maps, results, view, stream),
         )
         for view in views
-        for stream in sorted(name for name in scores["stream"].unique() if part_of(name) == "action")
+        for stream in scores.loc[scores["part"] == "action", "stream"].unique()
         if ((scores["view"] == view) & (scores["stream"] == stream) & scores["iteration"].notna()).any()
     ]  # fmt: skip
     for stream, rows in scores.groupby("stream", sort=False):

@@ -7,14 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks.sites import part_of
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import (
     FILLED,
-    OTHER_STREAM,
-    STREAMS,
+    PARTS,
     axes_for,
     caption,
     legend_above,
@@ -44,6 +42,7 @@ class IterationMapDisplay(Shown):
     category: str
     view: str
     stream: str
+    part: str
     chance: float
     layers: NDArray[np.int64]
     iterations: NDArray[np.int64]
@@ -54,9 +53,9 @@ class IterationMapDisplay(Shown):
 
     @classmethod
     def from_results(
-        cls, results: ProbeResults, category: str, view: str | None = None, stream: str = "expert"
+        cls, results: ProbeResults, category: str, view: str | None = None, stream: str | None = None
     ) -> Self:
-        """From stored probes; view: the first probed one by default.
+        """From stored probes; view: the first probed one by default; stream: where the action is made.
 
         Raises UnknownSiteError for a view that was not probed or a stream without iterations,
         UnknownCategoryError for a category that was not probed.
@@ -64,6 +63,7 @@ class IterationMapDisplay(Shown):
         view = known_view(results, view)
         curve = curve_of(results, category, view)
         scores = scores_of(results, category, view)
+        stream = stream or curve.action_stream
         scores = scores[(scores["stream"] == stream) & scores["iteration"].notna()]
         if scores.empty:
             raise UnknownSiteError(f"stream {stream!r} in view {view!r} has no iterations; see the layer curve")
@@ -71,7 +71,8 @@ class IterationMapDisplay(Shown):
         return cls(
             category=category,
             view=view,
-            stream=stream,
+            stream=str(stream),
+            part=str(scores["part"].iloc[0]),
             chance=curve.chance,
             layers=grid["accuracy"].columns.to_numpy(dtype=np.int64),
             iterations=grid.index.to_numpy(dtype=np.int64),
@@ -102,7 +103,7 @@ class IterationMapDisplay(Shown):
         return self
 
 
-def iteration_maps(results: ProbeResults, view: str | None = None, stream: str = "expert") -> "Figure":
+def iteration_maps(results: ProbeResults, view: str | None = None, stream: str | None = None) -> "Figure":
     """A layer × iteration map of every category on one scale of colours.
 
     Raises UnknownSiteError for a view that was not probed or a stream without iterations.
@@ -129,7 +130,7 @@ def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMapp
     from matplotlib.patheffects import withStroke
 
     norm = Normalize(100 * display.chance, 100 * top)
-    colours = _colours(display.stream)
+    colours = _colours(display.part)
     image = axes.imshow(100 * display.accuracy, cmap=colours, norm=norm, aspect="auto", origin="lower")
     iterations, layers = display.accuracy.shape
     for iteration, layer in np.argwhere(display.significant):
@@ -151,13 +152,13 @@ def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMapp
     return image
 
 
-def _colours(stream: str) -> "Colormap":
-    """White at chance, through the stream's colour, to nearly black: lightness alone orders the cells."""
+def _colours(part: str) -> "Colormap":
+    """White at chance, through the part's colour, to nearly black: lightness alone orders the cells."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colour = STREAMS.get(stream, OTHER_STREAM).colour
-    dark = "#331400" if part_of(stream) == "action" else "#001B2E"
-    return LinearSegmentedColormap.from_list(stream, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
+    colour = PARTS[part].colour
+    dark = "#331400" if part == "action" else "#001B2E"
+    return LinearSegmentedColormap.from_list(part, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
 
 
 def _draw_legend(figure: "Figure") -> None:

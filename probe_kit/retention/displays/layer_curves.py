@@ -14,8 +14,7 @@ from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.retention.displays.style import (
     DPI,
-    OTHER_STREAM,
-    STREAMS,
+    PARTS,
     Line,
     caption,
     layer_axis,
@@ -192,7 +191,7 @@ def _colours() -> "Colormap":
     """From pale to dark through the action's colour: lightness alone orders the iterations."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    return LinearSegmentedColormap.from_list("iterations", ["#F7C79B", STREAMS["expert"].colour, "#3B1200"])
+    return LinearSegmentedColormap.from_list("iterations", ["#F7C79B", PARTS["action"].colour, "#3B1200"])
 
 
 def _finish(axes: "Axes", layers: int, title: str) -> None:
@@ -203,7 +202,7 @@ def _finish(axes: "Axes", layers: int, title: str) -> None:
 
 
 def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
-    line = STREAMS.get(curve.stream, OTHER_STREAM)
+    line = PARTS[curve.part]
     if len(curve.lines) == 1:
         draw_line(axes, curve.lines[0], line, curve.label, sidestep)
     else:

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks.sites import label_of
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import known_view, of_iterations, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import (
-    STREAM_NAMES,
     axes_for,
     caption,
     layer_axis,
@@ -91,7 +91,7 @@ class ModelDepthDisplay(Shown):
         if any(model.layers.max() < last for model in self.models):
             axes.set_xlabel("layer (of the deepest model)", fontsize=8.5)
         _draw_fractions(axes, last)
-        axes.set_title(STREAM_NAMES.get(self.stream, self.stream), fontsize=10, loc="left")
+        axes.set_title(label_of(self.stream), fontsize=10, loc="left")
         if figure is not None:
             axes.set_ylabel("accuracy above chance\n(points, mean of categories)", fontsize=9)
             legend_above(figure, axes.get_legend_handles_labels()[0])
@@ -106,7 +106,12 @@ def model_depths(
     """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
     from probe_kit.retention.displays.shown_figure import ShownFigure
 
-    streams = [name for name in STREAM_NAMES if any((one.scores["stream"] == name).any() for one in results)]
+    found = {
+        (str(part), str(name))
+        for one in results
+        for part, name in zip(one.scores["part"], one.scores["stream"], strict=True)
+    }
+    streams = [name for part in ("backbone", "action") for own, name in sorted(found) if own == part]
     displays = [ModelDepthDisplay.from_results(results, stream, view, iterations) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.sites import label_of
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.selection import curve_of, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.stream_curve import StreamCurve
 from probe_kit.retention.displays.style import (
-    STREAM_NAMES,
     axes_for,
     caption,
     layer_axis,
@@ -114,7 +114,7 @@ def role_curves(
 
 
 def _label(stream: str) -> str:
-    return f"held-out accuracy (%), {STREAM_NAMES.get(stream, stream)}"
+    return f"held-out accuracy (%), {label_of(stream)}"
 
 
 def _draw_legend(figure: "Figure", panel: "Axes") -> None:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.sites import label_of
 from probe_kit.retention.displays.selection import of_iterations
-from probe_kit.retention.displays.style import STREAM_NAMES
 from probe_kit.retention.measure import Iterations
 
 if TYPE_CHECKING:
@@ -44,6 +44,8 @@ class LayerLine:
 class StreamCurve:
     """One stream's held-out accuracy by layer; arrays (L,), accuracies as shares. depth: the layer as a fraction.
 
+    part: of the model, see `Stream.part`.
+
     accuracy: of the best of the iterations that are shown, with its 95 % interval `low`, `high` over groups.
     least, most: over these iterations. significant: above chance, family-wise, and above the controls that were
     run. iterations: how many are shown.
@@ -52,6 +54,7 @@ class StreamCurve:
     """
 
     stream: str
+    part: str
     layers: NDArray[np.int64]
     depth: Shares
     accuracy: Shares
@@ -79,6 +82,7 @@ class StreamCurve:
         tied = scores[scores["accuracy"] >= scores["accuracy"].max() - 1e-12]
         return cls(
             stream=str(scores["stream"].iloc[0]),
+            part=str(scores["part"].iloc[0]),
             layers=best.layers,
             depth=best_rows["depth"].to_numpy(dtype=float),
             accuracy=best.accuracy,
@@ -98,7 +102,7 @@ class StreamCurve:
     @property
     def name(self) -> str:
         """What people call the stream."""
-        return STREAM_NAMES.get(self.stream, self.stream)
+        return label_of(self.stream)
 
     @property
     def label(self) -> str:

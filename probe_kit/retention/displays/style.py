@@ -34,13 +34,15 @@ class Line:
     dash: str = "-"
 
 
-STREAMS = MappingProxyType(
-    {"backbone": Line(BLUE, "o"), "expert": Line(VERMILION, "s"), "action": Line(VERMILION, "D")}
+PARTS = MappingProxyType(
+    {
+        "backbone": Line(BLUE, "o"),
+        "action": Line(VERMILION, "s"),
+        "vision": Line(GREEN, "^"),
+        "bridge": Line(PURPLE, "D"),
+    }
 )
-OTHER_STREAM = Line(GREEN, "^")
-STREAM_NAMES = MappingProxyType(
-    {"backbone": "backbone", "expert": "action expert", "action": "action tokens", "answer": "answer tokens"}
-)
+"""How the streams of one part of a model are drawn."""
 
 SERIES = (
     Line(BLUE, "o"),
