@@ -20,9 +20,11 @@ from probe_kit.errors import (
     SuiteError,
     UsageError,
 )
-from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract import Extraction, ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract.crews.ray import RayActor
 from probe_kit.extract.play.stage import LocalStage
 from probe_kit.extract.play.stage_process import ProcessStage
+from probe_kit.extract.store.locate import locate
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
@@ -63,6 +65,30 @@ def test_an_arm_without_its_extra_is_said_before_anything_is_played(
         extract_run(settings, tmp_path / "run")
     assert caught.value.exit_code == 2
     assert not (tmp_path / "run").exists()
+
+
+def spoiled_after_planning(suite: Suite, tmp_path: Path, **how: object) -> Extraction:
+    """An extraction that is planned and begun, of a suite whose pictures then change: workers will find out."""
+    copy = Path(shutil.copytree(suite.folder, tmp_path / "suite"))
+    extraction = prepare(ExtractSettings("expert", suite=copy, scene=SHORT, env_workers=0, **how))
+    extraction.writer(locate(tmp_path / "run"))
+    for picture in copy.rglob("*.png"):
+        picture.write_bytes(b"not a picture")
+    return extraction
+
+
+def test_a_worker_process_hands_its_error_on(suite: Suite, tmp_path: Path) -> None:
+    extraction = spoiled_after_planning(suite, tmp_path, workers=1)
+    with pytest.raises(SuiteError, match="changed"):
+        extraction.run(tmp_path / "run")
+
+
+def test_a_ray_actor_answers_with_its_error_instead_of_dying(suite: Suite, tmp_path: Path) -> None:
+    """Raised, it would come back as one of Ray's, or as that of a dead actor, and cost episodes."""
+    extraction = spoiled_after_planning(suite, tmp_path)
+    answer = RayActor(extraction.settings, str(tmp_path / "run")).play([0])
+    assert isinstance(answer, SuiteError)
+    assert "changed" in str(answer)
 
 
 WITHOUT_MESHES = """

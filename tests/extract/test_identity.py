@@ -146,6 +146,12 @@ def test_the_versions_of_the_machine_are_those_of_the_packages() -> None:
     assert os.sep not in json.dumps(record), "no path of this machine"
 
 
+def test_who_plans_for_gpus_elsewhere_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    record = provenance.provenance_here("cuda:1", "bfloat16")
+    assert (record["device"], record["device_name"], record["dtype"]) == ("cuda", None, "bfloat16")
+
+
 def test_allowing_a_mix_is_no_part_of_the_identity(suite: Suite) -> None:
     plain, allowed = prepare(expert(suite)), prepare(replace(expert(suite), allow_mixed=True))
     assert plain.identity() == allowed.identity()

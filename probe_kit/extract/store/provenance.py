@@ -43,10 +43,11 @@ def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, 
     }
 
 
-def _gpu_name(device: str) -> str:
+def _gpu_name(device: str) -> str | None:
+    """None where the GPUs are elsewhere: whoever only plans has none, and workers speak for themselves."""
     import torch
 
-    return torch.cuda.get_device_name(device)
+    return torch.cuda.get_device_name(device) if torch.cuda.is_available() else None
 
 
 def _versions() -> dict[str, str | None]:
