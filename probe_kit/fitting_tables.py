@@ -74,7 +74,8 @@ class FittingTable:
 
         yield Text(self.title, style="italic")
         yield from self._tables(options.max_width)
-        yield Text(self.caption, style="dim")
+        if self.caption:
+            yield Text(self.caption, style="dim")
         yield Text()
 
     def _tables(self, width: int) -> "Iterator[Table | RenderableType]":
