@@ -1,3 +1,8 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -230,3 +235,12 @@ def test_worker_processes_give_the_same_observations_as_the_parent(shared_env):
     expected = shared_env.reset(seed=0)[0]["pixels"]["image"]
     for image in images:
         np.testing.assert_array_equal(image, expected)
+
+
+def test_the_documented_line_makes_the_environment_without_an_import_of_ours():
+    page = (Path(__file__).parents[2] / "docs" / "environment.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert "import probe_kit" not in example
+    code = f"{example}\nprint(type(env.unwrapped).__name__, observation.keys() == env.observation_space.keys())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "Act2AnswerEnv True\n"), done.stderr

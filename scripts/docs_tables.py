@@ -1,0 +1,109 @@
+"""The tables of README and docs that come from `docs/demo.json`, each between two comments of its page."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT / "docs" / "demo.json"
+README = ROOT / "README.md"
+PAGES = (ROOT / "docs" / "embedded.md",)
+TRAINED = "trained"
+
+_BLOCK = re.compile(r"(<!-- from docs/demo.json: (?P<name>[a-z]+) -->\n).*?(<!-- end of it -->)", re.DOTALL)
+Row = Mapping[str, Any]
+
+
+def filled(page: str, data: Mapping[str, Any]) -> str:
+    """The page with the content of every block made anew. Raises KeyError for a block that has no table."""
+    return _BLOCK.sub(lambda block: f"{block[1]}\n{_TABLES[block['name']](data)}\n\n{block[3]}", page)
+
+
+def blocks(page: str) -> list[str]:
+    """Names of the blocks a page has."""
+    return [block["name"] for block in _BLOCK.finditer(page)]
+
+
+def trained_table(data: Mapping[str, Any]) -> str:
+    """What the demo prints of the trained policy, a row per category."""
+    delta = _percent(data["delta"])
+    heading = ("demo", f"SR % (Δ {delta})", "backbone %, family-wise p", "action %", "bounded retention [95 %]")
+    return _table(heading, [_cells(row, "n/a (no backbone signal)") for row in _of(data, TRAINED)])
+
+
+def organisms_table(data: Mapping[str, Any]) -> str:
+    """The verdicts on all organisms; those of untrained ones in a line each, since nothing is to be seen."""
+    heading = (
+        "policy", "category", "expected", "measured", "SR %", "backbone %, p", "action %",
+        "bounded retention [95 %]",
+    )  # fmt: skip
+    lines: list[tuple[str, ...]] = []
+    for name in dict.fromkeys(row["organism"] for row in data["organisms"]):
+        rows = _of(data, name)
+        if len({(row["expected"], row["measured"], row["retention"]) for row in rows}) == 1 < len(rows):
+            lines.append(_joined(rows))
+        else:
+            lines += [_with_verdict(row) for row in rows]
+    true = sum(row["expected"] == row["measured"] for row in data["organisms"])
+    note = (
+        f"{data['episodes']} episodes per category, Δ = {_percent(data['delta'])} points, {data['permutations']} "
+        f"permutations: {true} of {len(data['organisms'])} verdicts are true."
+    )
+    return f"{_table(heading, lines)}\n\n{note}"
+
+
+_TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"trained": trained_table, "organisms": organisms_table}
+
+
+def _of(data: Mapping[str, Any], organism: str) -> list[Row]:
+    rows = [row for row in data["organisms"] if row["organism"] == organism]
+    order = {"color": 0, "shape": 1, "state": 2}
+    return sorted(rows, key=lambda row: order.get(row["category"], len(order)))
+
+
+def _table(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(line)} |" for line in (heading, ["---"] * len(heading), *lines))
+
+
+def _cells(row: Row, undefined: str) -> tuple[str, ...]:
+    return (
+        row["category"].capitalize(),
+        _percent(row["sr"]),
+        f"{_percent(row['backbone'])}, {row['p']:.3f}",
+        _percent(row["action"]),
+        _retention(row, undefined),
+    )
+
+
+def _with_verdict(row: Row) -> tuple[str, ...]:
+    category, *measures = _cells(row, "n/a")
+    return row["organism"], category, row["expected"], row["measured"], *measures
+
+
+def _joined(rows: Sequence[Row]) -> tuple[str, ...]:
+    first = rows[0]
+    least = min(row["p"] for row in rows)
+    return (
+        first["organism"], f"the same {len(rows)}", first["expected"], first["measured"], _span(rows, "sr"),
+        f"{_span(rows, 'backbone')}, ≥ {least:.3f}", _span(rows, "action"), _retention(first, "n/a"),
+    )  # fmt: skip
+
+
+def _span(rows: Sequence[Row], name: str) -> str:
+    low, high = (_percent(value) for value in (min(row[name] for row in rows), max(row[name] for row in rows)))
+    return low if low == high else f"{low} to {high}"
+
+
+def _percent(share: float) -> str:
+    """One decimal, none where it is zero."""
+    return f"{100 * share:.1f}".removesuffix(".0")
+
+
+def _retention(row: Row, undefined: str) -> str:
+    if row["retention"] is None:
+        return undefined
+    limits = row["retention_ci"]
+    if not limits or None in limits:
+        return f"{row['retention']:.2f} [unbounded]"
+    return f"{row['retention']:.2f} [{limits[0]:.2f}, {limits[1]:.2f}]".replace("-", "−")

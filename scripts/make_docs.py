@@ -1,0 +1,87 @@
+"""Make the tables and figures of README and docs that come from the demo: `python scripts/make_docs.py FOLDER`.
+
+FOLDER: what `probe-kit demo --compare --out FOLDER` makes; what is not there is made first (3 to 15 minutes on two
+cores). The numbers go to `docs/demo.json`, and from there, by `docs_tables`, into the pages; a test compares them.
+`--trained-only` makes again what concerns the trained policy alone and keeps the other organisms' stored numbers.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from docs_tables import DATA, PAGES, README, ROOT, filled
+from readme_picture import draw_picture
+
+from probe_kit.console import counter, progress
+from probe_kit.demo import PERMUTATIONS, compare_organisms, run_demo
+from probe_kit.organisms import TRAINED, Finding, NamedProgress, verdict
+from probe_kit.retention import RetentionRow
+from probe_kit.retention.rows import MEAN
+
+
+def main() -> None:
+    """Run what has to be run, then write numbers, tables and figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--trained-only", action="store_true")
+    asked = parser.parse_args()
+    with progress() as bar:
+        measure(asked.folder, asked.trained_only, lambda stage: counter(bar, stage))
+    for page in (README, *PAGES):
+        page.write_text(filled(page.read_text(), json.loads(DATA.read_text())))
+    draw_picture(asked.folder, json.loads(DATA.read_text())["probes"])
+    sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]
+    subprocess.run(sheet, check=True)
+
+
+def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
+    """Run the demo, and the other organisms unless told not to, and write `docs/demo.json`."""
+    made = run_demo(folder, stage)
+    rows = [row for row in made.table.rows if row.category != MEAN]
+    if trained_only:
+        stored = json.loads(DATA.read_text())["organisms"]
+        others = [one for one in stored if one["organism"] != TRAINED.name]
+        findings = [_finding(_of_trained(row)) for row in rows] + others
+    else:
+        findings = [_finding(one) for one in compare_organisms(folder, stage)]
+    content = {
+        "suite": made.run.suite,
+        "weights": made.run.weights_sha256,
+        "run_settings": made.run.settings_sha256,
+        "probes": rows[0].probe_settings,
+        "permutations": PERMUTATIONS,
+        "episodes": rows[0].n_episodes,
+        "delta": rows[0].delta,
+        "organisms": findings,
+    }
+    DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+
+
+def _of_trained(row: RetentionRow) -> Finding:
+    return Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
+
+
+def _finding(finding: Finding) -> dict[str, object]:
+    row = finding.row
+    return {
+        "organism": finding.organism,
+        "category": finding.category,
+        "expected": finding.expected,
+        "measured": finding.measured,
+        "sr": row.sr,
+        "backbone": row.prefix_accuracy,
+        "p": row.prefix_p_fwe,
+        "action": row.action_accuracy,
+        "retention": row.retention_bounded if row.retention_defined else None,
+        "retention_ci": _limits(row.retention_bounded_ci) if row.retention_defined else None,
+    }
+
+
+def _limits(interval: tuple[float | None, float | None] | None) -> list[float | None]:
+    return [None, None] if interval is None else list(interval)
+
+
+if __name__ == "__main__":
+    main()
