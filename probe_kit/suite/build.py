@@ -63,12 +63,16 @@ def default_suite(
 
     Arguments and errors are those of `build_suite`.
     """
-    options = _options(categories, items_per_category, seed)
-    key = _cache_key(options)
-    folder = _cache_folder() / "suites" / f"{SUITE_NAME}-{SUITE_VERSION}-{key}"
+    folder = default_folder(categories, items_per_category, seed)
     if folder.is_dir():
         return load_suite(folder)
     return build_suite(folder, categories, items_per_category, seed, progress)
+
+
+def default_folder(categories: Sequence[str] | None = None, items_per_category: int = 150, seed: int = 0) -> Path:
+    """Where `default_suite` keeps the suite of these arguments, whether it was built yet or not."""
+    key = _cache_key(_options(categories, items_per_category, seed))
+    return _cache_folder() / "suites" / f"{SUITE_NAME}-{SUITE_VERSION}-{key}"
 
 
 def _options(categories: Sequence[str] | None, items_per_category: int, seed: int) -> dict[str, Any]:

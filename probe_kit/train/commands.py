@@ -188,15 +188,15 @@ def _default_controls(suite: Path | None) -> "tuple[Baseline, ...]":
 
 
 def _embedded_suite(run: "RunReader") -> Path | None:
-    """Folder of the embedded suite, if the run's pictures come from it."""
+    """Folder of the embedded suite, if it was built here and the run's pictures come from it."""
     from probe_kit.errors import SuiteError
-    from probe_kit.suite import default_suite
+    from probe_kit.suite.build import default_folder
     from probe_kit.suite.generators.couples import SUITE_NAME
     from probe_kit.train.baselines import suite_of
 
-    if not run.suite.startswith(f"{SUITE_NAME}@"):
+    folder = default_folder()
+    if not run.suite.startswith(f"{SUITE_NAME}@") or not folder.is_dir():
         return None
-    folder = default_suite().folder
     try:
         suite_of(run, folder)
     except SuiteError:  # drawn with another seed or version
