@@ -12,7 +12,8 @@ def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
     """p: of the backbone's best site against chance."""
     chance = None if p is None else p < 0.05
     return RetentionRow(
-        "run", "pi0-tiny", False, "0" * 64, "suite@1", "s", "p", "color", "mean", 48, 24, sr,
+        run="run", model="pi0-tiny", random_weights=False, weights_sha256="0" * 64, suite="suite@1",
+        run_settings="s", probe_settings="p", category="color", view="mean", n_episodes=48, n_items=24, sr=sr,
         regime=regime(sr, 0.14, 1 - sr, 0.0)[0], prefix_accuracy=0.9, prefix_p_fwe=p,
         prefix_beats={"chance": chance, "binding": None, "twin": None} | beats,
     )  # fmt: skip

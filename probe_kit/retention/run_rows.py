@@ -3,17 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
 from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
-from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.row_parts import ActionPeak, BackbonePeak, Background, Behaviour, Kept, Source
+from probe_kit.retention.rows import Part, RetentionRow
 from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
-from probe_kit.train.controls import Controls
+from probe_kit.train.controls import Controls, TwinScore
 from probe_kit.train.curve import Curve
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
@@ -68,64 +69,63 @@ def _row(
     view: str | None,
 ) -> Drawn:
     success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
-    values = _identity(run, results) | _behaviour(success, sensitivity(episodes, settings.epsilons))
+    parts: list[Part] = [_source(run, results), _behaviour(success, sensitivity(episodes, settings.epsilons))]
     estimates = {"sr": sr_estimate(episodes, run.suite)}
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
-        peaks = _peaks(curve, settings.iterations)
-        beats = {
-            name: results.controls.beats(category, view, str(peak.site), peak.p_fwe)
-            for name, peak in peaks.items()
-        }
-        retention = measure_retention(curve, settings.iterations, settings.seed, beats.get("prefix"))
-        estimates |= probe_estimates(curve, peaks, retention, run.suite)
-        values |= _probes(curve, peaks, success, estimates) | _retention(retention)
-        values |= _controls(results.controls, category, view, curve.action_stream)
-        values |= {f"{name}_beats": found for name, found in beats.items()}
-    return Drawn(RetentionRow(**values, category=category, view=view, group=group), estimates)
+        probed = _Probed(results.controls, category, view, curve, _peaks(curve, settings.iterations))
+        retention = measure_retention(curve, settings.iterations, settings.seed, probed.beats.get("prefix"))
+        estimates |= probe_estimates(curve, probed.peaks, retention, run.suite)
+        parts += [
+            probed.backbone(estimates),
+            probed.action(estimates),
+            _kept(retention),
+            probed.background(success),
+        ]
+    return Drawn(RetentionRow.of(category, view, group, *parts), estimates)
 
 
-def _identity(run: RunReader, results: ProbeResults | None) -> dict[str, Any]:
-    return {
-        "run": str(run.location),
-        "model": run.model,
-        "label": run.label,
-        "random_weights": run.random_weights,
-        "weights_sha256": run.weights_sha256,
-        "suite": run.suite,
-        "action_stream": first_of("action", run.streams.values()),
-        "run_settings": run.settings_sha256,
-        "probe_settings": None if results is None else results.key,
-        "call": None if results is None else results.settings.call,
-    }
+def _source(run: RunReader, results: ProbeResults | None) -> Source:
+    return Source(
+        run=str(run.location),
+        model=run.model,
+        label=run.label,
+        random_weights=run.random_weights,
+        weights_sha256=run.weights_sha256,
+        suite=run.suite,
+        action_stream=first_of("action", run.streams.values()),
+        run_settings=run.settings_sha256,
+        probe_settings=None if results is None else results.key,
+        call=None if results is None else results.settings.call,
+    )
 
 
-def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> dict[str, Any]:
-    return {
-        "n_episodes": success.n_episodes,
-        "n_items": success.n_items,
-        "sr": success.sr,
-        "delta": success.delta,
-        "delta_items": success.delta_items,
-        "delta_regime": success.delta_regime,
-        "sr_ci": success.ci,
-        "sr_original": success.sr_original,
-        "sr_swapped": success.sr_swapped,
-        "sr_left": success.sr_left,
-        "sr_right": success.sr_right,
-        "p_wrong": success.p_wrong,
-        "p_oob": success.p_oob,
-        "p_never_moved": success.p_never_moved,
-        "p_flagged": success.p_flagged,
-        "regime": str(success.regime),
-        "regime_reason": success.reason,
-        "side_preference": success.side_preference,
-        "items_both_right": success.paired.both,
-        "items_one_right": success.paired.one,
-        "items_none_right": success.paired.none,
-        "paired_p": success.paired.p,
-        "sr_by_epsilon": {f"{radius:g}": rate for radius, rate in by_epsilon.items()},
-    }
+def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviour:
+    return Behaviour(
+        n_episodes=success.n_episodes,
+        n_items=success.n_items,
+        sr=success.sr,
+        delta=success.delta,
+        delta_items=success.delta_items,
+        delta_regime=success.delta_regime,
+        sr_ci=success.ci,
+        sr_original=success.sr_original,
+        sr_swapped=success.sr_swapped,
+        sr_left=success.sr_left,
+        sr_right=success.sr_right,
+        p_wrong=success.p_wrong,
+        p_oob=success.p_oob,
+        p_never_moved=success.p_never_moved,
+        p_flagged=success.p_flagged,
+        regime=str(success.regime),
+        regime_reason=success.reason,
+        side_preference=success.side_preference,
+        items_both_right=success.paired.both,
+        items_one_right=success.paired.one,
+        items_none_right=success.paired.none,
+        paired_p=success.paired.p,
+        sr_by_epsilon={f"{radius:g}": rate for radius, rate in by_epsilon.items()},
+    )
 
 
 def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
@@ -135,65 +135,102 @@ def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
     return {name: peak for name, peak in found.items() if peak is not None}
 
 
-def _probes(curve: Curve, peaks: dict[str, Peak], success: SuccessRate, estimates: Estimates) -> dict[str, Any]:
-    found: dict[str, Any] = {"n_groups": curve.n_groups, "chance": curve.chance}
-    for name, peak in peaks.items():
-        control = float(curve.control_accuracy[curve.sites.index(peak.site)])
-        found |= {
-            f"{name}_accuracy": peak.accuracy,
-            f"{name}_ci": estimates[f"{name}_accuracy"].ci,
-            f"{name}_layer": peak.site.layer,
-            f"{name}_depth": curve.depth(peak.site),
-            f"{name}_p_fwe": _number(peak.p_fwe),
-            f"{name}_selectivity": _number(peak.accuracy - control),
+@dataclass(frozen=True)
+class _Probed:
+    """The probes of one category in one view, and their best sites: `prefix` and `action`, as far as there are."""
+
+    controls: Controls
+    category: str
+    view: str
+    curve: Curve
+    peaks: dict[str, Peak]
+
+    @property
+    def beats(self) -> dict[str, dict[str, bool | None]]:
+        """Per best site, which controls it is better than."""
+        return {
+            name: self.controls.beats(self.category, self.view, str(peak.site), peak.p_fwe)
+            for name, peak in self.peaks.items()
         }
-    if "prefix" in peaks:
-        found["gap"] = peaks["prefix"].accuracy - success.sr
-    if "action" in peaks:
-        found["action_iteration"] = peaks["action"].site.iteration
-        found |= _first_iteration(curve, peaks["action"])
-    return found
+
+    def backbone(self, estimates: Estimates) -> BackbonePeak:
+        """Of the backbone's best site."""
+        peak, twin = self.peaks.get("prefix"), self._twin("backbone")
+        if peak is None:
+            return BackbonePeak()
+        return BackbonePeak(
+            prefix_accuracy=peak.accuracy,
+            prefix_ci=estimates["prefix_accuracy"].ci,
+            prefix_layer=peak.site.layer,
+            prefix_depth=self.curve.depth(peak.site),
+            prefix_p_fwe=_number(peak.p_fwe),
+            prefix_selectivity=self._selectivity(peak),
+            prefix_beats=self.beats["prefix"],
+            prefix_twin=None if twin is None else twin.difference,
+            prefix_twin_ci=None if twin is None else twin.ci,
+        )
+
+    def action(self, estimates: Estimates) -> ActionPeak:
+        """Of the best site where the action is made."""
+        peak, twin = self.peaks.get("action"), self._twin(self.curve.action_stream)
+        if peak is None:
+            return ActionPeak()
+        first = self._first_iteration(peak)
+        return ActionPeak(
+            action_accuracy=peak.accuracy,
+            action_ci=estimates["action_accuracy"].ci,
+            action_layer=peak.site.layer,
+            action_depth=self.curve.depth(peak.site),
+            action_iteration=peak.site.iteration,
+            action_p_fwe=_number(peak.p_fwe),
+            action_selectivity=self._selectivity(peak),
+            action_beats=self.beats["action"],
+            action_twin=None if twin is None else twin.difference,
+            action_twin_ci=None if twin is None else twin.ci,
+            action_first_accuracy=None if first is None else first.accuracy,
+            action_first_layer=None if first is None else first.site.layer,
+        )
+
+    def background(self, success: SuccessRate) -> Background:
+        """What the best sites are held against."""
+        baselines, prefix = self.controls.of_category(self.category), self.peaks.get("prefix")
+        twins = [self._twin(stream) for stream in ("backbone", self.curve.action_stream)]
+        return Background(
+            n_groups=self.curve.n_groups,
+            chance=self.curve.chance,
+            gap=None if prefix is None else prefix.accuracy - success.sr,
+            baselines={name: score.accuracy for name, score in baselines.items()},
+            leaks=tuple(name for name, score in baselines.items() if score.above_chance),
+            twin=next((twin.twin for twin in twins if twin is not None), None),
+        )
+
+    def _twin(self, stream: str | None) -> TwinScore | None:
+        return None if stream is None else self.controls.twin_peak(self.category, self.view, stream)
+
+    def _selectivity(self, peak: Peak) -> float | None:
+        return _number(peak.accuracy - float(self.curve.control_accuracy[self.curve.sites.index(peak.site)]))
+
+    def _first_iteration(self, peak: Peak) -> Peak | None:
+        """The best layer where the stream has seen nothing of the action yet; None for one that runs once."""
+        own = [site.iteration for site in self.curve.sites if site.stream == peak.site.stream]
+        steps = [step for step in own if step is not None]
+        return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
 
 
-def _first_iteration(curve: Curve, peak: Peak) -> dict[str, Any]:
-    """The best layer where the stream has seen nothing of the action yet; nothing for a stream that runs once."""
-    if peak.site.iteration is None:
-        return {}
-    steps = [
-        site.iteration for site in curve.sites if site.stream == peak.site.stream and site.iteration is not None
-    ]
-    first = best_site(curve, peak.site.stream, min(steps))
-    return (
-        {} if first is None else {"action_first_accuracy": first.accuracy, "action_first_layer": first.site.layer}
-    )
-
-
-def _retention(retention: Retention | None) -> dict[str, Any]:
+def _kept(retention: Retention | None) -> Kept:
     if retention is None:
-        return {"retention_note": "n/a (one stream only)"}
-    return {
-        "retention": _number(retention.plain),
-        "retention_defined": retention.defined,
-        "retention_note": retention.note,
-        "retention_debiased": _number(retention.debiased),
-        "retention_ci": _limits(retention.interval),
-        "retention_bounded": _number(retention.bounded),
-        "retention_bounded_ci": _limits(retention.bounded_interval),
-        "retention_area": _number(retention.area),
-        "retention_area_ci": _limits(retention.area_interval),
-    }
-
-
-def _controls(controls: Controls, category: str, view: str, action_stream: str | None) -> dict[str, Any]:
-    baselines = controls.of_category(category)
-    found: dict[str, Any] = {
-        "baselines": {name: score.accuracy for name, score in baselines.items()},
-        "leaks": tuple(name for name, score in baselines.items() if score.above_chance),
-    }
-    for name, stream in (("prefix", "backbone"), ("action", action_stream)):
-        if stream is not None and (score := controls.twin_peak(category, view, stream)) is not None:
-            found |= {"twin": score.twin, f"{name}_twin": score.difference, f"{name}_twin_ci": score.ci}
-    return found
+        return Kept(retention_note="n/a (one stream only)")
+    return Kept(
+        retention=_number(retention.plain),
+        retention_defined=retention.defined,
+        retention_note=retention.note,
+        retention_debiased=_number(retention.debiased),
+        retention_ci=_limits(retention.interval),
+        retention_bounded=_number(retention.bounded),
+        retention_bounded_ci=_limits(retention.bounded_interval),
+        retention_area=_number(retention.area),
+        retention_area_ci=_limits(retention.area_interval),
+    )
 
 
 def _limits(interval: Interval) -> Limits:
