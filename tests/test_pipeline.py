@@ -42,6 +42,7 @@ def _accept_new_sizes(run: Path, commit: Path) -> None:
     commit.write_text(json.dumps(content))
 
 
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> None:
     results = train_probes(planted_run, permutations=40, jobs=1)
     for category in ("color", "shape"):
@@ -58,6 +59,7 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
         assert row.random_weights
 
 
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_with_shuffled_labels_nothing_is_significant(planted_run: Run) -> None:
     results = train_probes(planted_run, permutations=40, target="shuffled", jobs=1)
     assert (results.scores["p_fwe"] >= 0.05).all()

@@ -1,5 +1,6 @@
 """`probe-kit retention`."""
 
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -53,6 +54,7 @@ def retention(
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
+    _refuse_doubles([path for paths in grouped.values() for path in paths])
     steps = _iterations(iterations)
     radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
     _check_places(html, figures)
@@ -105,6 +107,13 @@ def _keys(paths: list[str], chosen: list[str]) -> list[str | None]:
 
 def _place(path: str) -> str:
     return path.rstrip("/") if "://" in path else str(Path(path).resolve())
+
+
+def _refuse_doubles(paths: Sequence[str]) -> None:
+    """Said before anything is opened; `retention` also knows copies of a run."""
+    for at, path in enumerate(paths):
+        if _place(path) in map(_place, paths[:at]):
+            raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
 
 
 def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:

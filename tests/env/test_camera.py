@@ -17,7 +17,7 @@ def test_matrices_equal_those_of_pybullet():
 
 
 def test_the_focal_length_is_that_of_the_bridge_camera():
-    assert Camera(CameraSpec()).focal_length == pytest.approx(623.588, abs=0.001)
+    assert CameraSpec().focal_length == pytest.approx(623.588, abs=0.001)
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,7 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return open_run(writer.location)
 
 
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
 @pytest.mark.parametrize("sealed", [False, True])
 def test_every_inference_is_read_apart_and_missing_ones_are_nan(run: Run, sealed: bool) -> None:
     if sealed:
@@ -89,6 +90,7 @@ def test_an_inference_that_was_not_captured_is_refused(run: Run, call: int) -> N
         train_probes(run, permutations=0, call=call)
 
 
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_probes_are_of_the_inference_that_was_asked_for(run: Run) -> None:
     by_call = [train_probes(run, ("all",), permutations=5, call=call) for call in range(CALLS)]
     best = [results.scores["accuracy"].max() for results in by_call]
@@ -100,6 +102,7 @@ def test_probes_are_of_the_inference_that_was_asked_for(run: Run) -> None:
     assert len({results.key for results in by_call}) == CALLS
 
 
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run) -> None:
     first = train_probes(run, permutations=5)
     later = train_probes(run, permutations=5, call=1)
@@ -110,6 +113,7 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
     assert not any("other episodes" in note for note in table.notes)
 
 
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_token_views_of_a_later_inference_are_probed_too(run: Run) -> None:
     results = train_probes(run, ("all",), ("tokens:language",), permutations=0, token_permutations=0, call=2)
     assert int(results.scores["n"].iloc[0]) == run.reached(2).sum()

@@ -57,6 +57,7 @@ def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: py
     assert tree(copy) == before
 
 
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_columns_of_other_commits_are_not_used_until_sealed_again(copy: Path) -> None:
     (copy / "commits/00000005.json").unlink()
     run = open_run(copy, allow_partial=True)

@@ -31,6 +31,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
     )
 
 
+@pytest.mark.slow
 def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: Path) -> None:
     openvla = replace(
         settings,

@@ -86,6 +86,7 @@ def test_what_is_not_stored_is_named(recorded_run: Run, site: Site, view: str) -
         recorded_run.column(site, view)
 
 
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_a_flipped_bit_is_an_error_and_never_a_number(damaged: Path) -> None:
     chunk = next((damaged / "data.zarr/backbone/pooled/c/3").rglob("0"))
     while chunk.is_dir():

@@ -105,6 +105,7 @@ def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
         convert(str(run), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_the_converter_is_a_command(run: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "probe_kit.hooks.families.internvla.convert"]
     done = subprocess.run([*command, str(run), str(tmp_path / "out")], capture_output=True, text=True, check=False)
