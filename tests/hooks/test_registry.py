@@ -70,3 +70,27 @@ def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatc
 def test_the_seven_models_of_the_papers_tables_can_be_loaded_by_name() -> None:
     acting = {name for name, family in known_families().items() if family.acts}
     assert acting >= {"pi0", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0", "internvla-m1"}
+
+
+@pytest.mark.parametrize(
+    "error", [ImportError("no module named old"), SystemExit(1), UsageError("options have a type")]
+)
+def test_a_third_partys_family_that_breaks_is_named_and_takes_no_other_with_it(
+    monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def load() -> Family:
+        raise error
+
+    entry = SimpleNamespace(load=load, name="broken", value="theirs:FAMILY")
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    with pytest.warns(registry.BrokenFamilyWarning, match=f"'broken'.*{type(error).__name__}"):
+        known = known_families()
+    assert "pi0-tiny" in known
+    assert "broken" not in known
+
+
+def test_what_is_no_family_is_refused_by_its_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = SimpleNamespace(load=lambda: "pi0", name="text", value="theirs:NAME")
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    with pytest.warns(registry.BrokenFamilyWarning, match="it is a str, not a probe_kit.hooks.Family"):
+        known_families()
