@@ -121,7 +121,7 @@ class HeatTableDisplay(Shown):
         labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
         patches = [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
         figure.legend(
-            handles=patches, loc="outside lower left", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
+            handles=patches, loc="outside upper right", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
             columnspacing=1.2, borderaxespad=0.6, title=self.note, title_fontsize=7, alignment="left",
         )  # fmt: skip
 
