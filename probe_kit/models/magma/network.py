@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from transformers import DynamicCache, LlamaForCausalLM
 
+from probe_kit.models.building import build_empty
 from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
 from probe_kit.models.magma.pictures import Grid, Picture
@@ -176,20 +177,11 @@ def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -
     `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
     Raises CheckpointError if the parts do not fit together.
     """
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        with torch.device(device):
-            network = MagmaNetwork(config)
-    finally:
-        torch.set_default_dtype(before)
+    network = build_empty(lambda: MagmaNetwork(config), dtype, device)
     # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
     decoder = network.language_model.model
     decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
     network.language_model.tie_weights()
-    for name, parameter in network.named_parameters():
-        if name.endswith(".bias") and not parameter.is_meta:
-            nn.init.zeros_(parameter)  # torch would draw them from the global generator
     return network.eval()
 
 

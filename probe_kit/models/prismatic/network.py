@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from transformers import AutoModelForCausalLM, DynamicCache
 
+from probe_kit.models.building import build_empty
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
 
@@ -121,20 +122,11 @@ def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "
     device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
     """
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        with torch.device(device):
-            network = PrismaticNetwork(config)
-    finally:
-        torch.set_default_dtype(before)
+    network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
     # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
     decoder = network.language_model.model
     decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
     network.language_model.tie_weights()
-    for name, parameter in network.named_parameters():
-        if name.endswith(".bias") and not parameter.is_meta:
-            nn.init.zeros_(parameter)  # torch would draw them from the global generator
     return network.eval()
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, ZoeDepthForDepthEstimation
 
 from probe_kit.errors import UsageError, WeightsError
+from probe_kit.models.building import build_empty
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, estimate_depth, fill_depth_buffers
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project
@@ -197,17 +198,8 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
     `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet. `embed_actions` comes after
     the weights. Raises WeightsError if a part of transformers has a constant that would stay without memory.
     """
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        with torch.device(device):
-            network = SpatialVLANetwork(config)
-    finally:
-        torch.set_default_dtype(before)
+    network = build_empty(lambda: SpatialVLANetwork(config), dtype, device)
     _fill_buffers(network)
-    for name, parameter in network.named_parameters():
-        if name.endswith(".bias") and not parameter.is_meta:
-            nn.init.zeros_(parameter)  # torch would draw them from the global generator
     return network.eval()
 
 

@@ -1,4 +1,4 @@
-"""Building networks that hold one of transformers' Qwen vision-language models."""
+"""Building networks of transformers' and timm's parts without drawing weights that nobody should use."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,7 +23,7 @@ def build_empty[Network: nn.Module](
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for weights nobody should use yet. The rotary frequencies, which no
-    checkpoint holds, are then to be computed with `fill_rotary`.
+    checkpoint holds, are then to be computed, for Qwen's with `fill_rotary`.
     """
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
