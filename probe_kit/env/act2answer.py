@@ -20,6 +20,8 @@ from probe_kit.suite.items import Item, other_side
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
+LARGEST_SHIFT, LARGEST_TURN = 1.0, float(np.pi)
+"""Bounds of the action space, metres and radians, where the scene limits no action."""
 
 
 class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[misc]
@@ -46,7 +48,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         spec = spec or SceneSpec()
         self.scene_spec = spec
         self.render_mode = render_mode
-        largest = [spec.limits.translation] * 3 + [spec.limits.rotation] * 3
+        limits = spec.limits
+        shift = LARGEST_SHIFT if limits.translation is None else limits.translation
+        turn = LARGEST_TURN if limits.rotation is None else limits.rotation
+        largest = [shift] * 3 + [turn] * 3
         self.action_space = spaces.Box(
             np.array([*np.negative(largest), 0.0], np.float32), np.array([*largest, 1.0], np.float32)
         )
@@ -167,8 +172,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         spec = self.scene_spec
         xy = np.array(spec.cube_xy) + self.np_random.uniform(-spec.start_jitter, spec.start_jitter, 2)
         yaw = spec.cube_yaw + self.np_random.uniform(-spec.start_jitter_yaw, spec.start_jitter_yaw)
-        scene.reset(self._question.pictures, (float(xy[0]), float(xy[1]), spec.cube_side / 2), float(yaw))
-        if spec.start_grasped:
+        scene.reset(self._question.pictures, (float(xy[0]), float(xy[1]), spec.cube_start_z), float(yaw))
+        if spec.closing_steps:
+            scene.close_hand(spec.closing_steps)
+        elif spec.start_grasped:
             scene.put_cube_in_hand()
         self._frame = None
         return Trial(scene, self._question)
@@ -179,7 +186,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return self._frame
 
     def _info(self) -> Info:
-        trial, spec = self.trial, self.scene_spec
+        trial, scene = self.trial, self.scene
         record = trial.outcome()
         return {
             "outcome": record.zone if trial.over else None,
@@ -188,8 +195,8 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
             "cube_z": record.cube_z,
             "distance_correct": record.distance_correct,
             "distance_wrong": record.distance_wrong,
-            "tile_xy_correct": np.array(spec.tile_xy(record.side_correct)),
-            "tile_xy_wrong": np.array(spec.tile_xy(other_side(record.side_correct))),
+            "tile_xy_correct": np.array(scene.tile_xy(record.side_correct)),
+            "tile_xy_wrong": np.array(scene.tile_xy(other_side(record.side_correct))),
             "side_correct": record.side_correct,
             "side_placed": record.side_placed,
             "layout": record.layout,

@@ -7,7 +7,7 @@ import numpy as np
 from probe_kit.env.arm_models import ArmModel
 from probe_kit.env.bullet import BulletClient
 from probe_kit.env.kinematics import Pose, SerialChain
-from probe_kit.env.rotations import Array, to_rpy
+from probe_kit.env.rotations import Array, from_rpy, to_rpy
 from probe_kit.env.spec import XYZ, PhysicsSpec
 from probe_kit.errors import SceneError
 
@@ -81,9 +81,9 @@ class Arm:
         span = self.model.opened - self.model.closed
         return float(np.clip((middle - self.model.closed) / span, 0.0, 1.0))
 
-    def tool_down(self, position: XYZ) -> Pose:
-        """The pose with the tool at `position` and the gripper pointing down."""
-        return Pose(np.array(position), np.array(self.model.down))
+    def tool_down(self, position: XYZ, rpy: XYZ = (0.0, 0.0, 0.0)) -> Pose:
+        """The pose with the tool at `position` and the gripper pointing down, but for a turn `rpy`."""
+        return Pose(np.array(position), from_rpy(rpy) @ np.array(self.model.down))
 
     def _load(self, urdf: Path) -> int:
         client, model = self._client, self.model

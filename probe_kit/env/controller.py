@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from probe_kit.env.arm import Arm
 from probe_kit.env.kinematics import Pose
-from probe_kit.env.rotations import Array, from_rpy
-from probe_kit.env.spec import LimitSpec
+from probe_kit.env.rotations import Array, from_euler_xyz, from_rpy
+from probe_kit.env.spec import Euler, LimitSpec
 from probe_kit.errors import ActionError
 
 ACTION_SIZE = 7
@@ -25,6 +25,7 @@ class Move:
 
     q_from, q_to: (n,) commanded joints before and after. opening: 1 open, 0 closed.
     clipped: a limit changed the action. ik_error: metres that remain to the wanted position.
+    shift, turn: (3,) metres and radians by which the commanded pose really moved, in the words of the action.
     """
 
     q_from: Array
@@ -32,6 +33,8 @@ class Move:
     opening: float
     clipped: bool
     ik_error: float
+    shift: Array
+    turn: Array
 
 
 def check_action(action: ArrayLike) -> Array:
@@ -51,29 +54,40 @@ def check_action(action: ArrayLike) -> Array:
 
 
 class DeltaController:
-    """Keeps the commanded tool pose `target` and joints `q`, and moves both by one action at a time."""
+    """Keeps the commanded tool pose `target` and joints `q`, and moves both by one action at a time.
 
-    def __init__(self, arm: Arm, limits: LimitSpec, q: Array) -> None:
+    euler: how the rotation of an action is read, see `SceneSpec`.
+    """
+
+    def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:
         self._arm = arm
         self._limits = limits
-        self._low = np.maximum(limits.low, (-np.inf, -np.inf, arm.model.clearance))
+        floor = (-np.inf, -np.inf, arm.model.clearance)
+        self._low = None if limits.low is None else np.maximum(limits.low, floor)
+        self._rotation = from_euler_xyz if euler == "xyz" else from_rpy
         self.q = q
         self.target: Pose = arm.chain.pose(q)
 
     def command(self, action: Array) -> Move:
         """Advance the commanded pose by a checked action (7,), or hold it if the new one is out of reach."""
         limits = self._limits
-        shift = np.clip(action[:3], -limits.translation, limits.translation)
-        turn = np.clip(action[3:6], -limits.rotation, limits.rotation)
-        position = np.clip(self.target.position + shift, self._low, limits.high)
-        wanted = Pose(position, from_rpy(turn) @ self.target.rotation)
-        clipped = not np.allclose(position - self.target.position, action[:3], atol=1e-9) or bool(
-            (turn != action[3:6]).any()
-        )
+        shift, turn = _within(action[:3], limits.translation), _within(action[3:6], limits.rotation)
+        position = self.target.position + shift
+        if self._low is not None or limits.high is not None:
+            position = np.clip(position, self._low, limits.high)
+        shift = position - self.target.position
+        wanted = Pose(position, self._rotation(turn) @ self.target.rotation)
+        clipped = not np.allclose(shift, action[:3], atol=1e-9) or bool((turn != action[3:6]).any())
 
         q_from = self.q
         solution = self._arm.chain.solve(wanted, q_from, np.array(self._arm.model.posture))
         if solution.error <= limits.ik_error and solution.turn_error <= limits.ik_turn_error:
             self.q, self.target = solution.q, wanted
+        else:
+            shift, turn = np.zeros(3), np.zeros(3)
         opening = 1.0 if action[6] > OPEN_ABOVE else 0.0
-        return Move(q_from, self.q, opening, clipped, solution.error)
+        return Move(q_from, self.q, opening, clipped, solution.error, shift, turn)
+
+
+def _within(values: Array, largest: float | None) -> Array:
+    return values if largest is None else np.clip(values, -largest, largest)

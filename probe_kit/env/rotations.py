@@ -21,6 +21,11 @@ def from_rpy(rpy: ArrayLike) -> Array:
     )
 
 
+def from_euler_xyz(angles: ArrayLike) -> Array:
+    """Rotation matrix (3, 3) of Euler angles "XYZ" (3,): R = Rx(first) Ry(second) Rz(third)."""
+    return from_rpy(np.negative(angles)).T
+
+
 def to_rpy(R: Array) -> Array:
     """Roll, pitch, yaw (3,) of a rotation matrix (3, 3); at pitch = ±π/2 the roll is set to zero."""
     level = np.hypot(R[0, 0], R[1, 0])

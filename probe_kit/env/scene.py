@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
@@ -13,8 +14,9 @@ from probe_kit.env.arm_models import ARMS
 from probe_kit.env.background import load_photo, wooden_table
 from probe_kit.env.bullet import BulletClient
 from probe_kit.env.camera import Backdrop, Camera, Frame, Picture
-from probe_kit.env.rotations import Array, yaw_quaternion
-from probe_kit.env.spec import XYZ, SceneSpec
+from probe_kit.env.kinematics import Pose
+from probe_kit.env.rotations import Array, to_vector, yaw_quaternion
+from probe_kit.env.spec import XY, XYZ, SceneSpec
 from probe_kit.env.tiles import TextureCache, write_quad
 from probe_kit.errors import SceneError
 from probe_kit.suite.items import Side
@@ -30,6 +32,11 @@ TILE_COLOR = (0.85, 0.85, 0.83, 1.0)
 INVISIBLE = (0.0, 0.0, 0.0, 0.0)
 LIMBO = (0.0, 0.0, 5.0)
 """Where the cube waits in the saved state, so far up that it touches nothing."""
+TILE_LIMBO: Mapping[Side, XYZ] = MappingProxyType({"left": (0.0, 1.0, 5.0), "right": (0.0, -1.0, 5.0)})
+"""Likewise tiles that can be pushed."""
+GRAVITY = (0.0, 0.0, -9.81)
+HOME_ERROR = 0.001
+"""How far, in metres and radians / 10, `home_joints` may bring the tool from `home`."""
 GRASP_GAP = 0.003
 """Space between each finger and a cube that starts in the hand, before the fingers close, metres."""
 QUAD_LIFT = 0.0005
@@ -37,8 +44,8 @@ QUAD_LIFT = 0.0005
 
 
 @dataclass(frozen=True)
-class CubeState:
-    """Where the cube is: position (3,), quaternion (4,) as x, y, z, w, and linear speed in m/s."""
+class BodyState:
+    """Where cube or tile is: position (3,) of its middle, quaternion (4,) x, y, z, w, and linear speed in m/s."""
 
     position: Array
     quaternion: Array
@@ -78,10 +85,12 @@ class Scene:
         for side in SIDES:
             texture = self.textures.load(pictures[side])
             self.client.changeVisualShape(self.quads[side], -1, textureUniqueId=texture)
-        self.client.resetBasePositionAndOrientation(self.cube, cube_position, yaw_quaternion(cube_yaw))
-        self.client.resetBaseVelocity(self.cube, (0, 0, 0), (0, 0, 0))
-        self.arm.place(self.home_q, 1.0)
-        self.arm.command_gripper(1.0)
+        if self.spec.tile_mass > 0:
+            for side in SIDES:
+                self._put(self.tiles[side], self._tile_start(side), self.spec.tile_yaw)
+        self._put(self.cube, cube_position, cube_yaw)
+        self.arm.place(self.home_q, self.spec.home_opening)
+        self.arm.command_gripper(self.spec.home_opening)
 
     def advance(self, q_from: Array, q_to: Array, opening: float) -> bool:
         """Drive the arm from one commanded posture to the next in one action; False if the state broke."""
@@ -101,28 +110,56 @@ class Scene:
         around_cube = model.pads + self.spec.cube_side / 2 + GRASP_GAP
         self.arm.place(self.home_q, (around_cube - model.closed) / (model.opened - model.closed))
         client.resetBasePositionAndOrientation(self.cube, (x, y, z - model.hand_drop), yaw_quaternion(0.0))
-        client.setGravity(0, 0, 0)
-        self.advance(self.home_q, self.home_q, 0.0)
-        client.setGravity(0, 0, -9.81)
-        self.advance(self.home_q, self.home_q, 0.0)
+        self.close_hand(2)
 
-    def cube_state(self) -> CubeState:
+    def close_hand(self, actions: int) -> None:
+        """Close the hand at the home pose for so many actions, without gravity during the first.
+
+        With gravity, a cube that waits in the air falls 12 mm before the fingers reach it.
+        """
+        self.client.setGravity(0, 0, 0)
+        for _ in range(actions):
+            self.advance(self.home_q, self.home_q, 0.0)
+            self.client.setGravity(*GRAVITY)
+
+    def cube_state(self) -> BodyState:
         """Where the cube is now."""
-        position, quaternion = self.client.getBasePositionAndOrientation(self.cube)
-        velocity, _ = self.client.getBaseVelocity(self.cube)
-        return CubeState(np.array(position), np.array(quaternion), float(np.linalg.norm(velocity)))
+        return self._state(self.cube)
+
+    def tile_state(self, side: Side) -> BodyState:
+        """Where the tile that started on `side` is now."""
+        return self._state(self.tiles[side])
+
+    def tile_xy(self, side: Side) -> XY:
+        """Where the middle of that tile is now, in the plane."""
+        if self.spec.tile_mass == 0:
+            return self.spec.tile_xy(side)
+        x, y, _ = self.tile_state(side).position
+        return (float(x), float(y))
+
+    def finger_contacts(self) -> tuple[bool, bool]:
+        """Whether the left and the right finger touch the cube."""
+        contacts = self.client.getContactPoints(bodyA=self.arm.body, bodyB=self.cube)
+        touching = {contact[3] for contact in contacts}
+        left, right = self.arm.model.fingers
+        return left in touching, right in touching
 
     def is_grasped(self) -> bool:
         """Whether both fingers touch the cube."""
-        contacts = self.client.getContactPoints(bodyA=self.arm.body, bodyB=self.cube)
-        return set(self.arm.model.fingers) <= {contact[3] for contact in contacts}
+        return all(self.finger_contacts())
+
+    def touches_tile(self, side: Side) -> bool:
+        """Whether the cube touches the tile that started on `side`."""
+        return bool(self.client.getContactPoints(bodyA=self.cube, bodyB=self.tiles[side]))
 
     def is_on_tile(self) -> bool:
         """Whether the cube touches a tile."""
-        return any(self.client.getContactPoints(bodyA=self.cube, bodyB=tile) for tile in self.tiles.values())
+        return any(self.touches_tile(side) for side in SIDES)
 
     def frame(self) -> Frame:
         """Robot, cube and tiles as the camera sees them, without the table."""
+        if self.spec.tile_mass > 0:
+            self._lay_pictures()
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
     def picture(self, frame: Frame) -> Picture:
@@ -137,7 +174,7 @@ class Scene:
         """Load the table, whose picture is kept; the tiles, whose pixels are counted; the cube and the arm."""
         client, spec, folder = self.client, self.spec, Path(self._folder.name)
         client.resetSimulation()
-        client.setGravity(0, 0, -9.81)
+        client.setGravity(*GRAVITY)
         client.setPhysicsEngineParameter(
             fixedTimeStep=1 / spec.physics.rate,
             numSolverIterations=spec.physics.solver_iterations,
@@ -146,7 +183,7 @@ class Scene:
         self.textures = TextureCache(client, folder)
         self.table = self._box(TABLE_SIZE, TABLE_CENTRE, TABLE_COLOR)
         self.floor = self._box(FLOOR_SIZE, FLOOR_CENTRE, FLOOR_COLOR)
-        empty = self.frame()
+        empty = self.camera.render(client, spec.light, spec.light_level)
         self.backdrop = Backdrop(self._surroundings(empty), empty.depth)
         for body in (self.table, self.floor):
             client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
@@ -155,16 +192,40 @@ class Scene:
         model = ARMS[spec.arm]
         self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
         self.home_q = self._find_home()
-        self.arm.place(self.home_q, 1.0)
+        self.arm.place(self.home_q, spec.home_opening)
+        if spec.tile_mass > 0:
+            # Contacts of tiles survive restoreState: without this an episode depends on the one before.
+            for side in SIDES:
+                self._put(self.tiles[side], TILE_LIMBO[side], spec.tile_yaw)
         self._saved = client.saveState()
         self._healthy = True
 
     def _find_home(self) -> Array:
-        posture, limits = np.array(self.arm.model.posture), self.spec.limits
-        solution = self.arm.chain.solve(self.arm.tool_down(self.spec.home), posture, posture)
+        spec, posture, limits = self.spec, np.array(self.arm.model.posture), self.spec.limits
+        wanted = self.arm.tool_down(spec.home, spec.home_rpy)
+        if spec.home_joints is not None:
+            return self._checked_home(np.array(spec.home_joints), wanted)
+        solution = self.arm.chain.solve(wanted, posture, posture)
         if solution.error > limits.ik_error or solution.turn_error > limits.ik_turn_error:
-            raise SceneError(f"the {self.spec.arm} cannot reach its home {self.spec.home} with the gripper down.")
+            raise SceneError(f"the {spec.arm} cannot reach its home {spec.home} with the gripper down.")
         return solution.q
+
+    def _checked_home(self, q: Array, wanted: Pose) -> Array:
+        spec, count = self.spec, len(self.arm.model.joints)
+        if q.shape != (count,):
+            raise SceneError(
+                f"home_joints has {q.size} angles; the {spec.arm} has {count} joints. Give one for each."
+            )
+        pose = self.arm.chain.pose(q)
+        apart = float(np.linalg.norm(pose.position - wanted.position))
+        turned = float(np.linalg.norm(to_vector(pose.rotation @ wanted.rotation.T)))
+        if apart > HOME_ERROR or turned > 10 * HOME_ERROR:
+            raise SceneError(
+                f"home_joints bring the tool of the {spec.arm} to {pose.position.round(4).tolist()}, "
+                f"{1000 * apart:.1f} mm and {turned:.3f} rad from home {spec.home} with home_rpy {spec.home_rpy}. "
+                "Change one of them."
+            )
+        return q
 
     def _surroundings(self, empty: Frame) -> Picture:
         """Colours behind robot, cube and tiles; a photo gets darker and brighter with the light of the scene."""
@@ -186,8 +247,8 @@ class Scene:
         self.tiles: dict[Side, int] = {}
         self.quads: dict[Side, int] = {}
         for side in SIDES:
-            x, y = spec.tile_xy(side)
-            self.tiles[side] = self._box(size, (x, y, spec.tile_height / 2), TILE_COLOR, turn=turn)
+            x, y, z = self._tile_start(side)
+            self.tiles[side] = self._box(size, (x, y, z), TILE_COLOR, spec.tile_mass, turn)
             shape = self.client.createVisualShape(
                 self.client.GEOM_MESH, fileName=str(mesh), rgbaColor=(1, 1, 1, 1), specularColor=(0, 0, 0)
             )
@@ -196,6 +257,27 @@ class Scene:
             )
         bodies = self.camera.widened().render(self.client, spec.light, spec.light_level).bodies
         self._tile_pixels = {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
+
+    def _tile_start(self, side: Side) -> XYZ:
+        return (*self.spec.tile_xy(side), self.spec.tile_height / 2)
+
+    def _lay_pictures(self) -> None:
+        """Let the pictures follow tiles that were pushed; they touch nothing, so that it changes no motion."""
+        lift = self.spec.tile_height / 2 + QUAD_LIFT
+        for side in SIDES:
+            state = self.tile_state(side)
+            up = np.array(self.client.getMatrixFromQuaternion(state.quaternion)).reshape(3, 3)[:, 2]
+            place = (state.position + lift * up).tolist()
+            self.client.resetBasePositionAndOrientation(self.quads[side], place, state.quaternion.tolist())
+
+    def _put(self, body: int, position: XYZ, yaw: float) -> None:
+        self.client.resetBasePositionAndOrientation(body, position, yaw_quaternion(yaw))
+        self.client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
+
+    def _state(self, body: int) -> BodyState:
+        position, quaternion = self.client.getBasePositionAndOrientation(body)
+        velocity, _ = self.client.getBaseVelocity(body)
+        return BodyState(np.array(position), np.array(quaternion), float(np.linalg.norm(velocity)))
 
     def _box(
         self,

@@ -22,6 +22,7 @@ XY = tuple[float, float]
 XYZ = tuple[float, float, float]
 ArmName = Literal["panda", "widowx"]
 Rendering = Literal["raw", "visual-matching"]
+Euler = Literal["zyx", "xyz"]
 
 EPSILON_MARGIN = 0.01
 """What the default outcome radius adds to half a tile side, metres (the rule of VL-Think)."""
@@ -84,16 +85,27 @@ class LimitSpec:
     """What the controller accepts; anything beyond is clipped and counted.
 
     translation, rotation: largest change per action and axis. low, high: corners of the box the commanded
-    tool position stays in (its floor is raised to the finger clearance of the arm). ik_error, ik_turn_error:
-    what may remain to the wanted pose before the arm holds still instead of moving.
+    tool position stays in (its floor is raised to the finger clearance of the arm). None means no such limit;
+    without `low` nothing keeps the fingers off the table. ik_error, ik_turn_error: what may remain to the wanted
+    pose before the arm holds still instead of moving.
     """
 
-    translation: float = 0.10
-    rotation: float = 0.50
-    low: XYZ = (0.15, -0.30, 0.0)
-    high: XYZ = (0.50, 0.30, 0.40)
+    translation: float | None = 0.10
+    rotation: float | None = 0.50
+    low: XYZ | None = (0.15, -0.30, 0.0)
+    high: XYZ | None = (0.50, 0.30, 0.40)
     ik_error: float = 0.005
     ik_turn_error: float = 0.05
+
+    @classmethod
+    def off(cls) -> Self:
+        """No limit but the reach of the arm."""
+        return cls(translation=None, rotation=None, low=None, high=None)
+
+    def contain(self, position: XYZ) -> bool:
+        """Whether the box holds a tool position."""
+        above = self.low is None or all(a <= b for a, b in zip(self.low, position, strict=True))
+        return above and (self.high is None or all(a <= b for a, b in zip(position, self.high, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,17 @@ class SceneSpec:
     cube_xy, cube_yaw: where the cube starts, give or take `start_jitter` per axis and `start_jitter_yaw`,
     drawn uniformly from the seed of the episode. cube_side, cube_mass, cube_color (RGB in [0, 1]).
     epsilon: radius of the outcome zones around the tile centres; None means tile_side / 2 + 0.01.
-    home: tool position at the start, the gripper pointing down. start_grasped: begin with the cube in hand.
+    home: tool position at the start, the gripper pointing down but for `home_rpy` (roll, pitch, yaw about the
+    world axes). home_joints: the joint angles of that pose for `arm`; None to look for some. home_opening: of
+    the gripper at the start, 1 is open.
+    start_grasped: begin with the cube in hand. closing_steps: how it gets there; with 0 it is put in the middle of
+    the hand, otherwise it waits at `cube_xy` and `cube_z` (the height of its middle) until the hand has closed for
+    so many actions at rest, without gravity during the first, and counts as untouched from then on.
+    forced_closed: actions of an episode during which the gripper stays shut whatever is asked.
+    tile_mass: of each tile; 0 fixes them to the table. euler: how the rotation of an action is read, `zyx` as
+    roll, pitch, yaw about fixed axes or `xyz` in the opposite order.
+    scoring_side, box_margin, box_height: the box of the rule `box`, whatever size the tiles are drawn in. It
+    reaches scoring_side / 2 + box_margin from the middle of a tile along x and y, and up from box_height over it.
     max_steps: actions per episode. early_stop: end when the cube was released and lay still for 5 actions.
     moved: how far the cube must end from its start to count as moved.
     rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo (`background`; None means
@@ -134,7 +156,18 @@ class SceneSpec:
     start_jitter_yaw: float = 0.0
     epsilon: float | None = None
     home: XYZ = (0.292, -0.006, 0.16)
+    home_rpy: XYZ = (0.0, 0.0, 0.0)
+    home_joints: tuple[float, ...] | None = None
+    home_opening: float = 1.0
     start_grasped: bool = False
+    closing_steps: int = 0
+    cube_z: float | None = None
+    forced_closed: int = 0
+    tile_mass: float = 0.0
+    euler: Euler = "zyx"
+    scoring_side: float = 0.11
+    box_margin: float = 0.08
+    box_height: float = 0.008
     max_steps: int = 60
     early_stop: bool = False
     moved: float = 0.03
@@ -153,8 +186,9 @@ class SceneSpec:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> Self:
-        """A named scene, with fields replaced: `bridge` (default), `frontal` or `vl-think`.
+        """A named scene, with fields replaced: `bridge` (default), `frontal`, `vl-think` or `act2answer`.
 
+        Another arm than the preset's starts from the same pose of its tool, with joint angles of its own.
         Raises SceneError for an unknown name or field.
         """
         if name not in PRESETS:
@@ -164,12 +198,26 @@ class SceneSpec:
             near = get_close_matches(unknown[0], cls.__dataclass_fields__, n=1)
             hint = f"did you mean {near[0]!r}?" if near else "see `help(SceneSpec)` for all of them."
             raise SceneError(f"SceneSpec has no field {unknown[0]!r}; {hint}")
-        return replace(cls(name=name), **{**PRESETS[name], **changes})
+        fields = {**PRESETS[name], **changes}
+        other_arm = fields.get("arm", cls.arm) != PRESETS[name].get("arm", cls.arm)
+        if other_arm and "home_joints" not in changes:
+            fields["home_joints"] = None
+        return replace(cls(name=name), **fields)
 
     @property
     def zone_radius(self) -> float:
         """Radius of the outcome zones in metres: `epsilon`, or the rule when it is None."""
         return self.tile_side / 2 + EPSILON_MARGIN if self.epsilon is None else self.epsilon
+
+    @property
+    def box_half(self) -> float:
+        """Half the side of the box of the rule `box`, metres."""
+        return self.scoring_side / 2 + self.box_margin
+
+    @property
+    def cube_start_z(self) -> float:
+        """Height of the middle of the cube when it is put down, metres: `cube_z`, or lying on the table."""
+        return self.cube_side / 2 if self.cube_z is None else self.cube_z
 
     @property
     def picture_shape(self) -> tuple[int, int]:
@@ -193,10 +241,15 @@ class SceneSpec:
     def to_json(self) -> dict[str, Any]:
         """The record as plain JSON values, with the outcome radius that is really used.
 
-        A file is named by the sha256 of what is in it, because its path says nothing about that.
-        Raises SceneError if it cannot be read.
+        A file is named by the sha256 of what is in it, because its path says nothing about that. Fields that
+        came after the first stored runs are written only where they differ from the default: those runs keep their
+        identity.
+        Raises SceneError if a file cannot be read.
         """
         plain = asdict(self) | {"epsilon": self.zone_radius}
+        for name in _LATER:
+            if getattr(self, name) == type(self).__dataclass_fields__[name].default:
+                del plain[name]
         return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
 
     def _check_values(self) -> None:
@@ -208,16 +261,27 @@ class SceneSpec:
             "epsilon": self.zone_radius,
             "max_steps": self.max_steps,
             "light_level": self.light_level,
+            "scoring_side": self.scoring_side,
         }
         for name, value in positive.items():
             if not value > 0:
                 raise SceneError(f"{name} is {value}; expected a positive number.")
-        for name, choices in (("rendering", get_args(Rendering)), ("arm", get_args(ArmName))):
+        for name in ("closing_steps", "forced_closed", "tile_mass", "box_margin", "box_height"):
+            if not getattr(self, name) >= 0:
+                raise SceneError(f"{name} is {getattr(self, name)}; expected zero or a positive number.")
+        for name, options in (("rendering", Rendering), ("arm", ArmName), ("euler", Euler)):
+            choices = get_args(options)
             if getattr(self, name) not in choices:
                 raise SceneError(f"{name} {getattr(self, name)!r} does not exist; use {' or '.join(choices)}.")
-        low, home, high = self.limits.low, self.home, self.limits.high
-        if not all(a <= b <= c for a, b, c in zip(low, home, high, strict=True)):
-            raise SceneError(f"home {home} is outside the workspace {low} to {high}. Change `home` or `limits`.")
+        if not 0 <= self.home_opening <= 1:
+            raise SceneError(f"home_opening is {self.home_opening}; expected 0 (closed) to 1 (open).")
+        if self.closing_steps and not self.start_grasped:
+            raise SceneError("closing_steps close the hand around the cube; they need `start_grasped=True`.")
+        if not self.limits.contain(self.home):
+            low, high = self.limits.low, self.limits.high
+            raise SceneError(
+                f"home {self.home} is outside the workspace {low} to {high}. Change `home` or `limits`."
+            )
 
     def _check_zones(self) -> None:
         radius, gap = self.zone_radius, float(np.hypot(*np.subtract(self.tile_left, self.tile_right)))
@@ -233,6 +297,22 @@ class SceneSpec:
                     f"a cube that starts at {self.cube_xy} may lie in the zone of the tile at {tile} without "
                     "having been moved. Use a smaller `epsilon` or `start_jitter`, or start it elsewhere."
                 )
+
+
+# Fields that are newer than runs which are still read, see `SceneSpec.to_json`.
+_LATER = (
+    "home_rpy",
+    "home_joints",
+    "home_opening",
+    "closing_steps",
+    "cube_z",
+    "forced_closed",
+    "tile_mass",
+    "euler",
+    "scoring_side",
+    "box_margin",
+    "box_height",
+)
 
 
 def _content_sha256(path: Path) -> str:
@@ -256,6 +336,25 @@ PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(
             "cube_yaw": 0.505,
             "home": (0.292, 0.0, 0.16),
         },
+        "act2answer": {
+            "arm": "widowx",
+            "tile_side": 0.1452,
+            "tile_mass": 0.81,
+            "cube_xy": (0.2780, -0.0131),
+            "cube_z": 0.1430,
+            "cube_color": (0.784, 0.784, 0.784),
+            "home": (0.2921, -0.0061, 0.1349),
+            "home_rpy": (-0.0045, 0.0568, -0.0190),
+            "home_joints": (-0.01840777, 0.0398835, -0.22242722, -0.00460194, -1.36524296, 0.00153398),
+            "home_opening": 0.8,
+            "start_grasped": True,
+            "closing_steps": 10,
+            "forced_closed": 15,
+            "max_steps": 80,
+            "euler": "xyz",
+            "rendering": "visual-matching",
+            "limits": LimitSpec.off(),
+        },
     }
 )
 """What each named scene changes in the default one.
@@ -263,6 +362,8 @@ PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(
 bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs, so that the gripper
 hides nothing of either picture in the first frame, the one that probes read.
 vl-think: their home pose as well; the gripper then hides 4 % of the left picture.
+act2answer: the protocol that was released with the paper, as far as it can be had here; the cube is in the hand
+already, tiles are larger and can be pushed, and nothing limits an action.
 frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it, so that
 both pictures have the same size and shape on screen.
 """

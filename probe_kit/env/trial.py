@@ -1,5 +1,7 @@
 """One episode while it runs: it passes actions on to the arm, counts, and says when and how the episode ends."""
 
+import numpy as np
+
 from probe_kit.env.controller import DeltaController
 from probe_kit.env.outcome import Ending, Outcome, distance, zone
 from probe_kit.env.question import Question
@@ -17,12 +19,17 @@ REST_STEPS = 5
 
 
 class Trial:
-    """An episode of one question, started in a scene that was just reset."""
+    """An episode of one question, started in a scene that was just reset.
+
+    executed: the last action (7,) as it was carried out: after the limits, no motion where the arm could
+    not follow, and the gripper that was really commanded. None before the first.
+    """
 
     def __init__(self, scene: Scene, question: Question) -> None:
         self.scene = scene
         self.question = question
-        self.controller = DeltaController(scene.arm, scene.spec.limits, scene.home_q)
+        self.controller = DeltaController(scene.arm, scene.spec.limits, scene.home_q, scene.spec.euler)
+        self.executed: Array | None = None
         self.steps = 0
         self.clipped = 0
         self.ik_error = 0.0
@@ -40,7 +47,9 @@ class Trial:
     def advance(self, action: Array) -> None:
         """Carry out one checked action (7,)."""
         move = self.controller.command(action)
-        finite = self.scene.advance(move.q_from, move.q_to, move.opening)
+        opening = 0.0 if self.steps < self.scene.spec.forced_closed else move.opening
+        finite = self.scene.advance(move.q_from, move.q_to, opening)
+        self.executed = np.concatenate([move.shift, move.turn, [opening]])
         self.steps += 1
         self.clipped += move.clipped
         self.ik_error = move.ik_error
@@ -51,8 +60,8 @@ class Trial:
         """The record of the episode as it stands."""
         scene, question = self.scene, self.question
         xy = self._cube_xy()
-        to_correct = distance(xy, scene.spec.tile_xy(question.side_correct))
-        to_wrong = distance(xy, scene.spec.tile_xy(other_side(question.side_correct)))
+        to_correct = distance(xy, scene.tile_xy(question.side_correct))
+        to_wrong = distance(xy, scene.tile_xy(other_side(question.side_correct)))
         return Outcome(
             zone=zone(to_correct, to_wrong, scene.spec.zone_radius),
             layout=question.layout,

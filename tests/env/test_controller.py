@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from probe_kit.env import LimitSpec
 from probe_kit.env.controller import DeltaController, check_action
+from probe_kit.env.rotations import from_euler_xyz, from_rpy
 from probe_kit.errors import ActionError
 
 
@@ -80,3 +82,34 @@ def test_an_unreachable_pose_holds_the_arm_and_the_command(shared_env):
     assert move.ik_error > 3.0
     assert controller.target is before
     np.testing.assert_array_equal(move.q_to, scene.home_q)
+
+
+def test_what_really_moved_is_told_after_limits_and_out_of_reach(controller):
+    move = controller.command(action((0.01, 5.0, 0.02), turn=(0.1, 0, 3.0)))
+    np.testing.assert_allclose(move.shift, [0.01, 0.10, 0.02])
+    np.testing.assert_allclose(move.turn, [0.1, 0, 0.5])
+    held = [controller.command(action((0.1, 0, 0), turn=(0, 0.5, 0))) for _ in range(8)][-1]
+    assert held.ik_error > 0 or held.clipped
+    np.testing.assert_array_equal(held.q_to, held.q_from)
+    np.testing.assert_array_equal([*held.shift, *held.turn], np.zeros(6))
+
+
+def test_without_limits_an_action_is_carried_out_whole_and_nothing_keeps_the_hand_off_the_table(shared_env):
+    shared_env.reset(seed=0)
+    scene = shared_env.scene
+    controller = DeltaController(scene.arm, LimitSpec.off(), scene.home_q)
+    before = controller.target.position
+    moves = [controller.command(action(shift)) for shift in ((0.02, 0.15, 0), (0, 0, -0.17))]
+    assert not any(move.clipped for move in moves)
+    np.testing.assert_allclose(controller.target.position - before, [0.02, 0.15, -0.17], atol=1e-4)
+    assert controller.target.position[2] < 0
+
+
+@pytest.mark.parametrize(("euler", "rotation"), [("zyx", from_rpy), ("xyz", from_euler_xyz)])
+def test_the_rotation_of_an_action_is_read_in_the_order_of_the_scene(euler, rotation, shared_env):
+    shared_env.reset(seed=0)
+    scene, turn = shared_env.scene, (0.3, -0.2, 0.4)
+    controller = DeltaController(scene.arm, LimitSpec(), scene.home_q, euler)
+    before = controller.target.rotation
+    controller.command(action(turn=turn))
+    np.testing.assert_allclose(controller.target.rotation, rotation(turn) @ before, atol=1e-12)

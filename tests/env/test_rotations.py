@@ -2,7 +2,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from probe_kit.env.rotations import from_rpy, to_rpy, to_vector, yaw_quaternion
+from probe_kit.env.rotations import from_euler_xyz, from_rpy, to_rpy, to_vector, yaw_quaternion
 
 ANGLES = np.random.default_rng(0).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (50, 3))
 
@@ -38,3 +38,10 @@ def test_rotation_vector_is_axis_times_angle(angle):
 def test_yaw_quaternion_turns_x_to_y():
     R = np.reshape(pybullet.getMatrixFromQuaternion(yaw_quaternion(np.pi / 2)), (3, 3))
     np.testing.assert_allclose(R @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_euler_xyz_turns_about_the_axes_in_the_opposite_order():
+    for angles in ANGLES[:10]:
+        about_x, about_y, about_z = (from_rpy(part) for part in np.diag(angles))
+        np.testing.assert_allclose(from_euler_xyz(angles), about_x @ about_y @ about_z, atol=1e-12)
+        np.testing.assert_allclose(from_rpy(angles), about_z @ about_y @ about_x, atol=1e-12)

@@ -1,11 +1,12 @@
 import json
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError, fields, replace
 
 import pytest
 
-from probe_kit.env import SceneSpec
+from probe_kit.env import LimitSpec, SceneSpec
 from probe_kit.env.spec import PRESETS
 from probe_kit.errors import SceneError
+from probe_kit.identity import sha256_json
 
 
 @pytest.mark.parametrize(("side", "radius"), [(0.11, 0.065), (0.154, 0.087), (0.088, 0.054)])
@@ -41,6 +42,12 @@ def test_a_cube_that_starts_in_a_zone_is_refused():
         {"rendering": "raytraced"},
         {"arm": "ur5"},
         {"home": (0.6, 0.0, 0.2)},
+        {"euler": "yxz"},
+        {"home_opening": 1.2},
+        {"tile_mass": -1.0},
+        {"forced_closed": -1},
+        {"scoring_side": 0.0},
+        {"closing_steps": 3},
     ],
 )
 def test_values_that_make_no_sense_are_refused(changes):
@@ -70,6 +77,39 @@ def test_the_record_is_json_and_tells_what_differs():
     stored = json.loads(json.dumps(spec.to_json(), allow_nan=False))
     assert stored["epsilon"] == spec.zone_radius
     assert stored != replace(spec, max_steps=80).to_json()
+
+
+def test_the_record_of_a_scene_that_existed_before_newer_fields_holds_none_of_them():
+    stored = SceneSpec().to_json()
+    newer = {"home_joints", "home_rpy", "home_opening", "closing_steps", "cube_z", "forced_closed", "tile_mass"}
+    assert not (newer | {"euler", "scoring_side", "box_margin", "box_height"}) & set(stored)
+    assert SceneSpec(forced_closed=15).to_json() == stored | {"forced_closed": 15}
+    # The sha256 of the default record before these fields came.
+    assert sha256_json(stored) == "a57c6704c5688fcf03483aa779e31a0ecb34f372b66e03dbb03dbdcfe9c1cf8a"
+
+
+def test_every_newer_field_that_differs_from_its_default_is_in_the_record():
+    spec = SceneSpec.preset("act2answer", scoring_side=0.1, box_margin=0.05, box_height=0.01)
+    assert set(spec.to_json()) == {field.name for field in fields(SceneSpec)}
+
+
+def test_another_arm_takes_the_pose_of_the_preset_and_not_its_joints():
+    panda, widowx = (SceneSpec.preset("act2answer", arm=arm) for arm in ("panda", "widowx"))
+    assert widowx.home_joints is not None
+    assert panda.home_joints is None
+    assert (panda.home, panda.home_rpy) == (widowx.home, widowx.home_rpy)
+
+
+def test_the_box_of_the_release_does_not_follow_the_tile_that_is_drawn():
+    for side in (0.1452, 0.2033, 0.1162):
+        spec = SceneSpec.preset("act2answer", tile_side=side)
+        assert (spec.box_half, spec.box_height) == (pytest.approx(0.135), 0.008)
+        assert spec.zone_radius == pytest.approx(side / 2 + 0.01)
+
+
+def test_limits_that_are_off_take_any_home():
+    assert LimitSpec.off().contain((9.0, 9.0, -9.0))
+    assert not LimitSpec().contain((0.3, 0.0, -0.01))
 
 
 def test_the_record_names_a_photo_by_what_it_shows_and_not_by_where_it_lies(tmp_path):
