@@ -29,10 +29,11 @@ ROOMS = {
 EXTRACT = {
     "store": {"plan", "settings"},
     "plan": {"store"},
-    "settings": {"store"},
-    "early": {"store", "plan", "settings"},
-    "play": {"store", "plan", "settings"},
-    "prepared": {"store", "plan", "settings", "early", "play"},
+    "asking": set(),
+    "settings": {"store", "asking"},
+    "early": {"store", "plan", "settings", "asking"},
+    "play": {"store", "plan", "settings", "asking"},
+    "prepared": {"store", "plan", "settings", "early", "play", "asking"},
     "crews": {"store", "plan", "settings", "play", "prepared"},
     "extraction": {"store", "plan", "settings", "early", "play", "prepared", "crews"},
 }

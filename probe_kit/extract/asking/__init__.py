@@ -1,0 +1,1 @@
+"""Asking a model a question in words: prompts, what they name, what the answers say, and what the logits say."""
