@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from probe_kit.hooks.model import Model
 
 DTYPES = ("float32", "bfloat16")
+SIZE = "size"
+"""The option that chooses one of a family's `sizes`."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Family:
     config.json. packages: modules of an extra that it needs, with the name of that extra.
     unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
     `verify --keys` prints them.
+    source: name of the reader whose network this policy grew from, if it is one of ours. sizes: hub ids of the
+    released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
     none, and then only the loader knows one when it sees it. needs_checkpoint: nothing is there by default.
     Raises UsageError if an option is not declared as an `Option`.
@@ -55,6 +59,8 @@ class Family:
     packages: tuple[tuple[str, str], ...] = ()
     config_types: tuple[str, ...] = ()
     needs_checkpoint: bool = False
+    source: str | None = None
+    sizes: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -63,6 +69,10 @@ class Family:
                     f"the family {self.name} declares its option as {option!r}; since 0.3 options have a type and "
                     f"help: Option({str(option)!r}, str, 'what it does') from probe_kit.hooks"
                 )
+        if self.sizes:
+            names = tuple(name for name, _ in self.sizes)
+            size = Option(SIZE, str, "Which of the released sizes, instead of --checkpoint.", names[0], names)
+            object.__setattr__(self, "options", (*self.options, size))
 
     def load(
         self,
@@ -79,13 +89,14 @@ class Family:
         Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
         """
         chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
+        place = self.place(checkpoint, chosen.pop(SIZE, None))
         check_machine(device, dtype)
         load = imported(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
-        model: Model = load(checkpoint or self.default_checkpoint, device, dtype, random_weights, **chosen)
+        model: Model = load(place, device, dtype, random_weights, **chosen)
         # What an adapter does not say of its options itself is part of the identity all the same.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
         model.card = replace(model.card, settings={**said, **model.card.settings})
@@ -115,12 +126,23 @@ class Family:
             raise MissingExtraError(
                 f"{self.name} needs {module}, which is not installed; `pip install 'probe-kit[{extra}]'`"
             )
-        place = checkpoint or self.default_checkpoint
+        place = self.place(checkpoint, chosen.get(SIZE))
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if place is not None and self.config_types:
             check_files(checkpoint_folder(place), self.config_types, weights=not random_weights)
         return chosen
+
+    def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
+        """What is loaded: `checkpoint`, that of a `size`, or the default. Raises UsageError for both at once."""
+        if size is None:
+            return checkpoint or self.default_checkpoint
+        if checkpoint is not None:
+            raise UsageError(
+                f"a checkpoint ({checkpoint}) and -M size={size} were given; a size stands for a checkpoint, so "
+                "leave one of them out"
+            )
+        return dict(self.sizes)[size]
 
     def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""

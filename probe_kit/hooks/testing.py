@@ -37,7 +37,7 @@ from probe_kit.errors import (
     WeightsError,
 )
 from probe_kit.hooks.capture_context import capture, edit
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.family import SIZE, Family
 from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.registry import find_family
@@ -346,7 +346,7 @@ class ModelContract:
         assert before.settings != after.settings
 
     def test_every_option_reaches_the_card(self, checkpoint: Path, other_options: Mapping[str, Any]) -> None:
-        declared = {option.name for option in self._family.options} - self.unloadable_options
+        declared = {option.name for option in self._family.options} - self.unloadable_options - {SIZE}
         assert declared <= other_options.keys(), "name another value of every option in `other_options`"
         plain = self.load(checkpoint).card.settings
         for name in sorted(declared):
@@ -444,7 +444,9 @@ class AdapterContract(ModelContract):
 class ReaderContract(ModelContract):
     """What the rest of probe_kit relies on in a `Reader`."""
 
-    question_options: ClassVar[tuple[str, ...]] = (" A", " B")
+    letters: ClassVar[tuple[str, ...]] = ("A", "B")
+    other_words: ClassVar[str] = " please"
+    """What makes a question longer, in words that the tokenizer knows."""
 
     @pytest.fixture
     def reader(self, checkpoint: Path) -> Reader:
@@ -460,7 +462,14 @@ class ReaderContract(ModelContract):
 
     def questions(self, seen: Sequence[Observation]) -> list[Question]:
         """The observations' instructions as questions."""
-        return [Question(own, own.instruction, self.question_options) for own in seen]
+        return [Question(own, own.instruction, self.letters) for own in seen]
+
+    def led(self, reader: Reader, questions: Sequence[Question]) -> list[Question]:
+        """With options as they stand behind the frame."""
+        return [
+            own if own.begun else replace(own, options=tuple(reader.lead + letter for letter in own.options))
+            for own in questions
+        ]
 
     def run(self, model: Model, seen: Sequence[Observation]) -> NDArray[np.float32]:
         """The logits of the options."""
@@ -469,18 +478,21 @@ class ReaderContract(ModelContract):
     def roles_of(self, model: Model, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the questions asked about them."""
         assert isinstance(model, Reader)
-        return model.asked_roles(self.questions(seen))
+        return model.asked_roles(self.led(model, self.questions(seen)))
 
     def _read(self, model: Model, seen: Sequence[Observation]) -> Reading:
         assert isinstance(model, Reader)
-        return model.read(self.questions(seen))
+        return model.read(self.led(model, self.questions(seen)))
+
+    def _ask(self, reader: Reader, questions: Sequence[Question]) -> NDArray[np.float32]:
+        return reader.read(self.led(reader, questions)).option_logits
 
     def test_a_reading_has_a_logit_per_option_and_their_mass_is_a_share(
         self, reader: Reader, observations: list[Observation]
     ) -> None:
         seen = self.shown(reader, observations)
         reading = self._read(reader, seen)
-        assert reading.option_logits.shape == (len(seen), len(self.question_options))
+        assert reading.option_logits.shape == (len(seen), len(self.letters))
         assert reading.option_mass.shape == (len(seen),)
         assert ((reading.option_mass > 0) & (reading.option_mass <= 1)).all()
 
@@ -492,3 +504,60 @@ class ReaderContract(ModelContract):
         assert first == reader.speak(self._read(reader, seen), 4)
         assert len(first) == len(seen)
         assert all(isinstance(text, str) for text in first)
+
+    def test_speaking_does_not_use_a_reading_up(self, reader: Reader, observations: list[Observation]) -> None:
+        reading = self._read(reader, self.shown(reader, observations))
+        assert reader.speak(reading, 4) == reader.speak(reading, 4)
+        assert reader.speak(reading, 0) == [""] * len(reading.option_logits)
+
+    def test_rows_in_another_order_are_answered_alike(
+        self, reader: Reader, observations: list[Observation]
+    ) -> None:
+        if reader.card.batch == 1:
+            pytest.skip(f"{reader.card.family} reads one question at a time")
+        questions = self.questions(observations)
+        forth, back = self._ask(reader, questions), self._ask(reader, questions[::-1])
+        np.testing.assert_allclose(forth, back[::-1], atol=self.tolerance)
+
+    def test_a_far_longer_neighbour_changes_nothing(self, reader: Reader, observations: list[Observation]) -> None:
+        if reader.card.batch == 1:
+            pytest.skip(f"{reader.card.family} reads one question at a time")
+        short = self.questions(observations)[0]
+        longer = replace(short, text=short.text + self.other_words * 6)
+        together, alone = self._ask(reader, [short, longer]), self._ask(reader, [short])
+        np.testing.assert_allclose(together[0], alone[0], atol=self.tolerance)
+        spoken = [reader.speak(reader.read(self.led(reader, asked)), 4)[0] for asked in ([short, longer], [short])]
+        assert spoken[0] == spoken[1]
+
+    def test_without_a_picture_nothing_of_it_is_left(
+        self, reader: Reader, observations: list[Observation]
+    ) -> None:
+        """Also right behind questions about pictures: no state may stay from call to call."""
+        asked = [replace(own, pictured=False) for own in self.questions(self.shown(reader, observations))]
+        other = [replace(own, seen=replace(own.seen, image=255 - own.seen.image)) for own in asked]
+        before = self._ask(reader, asked)
+        self._read(reader, self.shown(reader, observations))
+        np.testing.assert_array_equal(before, self._ask(reader, other))
+        for rows in reader.asked_roles(self.led(reader, asked)).values():
+            assert not any(row.mask("image").any() for row in rows)
+
+    def test_questions_with_and_without_a_picture_do_not_go_together(
+        self, reader: Reader, observations: list[Observation]
+    ) -> None:
+        first, second = self.questions(observations)
+        with pytest.raises((UsageError, ObservationError)):
+            self._ask(reader, [first, replace(second, pictured=False)])
+
+    def test_options_that_begin_alike_are_refused(self, reader: Reader, observations: list[Observation]) -> None:
+        twice = replace(self.questions(observations)[0], options=(self.letters[0], self.letters[0]))
+        with pytest.raises(UsageError, match="same token"):
+            self._ask(reader, [twice])
+
+    def test_a_choice_that_rounding_decides_is_a_near_tie(
+        self, reader: Reader, observations: list[Observation]
+    ) -> None:
+        reading = self._read(reader, self.shown(reader, observations))
+        rows = len(reading.option_logits)
+        apart = np.tile(np.array([[0.0, 9.0]], np.float32), (rows, 1))
+        assert not reader.near_ties(replace(reading, option_logits=apart)).any()
+        assert reader.near_ties(replace(reading, option_logits=apart * 1e-6)).all()

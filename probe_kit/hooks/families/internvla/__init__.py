@@ -13,6 +13,7 @@ FAMILIES = (
         embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
         verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
+        source="qwen2.5-vl",
         full_size="probe_kit.models.internvla:full_size_internvla",
         hub=(
             ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),

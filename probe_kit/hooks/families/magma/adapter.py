@@ -216,15 +216,16 @@ class Magma(Policy, Reader):
         self.check([question.seen for question in questions])
         prompts = [self._question(question).ids for question in questions]
         options = [
-            [self.text.option(question.text, question.begun, option) for option in question.options]
-            for question in questions
+            [self.text.option(own.text, own.begun, option, own.pictured) for option in own.options]
+            for own in questions
         ]
-        pictures = [self.picture(question.seen.image) for question in questions]
+        shown = self.shows_pictures(questions)
+        pictures = [self.picture(question.seen.image) for question in questions] if shown else None
         decoded = self.generate(prompts, pictures)
         return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
 
     def _question(self, question: Question) -> Prompt:
-        return self.text.prompt(question.text, question.begun)
+        return self.text.prompt(question.text, question.begun, question.pictured)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text up to the end of the turn; see the contract. Raises UsageError for another's reading."""
@@ -245,17 +246,22 @@ class Magma(Policy, Reader):
 
     def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
         """As `roles`, of other questions than what to do; how an answer has begun is `special`."""
-        return self._roles([self._labels(self._question(own), own.seen.image) for own in questions])
+        shown = self.shows_pictures(questions)
+        return self._roles(
+            [self._labels(self._question(own), own.seen.image if shown else None) for own in questions]
+        )
 
     def _roles(self, rows: Sequence[list[str]]) -> dict[str, list[Roles]]:
         longest = max(map(len, rows))
         backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
         return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}
 
-    def _labels(self, prompt: Prompt, image: NDArray[np.uint8]) -> list[str]:
+    def _labels(self, prompt: Prompt, image: NDArray[np.uint8] | None) -> list[str]:
         """Of every position but the last, which belongs to the stream `action`."""
-        span = self.span(prompt.ids, image)
         labels = ["language" if asked else "special" for asked in prompt.question]
+        if image is None:
+            return labels[:-1]
+        span = self.span(prompt.ids, image)
         row = [f"image.{CAMERA}"] * span.columns + [SEPARATOR]
         labels[span.start : span.start + 1] = row * span.rows
         return labels[:-1]

@@ -102,15 +102,18 @@ class ChatText:
         flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)
 
-    def prompt(self, question: str, begun: str = "") -> Prompt:
-        """The whole prompt of a question about one picture; `begun`: how the answer has begun already.
+    def prompt(self, question: str, begun: str = "", pictured: bool = True) -> Prompt:
+        """The whole prompt of a question about one picture, or in words alone.
 
+        begun: how the answer has begun already.
         Raises InstructionError for a question that holds a token of the frames.
         """
         self._refuse_markers(question + begun)
-        turn = picture_question(question, self.config.image_start_end)
+        before = picture_question("", self.config.image_start_end) if pictured else ""
+        turn = before + question
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
         start, stop = self._place(turn, frames)
+        start += len(before)
         encoding = self._tokenizer.encode(frames + begun)
         inside = tuple(
             not special and first < stop and last > start
@@ -119,7 +122,7 @@ class ChatText:
         return Prompt(tuple(encoding.ids), inside)
 
     def _place(self, turn: str, frames: str) -> tuple[int, int]:
-        """Where in `frames` the question of the user's turn begins and ends."""
+        """Where in `frames` what the user says begins and ends."""
         said = turn.strip()  # as templates do
         place = frames.find(said)
         if place < 0:
@@ -127,7 +130,7 @@ class ChatText:
                 f"the chat template in {self.folder} changes the words of a turn: {said!r} is not in {frames!r}. "
                 "Take the template the model was trained with"
             )
-        return place + len(picture_question("", self.config.image_start_end)), place + len(said)
+        return place, place + len(said)
 
     def _refuse_markers(self, text: str) -> None:
         for token in self._tokenizer.get_added_tokens_decoder().values():
@@ -137,9 +140,9 @@ class ChatText:
                     "write it without"
                 )
 
-    def option(self, question: str, begun: str, option: str) -> int:
+    def option(self, question: str, begun: str, option: str, pictured: bool = True) -> int:
         """The id of an option behind a prompt. Raises UsageError unless it is one token there."""
-        before, behind = self.prompt(question, begun).ids, self.prompt(question, begun + option).ids
+        before, behind = (self.prompt(question, text, pictured).ids for text in (begun, begun + option))
         if len(behind) != len(before) + 1 or behind[:-1] != before:
             raise UsageError(
                 f"the option {option!r} is {len(behind) - len(before)} tokens behind this prompt; options are "

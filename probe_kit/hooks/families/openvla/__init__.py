@@ -16,6 +16,7 @@ FAMILIES = (
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
         verifier="probe_kit.hooks.families.prismatic.verify:verify_openvla",
         config_types=("openvla", "prismatic"),
+        source="prismatic",
         full_size="probe_kit.models.prismatic:full_size_openvla",
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig, or the only one"),

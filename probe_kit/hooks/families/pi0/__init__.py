@@ -37,6 +37,7 @@ FAMILIES = (
         notes="Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
         verifier=_VERIFIER,
         config_types=("pi0",),
+        source="paligemma",
         full_size="probe_kit.models.pi0:full_size_pi0",
     ),
 )

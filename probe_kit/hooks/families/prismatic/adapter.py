@@ -20,7 +20,7 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
-from probe_kit.hooks.families.prismatic.tokenizer import TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
 from probe_kit.hooks.model import Model, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
@@ -140,16 +140,16 @@ class PrismaticModel(Model):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
-        return self._roles([self.prompt(observation.instruction) for observation in seen])
+        return self._roles([self.prompt(observation.instruction) for observation in seen], self.network.patches)
 
-    def _roles(self, rows: Sequence[Sequence[int]]) -> dict[str, list[Roles]]:
+    def _roles(self, rows: Sequence[Sequence[int]], patches: int) -> dict[str, list[Roles]]:
         longest, special = max(map(len, rows)), self.tokenizer.special
-        image = [f"image.{CAMERA}"] * self.network.patches
+        image = [f"image.{CAMERA}"] * patches
         backbone = []
         for first, *text, _ in rows:
             labels = ["special" if number in special else "language" for number in (first, *text)]
             labels[1:1] = image
-            labels += [PADDING] * (self.network.patches + longest - 1 - len(labels))
+            labels += [PADDING] * (patches + longest - 1 - len(labels))
             backbone.append(Roles.from_labels(labels))
         return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
 
@@ -192,6 +192,11 @@ class Prismatic(PrismaticModel, Reader):
     family: ClassVar[str] = "prismatic"
     output: ClassVar[str] = "answer"
 
+    @property
+    def lead(self) -> str:
+        """A space, as behind "Out:" words begin with one; none for bytes, where it would be a token of its own."""
+        return "" if isinstance(self.tokenizer, ByteTokenizer) else " "
+
     def prompt(self, instruction: str) -> list[int]:
         """Ids of a question in the frame around it."""
         return self.tokenizer.encode(_FRAME.format(instruction))
@@ -209,17 +214,22 @@ class Prismatic(PrismaticModel, Reader):
             [id_behind(self.tokenizer, text, option) for option in question.options]
             for text, question in zip(texts, questions, strict=True)
         ]
-        pixels = self.pixel_values(question.seen.image for question in questions)
+        pixels = None
+        if self.shows_pictures(questions):
+            pixels = self.pixel_values(question.seen.image for question in questions)
         logits = self.generate(pixels, rows).logits[:, 0].float().cpu()
         return Reading.of(logits.numpy(), options, (pixels, rows))
 
     def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
         """As `roles`; how an answer has begun is language too."""
-        return self._roles([self.tokenizer.encode(text) for text in _asked(questions)])
+        rows = [self.tokenizer.encode(text) for text in _asked(questions)]
+        return self._roles(rows, self.network.patches if self.shows_pictures(questions) else 0)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text behind every prompt, up to its end-of-sequence token; see the contract."""
         pixels, rows = reading.state
+        if tokens < 1:
+            return [""] * len(rows)
         packed, device = self.pack(rows), self.loaded.device
         with torch.inference_mode():
             decoded = self.network.decode(packed.ids.to(device), packed.mask.to(device), pixels, tokens)

@@ -13,6 +13,7 @@ FAMILIES = (
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
         notes="Apache-2.0; 9.4 GB in bfloat16",
         verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
+        source="qwen3-vl",
         full_size="probe_kit.models.xiaomi:full_size_xiaomi",
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),

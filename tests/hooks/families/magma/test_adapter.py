@@ -78,7 +78,6 @@ class TestMagmaAsked(ReaderContract):
 
     family = "magma"
     unloadable_options = TestMagma.unloadable_options
-    question_options = ("A", "B")
 
     @pytest.fixture(scope="class")
     def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -93,7 +92,7 @@ class TestMagmaAsked(ReaderContract):
         return unsteered
 
     def questions(self, seen: Sequence[Observation]) -> list[Question]:
-        return [Question(own, own.instruction, self.question_options, "It is ") for own in seen]
+        return [Question(own, own.instruction, self.letters, "It is ") for own in seen]
 
 
 # -- acting ----------------------------------------------------------------------------------------------
