@@ -1,5 +1,6 @@
 """Ray, started and stopped in one place (extra `ray`)."""
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,6 +10,8 @@ from probe_kit.extras import require
 
 AUTO = "auto"
 """The cluster this process belongs to, or else a new one on this machine."""
+KNOCK_TIMEOUT = 10.0
+"""Seconds in which the head of a cluster has to take a connection."""
 
 
 @contextmanager
@@ -23,10 +26,11 @@ def ray_cluster(address: str, log_to_driver: bool) -> Iterator[Any]:
         yield ray
         return
     try:
+        _knock(address)
         ray.init(
             address=None if address == AUTO else address, include_dashboard=False, log_to_driver=log_to_driver
         )
-    except (ConnectionError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise UsageError(
             f"no Ray cluster answers at {address!r}: {error}. Start one with `ray start --head`, or give "
             f"{AUTO!r} for a new one on this machine"
@@ -35,3 +39,10 @@ def ray_cluster(address: str, log_to_driver: bool) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Raise OSError where nothing listens: Ray itself asks a dead address for minutes before it gives up."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK_TIMEOUT).close()

@@ -73,9 +73,7 @@ def test_a_process_that_dies_is_named_with_a_way_out() -> None:
             probe()
 
 
-@pytest.mark.slow
 def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
-    """Slow: Ray asks for half a minute before it gives up."""
     pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
     with pytest.raises(UsageError, match=r"no Ray cluster answers at '127\.0\.0\.1:9'"):
         columns_of(CrewSettings(ray="127.0.0.1:9"))
