@@ -1,4 +1,4 @@
-"""What the commands share: two consoles, progress bars, comma-separated lists."""
+"""What the commands share: two consoles, progress, comma-separated lists."""
 
 import json
 import os
@@ -17,6 +17,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from probe_kit.heartbeat import Heartbeat
 
 PAGE = 120
 """Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""
@@ -39,7 +41,7 @@ def print_json(value: Any) -> None:
 
 @contextmanager
 def progress() -> Iterator[Progress]:
-    """Progress bars on stderr."""
+    """Progress on stderr: bars in a terminal; elsewhere what `counter` gives says a line now and then."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -47,12 +49,14 @@ def progress() -> Iterator[Progress]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=err) as bar:
+    with Progress(*columns, console=err, disable=not err.is_terminal) as bar:
         yield bar
 
 
 def counter(bar: Progress, description: str) -> Callable[..., None]:
-    """A callback (done, total, …) that moves one bar."""
+    """A callback (done, total, …) that moves one bar of `bar`, or says lines where there is no terminal."""
+    if not err.is_terminal:
+        return Heartbeat(description, lambda line: err.print(line, highlight=False, markup=False, soft_wrap=True))
     task = bar.add_task(description, total=None)
 
     def advance(done: int, total: int, *_: object) -> None:
