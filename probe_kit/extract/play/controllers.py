@@ -65,6 +65,9 @@ class Controller(Protocol):
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
 
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """What the network is delivered as this instruction; None if it reads none or cannot say."""
+
     def certificate(self) -> dict[str, Any]:
         """What was checked so far, for the run's certificate."""
 
@@ -83,6 +86,9 @@ class ScriptedController:
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Never asked: a scripted stage plays to the end by itself."""
         raise AssertionError(f"a scripted stage asked for {len(turns)} actions")
+
+    def instruction_ids(self, instruction: str) -> None:
+        """None: it reads no instruction."""
 
     def certificate(self) -> dict[str, Any]:
         """Nothing was loaded."""
@@ -123,6 +129,7 @@ class PolicyController:
         }
         if card.settings:
             self.identity["policy"] = dict(card.settings)
+        self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._fires: dict[str, int] = {}
         self._check: dict[str, Any] = {}
         self._ledger: list[dict[str, Any]] = []
@@ -142,6 +149,13 @@ class PolicyController:
                 chunks = self.policy.act(observations, seeds)
         self.flagged = self.policy.flagged
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """The ids that the policy's own packing makes of it, frames around it included."""
+        if instruction not in self._instruction_ids:
+            ids = self.policy.token_ids([instruction])
+            self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
+        return self._instruction_ids[instruction]
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
         exponent = self.policy.card.ensemble

@@ -19,20 +19,28 @@ from probe_kit.hooks.observation import Observation
 
 @dataclass(frozen=True)
 class Rollout:
-    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for."""
+    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for.
+
+    trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
+    as its instruction, None if it reads none or cannot say.
+    """
 
     planned: PlannedEpisode
     outcome: dict[str, Any]
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
     ends: Ends | None = None
+    trajectory: NDArray[np.float32] | None = None
+    instruction_ids: Sequence[int] | None = None
 
     @property
     def record(self) -> EpisodeRecord:
         """What of it the run stores."""
         buffers = self.buffers
         arrays: dict[str, dict[str, NDArray[Any]]] = {"pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}}
-        return EpisodeRecord(self.planned, self.outcome, arrays, buffers.roles)
+        return EpisodeRecord(
+            self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids
+        )
 
 
 @dataclass(frozen=True)
@@ -52,12 +60,13 @@ class Seat:
         self.seen: Observation | None = None
         self.calls = 0
         self.flagged: int | None = None
+        self.instruction_ids: Sequence[int] | None = None
         self.past: list[NDArray[np.float32]] = []
 
     def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
         """Begin an episode."""
         self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
-        self.flagged, self.past = None, []
+        self.flagged, self.instruction_ids, self.past = None, None, []
         self.stage.ask("begin", planned, film)
 
     def turn(self) -> Turn:
@@ -134,7 +143,10 @@ class Play:
                     seat.seen = answer
                 else:
                     outcome = {**answer.outcome, **seat.counts}
-                    yield Rollout(seat.planned, outcome, seat.buffers, answer.frames, answer.ends)
+                    yield Rollout(
+                        seat.planned, outcome, seat.buffers, answer.frames, answer.ends, answer.trajectory,
+                        seat.instruction_ids,
+                    )  # fmt: skip
                     self._begin_next(seat)
             if not any(seat.seen for seat in group):
                 return
@@ -144,11 +156,15 @@ class Play:
         if not due:
             return
         try:
-            chunks = self._controller.act([seat.turn() for seat in due])
+            turns = [seat.turn() for seat in due]
+            chunks = self._controller.act(turns)
         except EPISODE_ERRORS as error:
             for seat in due:
                 yield self._give_up(seat, error)
             return
+        for seat, turn in zip(due, turns, strict=True):
+            if turn.call == 0:
+                seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
         flags = self._controller.flagged
         for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
             seat.go_on(actions, None if flags is None else bool(flags[row]))

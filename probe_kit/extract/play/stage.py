@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.env.recorder import Recorder
 from probe_kit.errors import (
     ActionError,
     EmptyRoleError,
@@ -36,11 +37,15 @@ EPISODE_ERRORS = (
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails."""
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails.
+
+    trajectory: (T + 1, C) float32; see `probe_kit.env.trajectory`.
+    """
 
     outcome: dict[str, Any]
     frames: list[NDArray[np.uint8]]
     ends: Ends | None = None
+    trajectory: NDArray[np.float32] | None = None
 
 
 Answer = Observation | Ending
@@ -64,6 +69,7 @@ class Stage:
             options = {"item": planned.episode.item, "layout": planned.episode.layout}
             _, start = self._env.reset(seed=planned.scene_seed, options=options)
             self._visible = start["tile_visibility"]
+            self._recorder = Recorder(self._env)
             self._shoot()
             self._first = shrink(self._env.render()) if self._keep_ends else None
             return self._see() if self.script is None else self._follow_script()
@@ -92,9 +98,11 @@ class Stage:
     def _carry_out(self, actions: Iterable[NDArray[np.float32]]) -> Ending | None:
         for action in actions:
             _, terminated, truncated, _ = self._env.advance(action)
+            self._recorder.note(action)
             self._shoot()
             if terminated or truncated:
-                return Ending(_record(self._env, self._visible), self._frames, self._ends())
+                trajectory = self._recorder.trajectory().frames
+                return Ending(_record(self._env, self._visible), self._frames, self._ends(), trajectory)
         return None
 
     def _ends(self) -> Ends | None:

@@ -11,7 +11,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe_kit.errors import RunDamagedError, RunIncompleteError, RunNotFoundError, UnknownSiteError
+from probe_kit.errors import (
+    NoTrajectoryError,
+    RunDamagedError,
+    RunIncompleteError,
+    RunNotFoundError,
+    UnknownSiteError,
+    UsageError,
+)
 from probe_kit.extract.store.arrays import open_array
 from probe_kit.extract.store.columns import Columns, find_columns
 from probe_kit.extract.store.commits import Commit, read_commits, read_failures, stamp_of
@@ -29,11 +36,14 @@ from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import PROVENANCE, Provenance, differences, read_provenances
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.summary import run_html, run_text, what_to_open
+from probe_kit.extract.store.trajectories import Trajectories, has_trajectories
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.views import resolve_view
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from probe_kit.env.trajectory import Trajectory
 
 
 class NotSealedWarning(UserWarning):
@@ -196,6 +206,49 @@ class Run:
         """One row per committed episode: the plan's columns, then the outcome's."""
         plan = {planned["episode"]: planned for planned in self._plan}
         return pd.DataFrame([{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers])
+
+    # -- trajectories ----------------------------------------------------------------------------------
+
+    @cached_property
+    def has_trajectories(self) -> bool:
+        """Whether episodes keep what happened in them step by step; runs made before it was stored do not."""
+        return has_trajectories(self.location)
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """What happened in every episode, in the order of `episodes`. Raises NoTrajectoryError without any."""
+        if not self.has_trajectories:
+            raise NoTrajectoryError(
+                f"{self.location} keeps no trajectories; it was made before they were stored. Extract it again to "
+                "have them"
+            )
+        return Trajectories(self.location, self._numbers, self.episodes["steps"].astype(int).tolist())
+
+    def trajectory(self, episode: str | int) -> "Trajectory":
+        """What happened in one episode, frame by frame; `.to_xarray()` labels it.
+
+        episode: its id, such as `color-0001:o`, or its row in `episodes`. Raises NoTrajectoryError if the run
+        keeps none, UsageError for an unknown episode, RunDamagedError if stored bytes are missing or changed.
+        """
+        return self.trajectories[self._position(episode)]
+
+    def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
+        """The instruction of one episode as the policy was delivered it; None where nothing was stored."""
+        ids = self.commits()[self._position(episode)].get("instruction_ids")
+        return None if ids is None else tuple(ids)
+
+    def _position(self, episode: str | int) -> int:
+        """Row in `episodes`. Raises UsageError."""
+        names = self.episodes["episode_id"].tolist()
+        if isinstance(episode, str) and episode in names:
+            return names.index(episode)
+        if isinstance(episode, int) and 0 <= episode < len(names):
+            return episode
+        raise UsageError(
+            f"{self.location} has no episode {episode!r}; it has {len(names)}, from {names[0]!r} on"
+            if names
+            else f"{self.location} has no episode yet"
+        )
 
     # -- streams ---------------------------------------------------------------------------------------
 

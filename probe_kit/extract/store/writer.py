@@ -4,8 +4,10 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.core.array_spec import ArrayConfigLike
@@ -35,6 +37,7 @@ from probe_kit.extract.store.provenance import (
     refuse_other_provenance,
 )
 from probe_kit.extract.store.run import read_card
+from probe_kit.extract.store.trajectories import create_trajectories, has_trajectories, write_trajectory
 from probe_kit.identity import canonical_json, sha256_json
 
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
@@ -47,13 +50,16 @@ class EpisodeRecord:
     """All that is stored of one episode.
 
     arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
-    roles: per captured inference and stream, the spans of roles.
+    roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
+    instruction_ids: the instruction as the policy was delivered it.
     """
 
     planned: PlannedEpisode
     outcome: Mapping[str, Any]
     arrays: Mapping[str, Mapping[str, NDArray[Any]]]
     roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
+    trajectory: NDArray[np.float32] | None = None
+    instruction_ids: Sequence[int] | None = None
 
 
 class RunWriter:
@@ -77,14 +83,18 @@ class RunWriter:
     def _beginning(self) -> dict[str, bytes]:
         """Every object a run has before its first episode."""
         arrays: dict[str, Buffer] = {}
+        store = MemoryStore(arrays)
         create_arrays(
-            MemoryStore(arrays),
+            store,
             list(self.plan.streams),
             len(self.plan.episodes),
             self.settings["captured_calls"],
             self.settings["tokens"] == "all",
             self.settings["codec"],
         )
+        if "scene" in self.settings:
+            frames = self.settings["scene"]["max_steps"] + 1
+            create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
         run = {
             "schema_version": SCHEMA_VERSION,
             "settings": self.settings,
@@ -102,6 +112,11 @@ class RunWriter:
         asked = {"schema_version": SCHEMA_VERSION, **self.settings}
         there = {"schema_version": stored["schema_version"], **stored["settings"]}
         refuse_other_settings(there, asked, str(self.location))
+
+    @cached_property
+    def _keeps_trajectories(self) -> bool:
+        """Not in a run that was begun before there were any: all of its episodes stay alike."""
+        return has_trajectories(self.location)
 
     def several_may_write(self) -> bool:
         """Whether the location keeps the first of two objects of one key, which commits rely on."""
@@ -143,11 +158,14 @@ class RunWriter:
             for stream, values in by_stream.items():
                 array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
                 array[planned.index] = values
+        if episode.trajectory is not None and self._keeps_trajectories:
+            write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
         commit = {
             "episode_id": planned.episode.episode_id,
             "outcome": episode.outcome,
             "roles": episode.roles,
             "provenance": name_of(self.provenance),
+            **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
             "objects": {key: list(record) for key, record in sorted(store.objects.items())},
         }
         write_commit(self.location, planned.index, commit)
