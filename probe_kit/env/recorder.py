@@ -4,11 +4,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from probe_kit.env.act2answer import Act2AnswerEnv
-from probe_kit.env.controller import OPEN_ABOVE
-from probe_kit.env.rotations import Array, to_rpy
+from probe_kit.env.rotations import Array
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.trajectory import LED_TO, Trajectory
-from probe_kit.suite.items import Side
 
 
 class Recorder:
@@ -19,18 +17,14 @@ class Recorder:
 
     def __init__(self, env: Act2AnswerEnv) -> None:
         self._env: Act2AnswerEnv = env.unwrapped
-        self._target = self._env.trial.controller.target
         self._frames = [np.concatenate([_state(self._env.scene), np.full(LED_TO, np.nan)])]
 
     def note(self, commanded: ArrayLike) -> None:
         """After an action (7,) was carried out."""
         trial = self._env.trial
-        before, self._target = self._target, trial.controller.target
-        shift = self._target.position - before.position
-        turn = to_rpy(self._target.rotation @ before.rotation.T)
+        assert trial.executed is not None
         asked = np.asarray(commanded, np.float64)
-        executed = [*shift, *turn, float(asked[6] > OPEN_ABOVE)]
-        self._frames.append(np.concatenate([_state(trial.scene), asked, executed, [trial.ik_error]]))
+        self._frames.append(np.concatenate([_state(trial.scene), asked, trial.executed, [trial.ik_error]]))
 
     def trajectory(self) -> Trajectory:
         """What was noted so far."""
@@ -39,9 +33,7 @@ class Recorder:
 
 def _state(scene: Scene) -> Array:
     """The state part of a frame; see `trajectory.STATE`."""
-    client, cube = scene.client, scene.cube_state()
-    tiles = [value for side in SIDES for part in _pose(scene, side) for value in part]
-    touches = [bool(client.getContactPoints(bodyA=scene.cube, bodyB=scene.tiles[side])) for side in SIDES]
+    cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
     return np.array(
         [
             *scene.arm.tool_state(),
@@ -49,18 +41,13 @@ def _state(scene: Scene) -> Array:
             *cube.position,
             *cube.quaternion,
             cube.speed,
-            *tiles,
+            *(value for tile in tiles for value in (*tile.position, *tile.quaternion)),
             *_finger_forces(scene),
             scene.is_grasped(),
-            *touches,
+            *(scene.touches_tile(side) for side in SIDES),
         ],
         np.float64,
     )
-
-
-def _pose(scene: Scene, side: Side) -> tuple[Array, Array]:
-    position, quaternion = scene.client.getBasePositionAndOrientation(scene.tiles[side])
-    return np.array(position), np.array(quaternion)
 
 
 def _finger_forces(scene: Scene) -> list[float]:
