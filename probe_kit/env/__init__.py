@@ -10,6 +10,7 @@ from gymnasium.envs.registration import register, registry
 from probe_kit.env.act2answer import Act2AnswerEnv
 from probe_kit.env.adapters import to_lerobot, to_openpi
 from probe_kit.env.expert import ScriptedExpert
+from probe_kit.env.idle import Idle
 from probe_kit.env.outcome import Outcome, success_by_radius
 from probe_kit.env.recording import save_gif
 from probe_kit.env.spec import CameraSpec, LightSpec, LimitSpec, PhysicsSpec, SceneSpec
@@ -23,6 +24,7 @@ __all__ = [
     "ENV_ID",
     "Act2AnswerEnv",
     "CameraSpec",
+    "Idle",
     "LightSpec",
     "LimitSpec",
     "Outcome",

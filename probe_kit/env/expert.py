@@ -19,6 +19,7 @@ MAX_TURN = 0.35
 TRAVEL_HEIGHT = 0.12
 RELEASE_GAP = 0.003
 OPEN, CLOSED = 1.0, 0.0
+STAY_SHUT = np.array([0, 0, 0, 0, 0, 0, CLOSED])
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,14 @@ class ScriptedExpert:
     def _carry(self) -> list[Waypoint]:
         """Over the tile, down to just above it, open, and up again."""
         spec, side = self._env.scene_spec, self._env.question.side_correct
-        x, y = spec.tile_xy(other_side(side) if self._mirrored else side)
+        x, y = self._env.scene.tile_xy(other_side(side) if self._mirrored else side)
         height = spec.tile_height + self._grasp_height() + RELEASE_GAP
+        if spec.closing_steps:
+            # The hand closed around the cube where it was, which is not where the hand would take it.
+            hold = self._cube() - self._env.trial.controller.target.position
+            clearance = self._env.scene.arm.model.clearance
+            x, y = x - hold[0], y - hold[1]
+            height = spec.tile_height + max(spec.cube_side / 2 - hold[2], clearance) + RELEASE_GAP
         above, at = np.array([x, y, TRAVEL_HEIGHT]), np.array([x, y, height])
         yaw = 0.0 if spec.start_grasped else self._cube_yaw()
         return [
@@ -91,6 +98,8 @@ class ScriptedExpert:
         for waypoint in plan:
             while not self._arrived(waypoint):
                 yield self._towards(waypoint)
+            while waypoint.gripper == OPEN and self._env.trial.steps < self._env.scene_spec.forced_closed:
+                yield STAY_SHUT
             for _ in range(waypoint.wait):
                 yield np.array([0, 0, 0, 0, 0, 0, waypoint.gripper])
         while True:

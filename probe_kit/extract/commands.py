@@ -24,7 +24,7 @@ MOVED = {
 
 
 def extract(
-    model: Annotated[str, typer.Option(help="A model of `probe-kit models`, or expert, expert-mirrored.")],
+    model: Annotated[str, typer.Option(help="A model of `probe-kit models`, or expert, expert-mirrored, idle.")],
     out_folder: Annotated[
         str | None,
         typer.Option("--out", help="Folder or s3://BUCKET/PREFIX/RUN; default runs/<model>-<settings hash>."),
@@ -51,12 +51,13 @@ def extract(
     suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
     items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
-    scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal or vl-think.")] = "bridge",
+    scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal, vl-think or act2answer.")] = "bridge",
     max_steps: Annotated[
         int | None, typer.Option(help="Actions per episode, at 5 Hz.", rich_help_panel=SCENE)
     ] = None,
     tile_side: Annotated[
-        float | None, typer.Option(help="Metres; the paper's sizes are 0.11, 0.154, 0.088.", rich_help_panel=SCENE)
+        float | None,
+        typer.Option(help="Metres; the paper's sizes are 0.1452, 0.2033, 0.1162.", rich_help_panel=SCENE),
     ] = None,
     light_level: Annotated[
         float | None, typer.Option(help="1 is default; the paper's levels are 0.7, 1.3.", rich_help_panel=SCENE)

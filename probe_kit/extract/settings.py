@@ -34,7 +34,7 @@ _MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", 
 class ExtractSettings:
     """Everything `probe-kit extract` can be told; the defaults are the command line's.
 
-    model: a family of `probe-kit models`, or `expert` / `expert-mirrored` (scripted, no activations).
+    model: a family of `probe-kit models`, or `expert` / `expert-mirrored` / `idle` (scripted, no activations).
     checkpoint: folder or hub id; None for the family's default.
     weights_seed: of a random twin's weights.
     options: what only some families have, such as `unnorm_key`; what they lead to is in the policy's card.

@@ -1,6 +1,7 @@
 """The same seed gives the same episode, bit for bit, on one machine with one build of the simulator."""
 
 import sys
+from importlib.util import find_spec
 from subprocess import run
 
 import numpy as np
@@ -67,6 +68,10 @@ def test_a_new_process_gives_the_same_episode(reference):
     command = [sys.executable, episode_digest.__file__, "3"]
     output = run(command, capture_output=True, text=True, check=True).stdout
     assert f"digest {reference}" in output
+    if find_spec("rtbdata") is not None:
+        env = episode_digest.make_released_env()
+        assert f"released {episode_digest.released_digest(env, seed=3)}" in output
+        env.close()
 
 
 def test_the_seed_moves_the_cube_and_nothing_else_does(env):

@@ -126,6 +126,16 @@ def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suit
         assert len(run.episodes) == 16
 
 
+def test_a_policy_that_does_nothing_leaves_a_run_in_which_nothing_was_moved(
+    two_items: Suite, tmp_path: Path
+) -> None:
+    scene = SceneSpec.preset("act2answer", arm="panda", rendering="raw", max_steps=3)
+    run = extract_run(ExtractSettings("idle", suite=two_items.folder, scene=scene), tmp_path / "run")
+    assert (run.episodes["outcome"] == "oob").all()
+    assert run.episodes["never_moved"].all()
+    assert run.episodes["is_grasped"].all()
+
+
 @pytest.mark.slow
 def test_sixty_expert_episodes_prove_environment_and_scoring(tmp_path: Path) -> None:
     suite = build_suite(tmp_path / "suite", ["color"], 30)

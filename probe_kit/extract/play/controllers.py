@@ -1,4 +1,4 @@
-"""Who decides: a captured policy, or the scripted expert that knows the answer."""
+"""Who decides: a captured policy, or a script that needs no model."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SCRIPTED = {
     "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
     "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
+    "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
 }
 # Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
 SMALL = 10_000_000
@@ -73,7 +74,7 @@ class Controller(Protocol):
 
 
 class ScriptedController:
-    """The scripted expert plays on the stage itself, looks at nothing and leaves no activations."""
+    """A script plays on the stage itself, looks at nothing and leaves no activations."""
 
     def __init__(self, name: str) -> None:
         self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}

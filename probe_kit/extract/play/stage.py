@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
 from probe_kit.env.recorder import Recorder
 from probe_kit.errors import (
     ActionError,
@@ -54,7 +54,7 @@ Answer = Observation | Ending
 class Stage:
     """Plays episodes in this process.
 
-    script: `expert` or `expert-mirrored` to let the scripted expert play every episode to its end at once.
+    script: `expert`, `expert-mirrored` or `idle` to let that script play every episode to its end at once.
     keep_ends: whether every episode ends with small pictures of its first and last frame.
     """
 
@@ -88,11 +88,12 @@ class Stage:
         self._env.close()
 
     def _follow_script(self) -> Ending:
-        expert = ScriptedExpert(self._env, mirrored=self.script == "expert-mirrored")
-        expert.reset()
+        mirrored = self.script == "expert-mirrored"
+        script = Idle(self._env) if self.script == "idle" else ScriptedExpert(self._env, mirrored)
+        script.reset()
         ending = None
         while ending is None:
-            ending = self._carry_out([expert.act()])
+            ending = self._carry_out([script.act()])
         return ending
 
     def _carry_out(self, actions: Iterable[NDArray[np.float32]]) -> Ending | None:
