@@ -133,8 +133,10 @@ def sheet(path: Path) -> None:
         cells[f"light {level:.0%}"] = SceneSpec(light_level=level)
     for preset in ("bridge", "frontal", "vl-think"):
         cells[f"{preset}, widowx"] = SceneSpec.preset(preset, arm="widowx")
-    for side in (0.088, 0.154):
-        cells[f"tile {side / 0.11:.0%}"] = SceneSpec(tile_side=side)
+    for arm in ("widowx", "panda"):
+        cells[f"act2answer, {arm}"] = SceneSpec.preset("act2answer", arm=arm)
+    for side in (0.1162, 0.2033):
+        cells[f"act2answer, tile {side / 0.1452:.0%}"] = SceneSpec.preset("act2answer", tile_side=side)
     columns = 4
     rows = -(-len(cells) // columns)
     board = Image.new("RGB", (columns * (CELL + 8), rows * (CELL + 26)), "white")
@@ -149,7 +151,9 @@ def first_frame(spec: SceneSpec) -> Image.Image:
     """What the camera sees before the first action."""
     scene = Scene(spec)
     pictures = {"left": label("7A", "#ffee77"), "right": label("R2", "#99e5ff")}
-    scene.reset(pictures, (*spec.cube_xy, spec.cube_side / 2), spec.cube_yaw)
+    scene.reset(pictures, (*spec.cube_xy, spec.cube_start_z), spec.cube_yaw)
+    if spec.closing_steps:
+        scene.close_hand(spec.closing_steps)
     picture = scene.picture(scene.frame())
     scene.close()
     return Image.fromarray(picture).resize((CELL, CELL), Image.Resampling.LANCZOS)
