@@ -106,7 +106,9 @@ def _least_leaks(folder: Path) -> dict[str, float]:
 
 @app.command()
 def convert(
-    source: Annotated[str, typer.Argument(help="mllm-compbench, iconqa, mmbench, ok-vqa or vl-think.")],
+    source: Annotated[
+        str, typer.Argument(help="mllm-compbench, iconqa, mmbench, ok-vqa, vl-think or act2answer.")
+    ],
     root: Annotated[Path, typer.Option(help="Folder the benchmark was unpacked to.")],
     out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the source.")] = None,

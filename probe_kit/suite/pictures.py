@@ -66,7 +66,7 @@ def decode_picture(path: Path) -> Image.Image:
             image.verify()  # decoding alone does not compare the checksums
         with Image.open(path) as image:
             _refuse_deep(image, path)
-            return _on_white(ImageOps.exif_transpose(image))
+            return on_white(ImageOps.exif_transpose(image))
     except _DECODING_ERRORS as error:
         raise SuiteError(
             f"{path}: not a picture that Pillow can decode ({error}). Restore the suite's files or build it again."
@@ -78,7 +78,8 @@ def _refuse_deep(image: Image.Image, path: Path) -> None:
         raise SuiteError(f"{path}: has more than 8 bits per channel ({image.mode}). Convert it to 8-bit RGB.")
 
 
-def _on_white(image: Image.Image) -> Image.Image:
+def on_white(image: Image.Image) -> Image.Image:
+    """An RGB picture: transparency is laid over white."""
     if not image.has_transparency_data:
         return image.convert("RGB")
     rgba = image.convert("RGBA")

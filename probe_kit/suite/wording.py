@@ -2,6 +2,8 @@
 
 import re
 
+VERBATIM = "verbatim"
+"""Rule of items whose instruction is their source's own question, not a sentence of ours."""
 MOST_WORDS = 12
 MOST_CHARACTERS = 80
 _SIDE_WORDS = frozenset(

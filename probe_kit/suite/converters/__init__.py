@@ -1,7 +1,8 @@
-"""Converters: Act2Answer items from five published benchmarks, which stay where their owners put them."""
+"""Converters: Act2Answer items from published benchmarks, and from sets in Act2Answer's own format."""
 
 from probe_kit.suite.converters.conversion import PAPER_ITEMS, PAPER_POOL, SOURCES, convert
 from probe_kit.suite.converters.options import (
+    Act2AnswerOptions,
     CompBenchOptions,
     ConvertOptions,
     IconQaOptions,
@@ -15,6 +16,7 @@ __all__ = [
     "PAPER_ITEMS",
     "PAPER_POOL",
     "SOURCES",
+    "Act2AnswerOptions",
     "CompBenchOptions",
     "ConvertOptions",
     "IconQaOptions",

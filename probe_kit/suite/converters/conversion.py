@@ -15,7 +15,7 @@ from probe_kit.errors import SuiteError, UsageError
 from probe_kit.identity import derive_seed
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_categories
-from probe_kit.suite.converters import compbench, iconqa, mmbench, okvqa, vlthink
+from probe_kit.suite.converters import act2answer, compbench, iconqa, mmbench, okvqa, vlthink
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
 from probe_kit.suite.converters.emission import emit, sample
@@ -95,13 +95,18 @@ def convert(
     n: most items per category. curation: a reviewed file; only what it accepts is emitted. emit_curation: where to
     write a file to review. options: fields of the source's options, such as `min_side` (see `SOURCES`).
     The same arguments give the same bytes. `stats.json` counts every stage beside the paper.
+    Sets in Act2Answer's own format (`act2answer`) are taken over question by question, whatever `seed` is.
     Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
     should be; `out` is then left as it was.
     """
-    if source not in SOURCES:
-        raise UsageError(f"unknown source {source!r}; available: {', '.join(SOURCES)}.")
+    if source not in (*SOURCES, act2answer.SOURCE):
+        raise UsageError(f"unknown source {source!r}; available: {', '.join((*SOURCES, act2answer.SOURCE))}.")
     if n < 1:
         raise UsageError(f"n is {n}; expected at least 1 item per category.")
+    if source == act2answer.SOURCE:
+        if curation is not None or emit_curation is not None:
+            raise UsageError(f"{source} takes no curation: its questions are taken over as they are.")
+        return act2answer.convert_set(Path(root), Path(out), categories, n, options)
     kind, root, out = SOURCES[source], Path(root), Path(out)
     chosen = options_from(kind.options, options)
     wanted = kind.categories if categories is None else check_categories(categories, kind.categories)

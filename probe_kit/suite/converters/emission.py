@@ -31,8 +31,10 @@ class Emitted:
 
 
 @dataclass(frozen=True)
-class _Stored(Picture):
-    """original_pixels: hash of the source's pixels. operation: what was done to them."""
+class StoredPicture(Picture):
+    """A picture of a source as a suite stores it.
+
+    original_pixels: hash of the source's pixels. operation: what was done to them."""
 
     original_pixels: str
     operation: str
@@ -54,11 +56,11 @@ def emit(
     rng: np.random.Generator,
 ) -> Emitted:  # fmt: skip
     """The items of the bundles. Twins keep their two pictures where they are; all sides balance."""
-    store: dict[str, _Stored] = {}
+    store: dict[str, StoredPicture] = {}
 
-    def stored(picture: SourcePicture) -> _Stored:
+    def stored(picture: SourcePicture) -> StoredPicture:
         if picture.image_id not in store:
-            store[picture.image_id] = _encode(picture, render(picture))
+            store[picture.image_id] = stored_picture(picture.image_id, render(picture), picture.operation)
         return store[picture.image_id]
 
     items = [
@@ -90,17 +92,16 @@ def _side(proposal: Proposal, first: Proposal, side_of_first: Side) -> Side:
     return side_of_first if proposal.target == first.target else other_side(side_of_first)
 
 
-def _encode(picture: SourcePicture, image: Image.Image) -> _Stored:
+def stored_picture(image_id: str, image: Image.Image, operation: str) -> StoredPicture:
+    """`image` on a white square of 224 to 512 pixels. operation: what was done to it before."""
     square = letterboxed(image)
     size = min(max(square.width, _SMALLEST), _LARGEST)
     shown = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
-    return _Stored(
-        picture.image_id, encode_png(shown), pixels_sha256(shown), pixels_sha256(image), picture.operation
-    )
+    return StoredPicture(image_id, encode_png(shown), pixels_sha256(shown), pixels_sha256(image), operation)
 
 
 def _item(
-    source: str, proposal: Proposal, side: Side, target: _Stored, distractor: _Stored, reading: Reading
+    source: str, proposal: Proposal, side: Side, target: StoredPicture, distractor: StoredPicture, reading: Reading
 ) -> Item:
     left, right = (target, distractor) if side == "left" else (distractor, target)
     assert proposal.wording is not None

@@ -85,7 +85,22 @@ class VlThinkOptions(ConvertOptions):
     extra_boards: tuple[str, ...] = ()
 
 
-def options_from(kind: type[ConvertOptions], given: dict[str, Any]) -> ConvertOptions:
+@dataclass(frozen=True)
+class Act2AnswerOptions:
+    """What a set of Act2Answer's own format does not say.
+
+    tile_yaw: degrees by which its scene turns the tiles; 90 as released, 0 as VL-Think does.
+    contains_real_face: whether its pictures show real people. license: an SPDX name, if you know it.
+    """
+
+    tile_yaw: int = 90
+    contains_real_face: bool = False
+    license: str = "LicenseRef-Act2Answer-assets"
+
+
+def options_from[Options: (ConvertOptions, Act2AnswerOptions)](
+    kind: type[Options], given: dict[str, Any]
+) -> Options:
     """The options of one source. Raises UsageError for a name it does not have, with the nearest one."""
     known = [field.name for field in fields(kind)]
     for name in given:

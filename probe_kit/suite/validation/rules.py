@@ -14,7 +14,7 @@ from probe_kit.suite.items import Item, Side
 from probe_kit.suite.pictures import decode_picture, picture_size, pixels_sha256
 from probe_kit.suite.suite import Suite, count_by_category
 from probe_kit.suite.validation.findings import Finding, error
-from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, side_words
+from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, VERBATIM, side_words
 
 SMALLEST_PICTURE = 64
 SIGN_CATEGORIES = ("traffic", "public-info")  # a sign may be named after a side
@@ -67,28 +67,32 @@ def sides_differ(suite: Suite) -> Iterator[Finding]:
 
 
 def instruction_names_object(suite: Suite) -> Iterator[Finding]:
-    """E09: one short line without a full stop that contains the object phrase."""
+    """E09: one short line without a full stop that contains the object phrase. A source's own may be long."""
     for item in suite.items:
         words = len(item.instruction.split())
         problems = {
             f"the instruction does not contain the object phrase {item.object_phrase!r}": (
                 not item.object_phrase or item.object_phrase not in item.instruction
             ),
-            "the instruction ends with a period": item.instruction.endswith("."),
             "the instruction has more than one line": len(item.instruction.splitlines()) != 1,
+        }
+        style = {
+            "the instruction ends with a period": item.instruction.endswith("."),
             f"the instruction has {words} words (limit {MOST_WORDS})": words > MOST_WORDS,
             f"the instruction has {len(item.instruction)} characters (limit {MOST_CHARACTERS})": (
                 len(item.instruction) > MOST_CHARACTERS
             ),
         }
-        for message, present in problems.items():
+        for message, present in {**problems, **({} if item.rule_id == VERBATIM else style)}.items():
             if present:
                 yield error("E09", f"item {item.item_id}", message)
 
 
 def no_side_words(suite: Suite) -> Iterator[Finding]:
-    """E10: no side is named, except by signs that are marked with `side_word` (W07 lists them)."""
+    """E10: no side is named, except by signs and a source's own questions marked `side_word` (W07 lists them)."""
     for item in suite.items:
+        if item.side_word and item.rule_id == VERBATIM:
+            continue
         outside = item.instruction.replace(item.object_phrase, " ")
         exempt = item.side_word and item.category in SIGN_CATEGORIES
         named = side_words(outside) or (() if exempt else side_words(item.object_phrase))
