@@ -119,7 +119,7 @@ def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *_: None)
     known = known_families()
     assert known["pi0-tiny"].missing() == ""
-    assert known["pi0"].missing() == "download of lerobot/pi0_base, google/paligemma-3b-pt-224"
+    assert known["pi0"].missing() == "download of juexzz/INTACT-pi0-finetune-bridge, google/paligemma-3b-pt-224"
     assert known["openvla"].missing() == "extra openvla and download of openvla/openvla-7b"
     assert known["prismatic"].missing() == "extra openvla and a checkpoint of yours (--checkpoint)"
 
@@ -131,7 +131,7 @@ def test_a_cached_config_without_weights_is_no_checkpoint(tmp_path: Path, monkey
 
     (tmp_path / "config.json").touch()
     monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *_: str(tmp_path / "config.json"))
-    assert families()["pi0"].missing() == "download of lerobot/pi0_base"
+    assert families()["pi0"].missing() == "download of juexzz/INTACT-pi0-finetune-bridge"
     (tmp_path / "model.safetensors").touch()
     assert families()["pi0"].missing() == ""
 

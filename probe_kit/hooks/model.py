@@ -159,6 +159,21 @@ class Policy(Model):
 
     flagged: NDArray[np.bool_] | None = None
 
+    def misfit(self) -> str | None:
+        """Why its actions cannot move this arm; None if they can. Such a policy is listened to all the same."""
+        return None
+
+    def deaf_to(self) -> tuple[str, ...]:
+        """What of an observation `listen` gives it as zeros, because it reads something else in that place."""
+        return ()
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
+
+        For a policy with a `misfit`, which `act` refuses.
+        """
+        return self.act(seen, seeds)
+
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation.

@@ -45,7 +45,7 @@ def test_a_family_that_cannot_be_verified_says_so() -> None:
 def test_what_must_be_downloaded_is_said_before_it_is_tried(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     assert known_families()["pi0-tiny"].missing() == ""
-    assert "lerobot/pi0_base" in known_families()["pi0"].missing()
+    assert "juexzz/INTACT-pi0-finetune-bridge" in known_families()["pi0"].missing()
 
 
 def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,7 +53,7 @@ def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
     known = known_families()
     for name, needed in (
-        ("pi0", ("lerobot/pi0_base", "google/paligemma-3b-pt-224")),
+        ("pi0", ("juexzz/INTACT-pi0-finetune-bridge", "google/paligemma-3b-pt-224")),
         ("smolvla", ("lerobot/smolvla_base", "HuggingFaceTB/SmolVLM2-500M-Video-Instruct")),
         ("internvla-m1", ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "Qwen/Qwen2.5-VL-3B-Instruct")),
         ("xiaomi-r0", ("XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",)),

@@ -4,9 +4,9 @@ Never lerobot's own `from_pretrained`: it returns partly or fully random models 
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -20,53 +20,29 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import checkpoint_folder, content_hashes, side_files
-from probe_kit.hooks.families.lerobot_normaliser import Normaliser, read_normaliser
+from probe_kit.hooks.families.lerobot_evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.lerobot_normaliser import (
+    Normaliser,
+    Units,
+    from_buffers,
+    read_buffers,
+    read_normaliser,
+)
+from probe_kit.hooks.families.lerobot_stacks import Stack
 from probe_kit.hooks.families.lerobot_window import PictureWindow, read_window
 from probe_kit.hooks.model import Policy, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.sites import Site
+from probe_kit.hooks.state_layout import ARM_NUMBERS
 from probe_kit.hooks.views import PADDING
 from probe_kit.hooks.weights import Weights, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
-
-
-@dataclass(frozen=True)
-class Stack:
-    """One transformer stack inside a policy; `entry` names the block's first submodule."""
-
-    layers: Sequence[nn.Module]
-    norm: nn.Module
-    width: int
-    iterations: int | None
-    entry: str = "input_layernorm"
-
-    def tap(self, site: Site) -> Tap:
-        """Where a site of this stack is read."""
-        fires = self.iterations or 1
-        if site.quantity == "final_norm":
-            return Tap(self.norm, fires, "output")
-        if site.layer == len(self.layers):
-            return Tap(self.norm, fires)
-        block: Any = self.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, fires, "output")
-        if site.quantity == "attention":
-            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.out_proj
-            return Tap(projection, fires, "output")
-        return Tap(getattr(block, self.entry), fires)
-
-
-def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:
-    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotFlow`."""
-    return {
-        "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
-        "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
-        "vision": Stack(vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, 1, "layer_norm1"),
-    }
+_DIMENSIONS = 7
+"""Of the arm's actions."""
 
 
 class LerobotFlow(Policy):
@@ -84,9 +60,10 @@ class LerobotFlow(Policy):
     suffix_roles: ClassVar[tuple[str, ...]]
 
     def __init__(self, network: Any, folder: Path) -> None:
+        self.checkpoint, self.evaluation = str(folder), AS_STORED
         self.network, self.folder, self.config = network, folder, network.config
         self.stacks = self._stacks()
-        self.streams = {name: _stream(name, self.stacks[name]) for name in ("backbone", "expert")}
+        self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "expert")}
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
         self._show(self.cameras[:1])
@@ -111,7 +88,7 @@ class LerobotFlow(Policy):
     def _show(self, cameras: tuple[str, ...]) -> None:
         self.shown = cameras
         self.stacks["vision"] = replace(self.stacks["vision"], iterations=len(cameras) + self.masked_cameras)
-        self.further_streams = {"vision": _stream("vision", self.stacks["vision"])}
+        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
         images = tuple(f"image.{camera}" for camera in cameras)
         self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}
 
@@ -169,15 +146,17 @@ class LerobotFlow(Policy):
         dtype: str | None = None,
         random_weights: bool = False,
         weights_seed: int = 0,
+        evaluation: Evaluation = AS_STORED,
     ) -> Self:
         """Load a lerobot checkpoint from a folder or hub id.
 
         dtype: float32 or bfloat16; default what the checkpoint's config says.
         random_weights: same architecture, tokenizer and statistics, but random weights of `weights_seed`.
+        evaluation: what its files do not say.
         Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
         """
         folder = checkpoint_folder(checkpoint)
-        config = cls._read_config(folder)
+        config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
         network = cls.build(config, folder)
@@ -189,6 +168,7 @@ class LerobotFlow(Policy):
         audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
         config.device = device
         policy = cls(network.to(device), folder)
+        policy.prepare(checkpoint, evaluation)
         policy.card = Card(
             family=cls.family,
             checkpoint=checkpoint,
@@ -203,16 +183,16 @@ class LerobotFlow(Policy):
             execute=min(config.n_action_steps, config.chunk_size),
             notes=policy._notes(),
             audit=audit.to_json(),
-            settings=content_hashes(policy.side_files()),
+            settings={**content_hashes(policy.side_files()), **policy.further_settings()},
             weights_seed=weights_seed if audit.random and random_weights else None,
         )
         return policy
 
     @classmethod
-    def _read_config(cls, folder: Path) -> Any:
+    def _read_config(cls, folder: Path, evaluation: Evaluation) -> Any:
         if not (folder / "config.json").is_file():
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
-        config: Any = PreTrainedConfig.from_pretrained(folder)
+        config: Any = cls.parse_config(folder, evaluation)
         if config.type != cls.config_type:
             raise CheckpointError(
                 f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
@@ -221,6 +201,20 @@ class LerobotFlow(Policy):
         config.compile_model = False
         config.rtc_config = None
         return config
+
+    @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """lerobot's configuration object of the folder's `config.json`."""
+        del evaluation
+        return PreTrainedConfig.from_pretrained(folder)
+
+    def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
+        """What is looked at once, before the card is written. checkpoint: the name it was asked for by."""
+        self.checkpoint, self.evaluation = checkpoint, evaluation
+
+    def further_settings(self) -> dict[str, str]:
+        """What numbers depend on besides weights and side files; empty where a checkpoint says everything."""
+        return {}
 
     def side_files(self) -> dict[str, Path]:
         """Every file besides the weights that loading and acting read: configuration, units, window, text."""
@@ -244,13 +238,42 @@ class LerobotFlow(Policy):
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
         self.check(seen, seeds)
-        dimensions = self.config.output_features["action"].shape[0]
-        if dimensions != 7:
-            raise CheckpointError(
-                f"{self.folder} acts in {dimensions} dimensions; Act2Answer needs a 7-DoF end-effector delta"
-            )
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
         chunk = self.infer(self.batch(seen), self.noise(seeds))
         return self.action_units.restore(chunk.float().cpu().numpy())
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, chunk, action numbers) as the network puts them out, without units."""
+        self.check(seen, seeds)
+        zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.deaf_to() else None
+        chunk = self.infer(self.batch(seen, zeros), self.noise(seeds))
+        output: NDArray[np.float32] = chunk.float().cpu().numpy()
+        return output
+
+    def misfit(self) -> str | None:
+        """Other actions than an end-effector delta, another state, or no units for either."""
+        return self._action_misfit() or self._state_misfit()
+
+    def deaf_to(self) -> tuple[str, ...]:
+        """The state, where it has other numbers than the arm's, or no units."""
+        return ("state",) if self._state_misfit() else ()
+
+    def _action_misfit(self) -> str | None:
+        dimensions = self.config.output_features["action"].shape[0]
+        if dimensions != _DIMENSIONS:
+            return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
+        return _problem(lambda: self.action_units)
+
+    def _state_misfit(self) -> str | None:
+        example = self.laid_out(np.zeros((1, ARM_NUMBERS), np.float32)).shape[1]
+        if example != self._state_numbers:
+            return f"{self.checkpoint} reads {self._state_numbers} numbers as its state; the arm's are {example}"
+        return _problem(lambda: self.state_units)
+
+    @property
+    def _state_numbers(self) -> int:
+        return int(self.config.input_features[STATE].shape[0])
 
     def infer(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
         """(B, chunk, D) normalised actions for a batch in lerobot's keys.
@@ -274,26 +297,43 @@ class LerobotFlow(Policy):
             chunk: Tensor = self.network.predict_action_chunk(batch, noise=noise)
         return chunk
 
-    def batch(self, seen: Sequence[Observation]) -> dict[str, Tensor]:
-        """The observations in lerobot's keys; the environment's picture goes to the first camera."""
+    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+        """The observations in lerobot's keys; the environment's picture goes to the first camera.
+
+        state: (B, numbers) as the network reads them; None for that of the observations.
+        """
         device = self.config.device
         tokens, mask = self.tokenise([o.instruction for o in seen])
-        state = np.stack([np.asarray(o.state, np.float32) for o in seen])
-        expected = self.config.input_features[STATE].shape[0]
-        if state.shape[1] != expected:
-            raise ObservationError(f"the state has {state.shape[1]} numbers; this checkpoint reads {expected}")
+        numbers = self.state(seen) if state is None else state
         return {
             **{f"{IMAGES}{camera}": self._pictures(camera, seen) for camera in self.shown},
-            STATE: torch.from_numpy(self.state_units.normalise(state)).to(device),
+            STATE: torch.from_numpy(numbers).to(device),
             TOKENS: tokens.to(device),
             MASK: mask.to(device),
         }
 
+    def state(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+        """(B, numbers) as the network reads them. Raises ObservationError for another count of numbers."""
+        rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in seen]))
+        if rows.shape[1] != self._state_numbers:
+            raise ObservationError(
+                f"the state has {rows.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
+            )
+        return self.state_units.normalise(rows)
+
+    def laid_out(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, numbers) of (B, 8): the state in the order this checkpoint was given it."""
+        return state
+
     def _pictures(self, camera: str, seen: Sequence[Observation]) -> Tensor:
-        """(B, 3, H, W) in [0, 1]: the part of each picture that this checkpoint looks at."""
+        """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""
         own = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in seen]
-        images = torch.from_numpy(np.stack([checked_picture(image) for image in own]))
-        return self.window(camera)(images.permute(0, 3, 1, 2).to(self.config.device).float() / 255)
+        return self.look(camera, [checked_picture(image) for image in own])
+
+    def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: the part of each picture (H, W, 3) that this checkpoint looks at."""
+        rows = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+        return self.window(camera)(rows.to(self.config.device).float() / 255)
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, max_action_dim) float32 flow noise, a row per seed, the same on every device."""
@@ -335,14 +375,34 @@ class LerobotFlow(Policy):
         return {}
 
     @cached_property
-    def state_units(self) -> Normaliser:
-        """Metres and radians to what the network reads."""
-        return read_normaliser(self.folder, "policy_preprocessor", STATE, "STATE")
+    def state_units(self) -> Units:
+        """Metres and radians to what the network reads. Raises CheckpointError if nothing says."""
+        return self.units_of(STATE, "STATE")
 
     @cached_property
-    def action_units(self) -> Normaliser:
-        """What the network writes to metres and radians."""
-        return read_normaliser(self.folder, "policy_postprocessor", "action", "ACTION")
+    def action_units(self) -> Units:
+        """What the network writes to metres and radians. Raises CheckpointError if nothing says."""
+        return self.units_of("action", "ACTION")
+
+    def units_of(self, feature: str, kind: str) -> Units:
+        """The units of one feature, STATE or ACTION."""
+        if (own := self.own_units(feature, kind)) is not None:
+            return own
+        raise CheckpointError(
+            f"{self.checkpoint} does not normalise its {feature} and no policy_preprocessor.json says so: "
+            "its units are unknown"
+        )
+
+    def own_units(self, feature: str, kind: str) -> Normaliser | None:
+        """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
+        pipeline = "policy_preprocessor" if kind == "STATE" else "policy_postprocessor"
+        if (self.folder / f"{pipeline}.json").is_file():
+            return read_normaliser(self.folder, pipeline, feature, kind)
+        return from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
+
+    @cached_property
+    def _buffers(self) -> dict[str, NDArray[np.float32]]:
+        return read_buffers(self.folder)
 
     # -- listening ---------------------------------------------------------------------------------------
 
@@ -377,5 +437,10 @@ class LerobotFlow(Policy):
         return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
 
 
-def _stream(name: str, stack: Stack) -> Stream:
-    return Stream(name, len(stack.layers) + 1, stack.width, stack.iterations)
+def _problem(read: Callable[[], object]) -> str | None:
+    """What is wrong with the checkpoint, as far as `read` finds out."""
+    try:
+        read()
+    except CheckpointError as error:
+        return str(error)
+    return None

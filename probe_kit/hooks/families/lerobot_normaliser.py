@@ -1,17 +1,40 @@
-"""Normalisation with the statistics a lerobot checkpoint carries in its processor files."""
+"""Normalisation with the statistics of a lerobot checkpoint: in processor files or, until 2025, in its weights."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file
 
 from probe_kit.errors import CheckpointError
+from probe_kit.models.pi0_keys import STATISTICS
 
+_EPS = 1e-8
 # The two statistics each mode needs, as (offset-like, scale-like).
 _NEEDED = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}
+
+
+class Units(Protocol):
+    """Between physical units and the numbers of a network. mode, source: what it is and whence, in words."""
+
+    @property
+    def mode(self) -> str:
+        """The kind of map."""
+
+    @property
+    def source(self) -> str:
+        """The file the statistics come from."""
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D)."""
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Network output to physical units; (..., D)."""
 
 
 @dataclass(frozen=True)
@@ -83,3 +106,46 @@ def _statistics(
             "unit. Take the statistics of the data set it was trained on"
         )
     return arrays[wanted[0]], arrays[wanted[1]]
+
+
+def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
+    """The statistics that lerobot kept among the weights until 2025, by their names there; mostly none.
+
+    Raises CheckpointError if a weights file cannot be read.
+    """
+    found: dict[str, NDArray[np.float32]] = {}
+    for path in sorted(folder.glob("model*.safetensors")):
+        try:
+            with safe_open(path, "pt") as file:
+                names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
+                found |= {name: file.get_tensor(name).float().numpy() for name in names}
+        except SafetensorError as error:
+            raise CheckpointError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+    return found
+
+
+def from_buffers(
+    buffers: Mapping[str, NDArray[np.float32]], modes: Mapping[str, object], feature: str, kind: str, source: str
+) -> Normaliser | None:
+    """The map of one feature from old buffers; None where the configuration normalises nothing.
+
+    modes: `normalization_mapping` of the configuration. source: whose weights they are, for messages.
+    Raises CheckpointError if a buffer is missing, or was never filled.
+    """
+    found = modes.get(kind, "IDENTITY")
+    mode = str(getattr(found, "value", found))
+    if mode == "IDENTITY":
+        return None
+    if mode not in _NEEDED:
+        raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
+    module = "normalize_inputs" if kind == "STATE" else "unnormalize_outputs"
+    names = [f"{module}.buffer_{feature.replace('.', '_')}.{statistic}" for statistic in _NEEDED[mode]]
+    missing = [name for name in names if name not in buffers]
+    unfilled = [name for name in names if name in buffers and not np.isfinite(buffers[name]).all()]
+    if missing or unfilled:
+        what = f"lack {', '.join(missing)}" if missing else f"hold {', '.join(unfilled)} that nobody filled"
+        raise CheckpointError(
+            f"{source} has no policy_preprocessor.json and its weights {what}: its {feature} has no physical "
+            "unit. Take the statistics of the data set it was trained on"
+        )
+    return Normaliser(mode, buffers[names[0]], buffers[names[1]], _EPS, "the weights")

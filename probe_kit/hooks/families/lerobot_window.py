@@ -1,10 +1,15 @@
-"""The part of a picture a policy looks at: lerobot's crop-and-resize step, read from a checkpoint."""
+"""The part of a picture a policy looks at: lerobot's crop-and-resize step, read from a checkpoint; other ways."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+import torch
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from lerobot.policies.smolvla.modeling_smolvla import resize_with_pad
+from numpy.typing import NDArray
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 
@@ -61,6 +66,19 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
             except TypeError as error:
                 raise CheckpointError(f"{path}: {STEP} cannot be read: {error}") from error
     return PictureWindow()
+
+
+def squashed(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 at `size` (height, width), proportions given up, with the filter of INT-ACT's client."""
+    height, width = size
+    resized: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LANCZOS4))
+    return resized
+
+
+def padded_top_left(pictures: Tensor, size: tuple[int, int]) -> Tensor:
+    """(B, 3, H, W) in [0, 1] at `size`, proportions kept, black on the left and top: lerobot until 0.3."""
+    height, width = size
+    return torch.as_tensor(resize_with_pad(pictures, width, height, pad_value=0)).clamp(0.0, 1.0)
 
 
 def _crop(top: int, left: int, height: int, width: int) -> tuple[int, int, int, int]:

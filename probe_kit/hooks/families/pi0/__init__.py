@@ -1,6 +1,9 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.82 million parameters."""
 
+from probe_kit.hooks.families.lerobot_evaluation import PICTURES
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+from probe_kit.hooks.state_layout import OPENNESS
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
 _VERIFIER = "probe_kit.hooks.families.lerobot_verify:verify_pi0"
@@ -29,15 +32,36 @@ FAMILIES = (
     Family(
         "pi0",
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
-        "lerobot/pi0_base",
+        "juexzz/INTACT-pi0-finetune-bridge",
         "probe_kit.hooks.families.pi0.adapter:load_pi0",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
-        embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
-        notes="Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated",
+        notes=(
+            "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. lerobot/pi0_base acts in 32 unnamed "
+            "dimensions: --checkpoint lerobot/pi0_base --listen"
+        ),
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="paligemma",
         full_size="probe_kit.models.pi0:full_size_pi0",
+        options=(
+            Option(
+                "statistics",
+                str,
+                "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
+                "none: its numbers are metres and radians.",
+                "the checkpoint's",
+            ),
+            Option(
+                "picture",
+                str,
+                "How pictures come to the network's resolution.",
+                "as the checkpoint's layout implies",
+                PICTURES,
+            ),
+            Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
+            Option("unread", str, "Settings of an old config.json that change nothing, comma-separated.", "none"),
+        ),
     ),
 )

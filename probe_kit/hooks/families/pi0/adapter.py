@@ -15,7 +15,9 @@ from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoint import side_files
-from probe_kit.hooks.families.lerobot_flow import LerobotFlow, Stack, flow_stacks
+from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
+from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
+from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.views import PADDING
 from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_keys import current_pi0_keys
@@ -24,7 +26,7 @@ from probe_kit.models.pi0_tiny import embedded_checkpoint
 _TOKENIZER = "google/paligemma-3b-pt-224"
 
 
-class Pi0(LerobotFlow):
+class Pi0(EvaluatedPi0):
     """A loaded pi0."""
 
     family = "pi0"
@@ -110,10 +112,20 @@ def load_pi0(
     device: str = "cpu",
     dtype: str | None = None,
     random_weights: bool = False,
+    *,
+    statistics: str | None = None,
+    picture: Picture | None = None,
+    openness: str = "measured",
+    unread: str = "",
     weights_seed: int = 0,
 ) -> Pi0:
-    """Load a lerobot pi0 checkpoint; see `LerobotFlow.load`."""
-    return Pi0.load(checkpoint, device, dtype, random_weights, weights_seed)
+    """Load a lerobot pi0 checkpoint, of today's layout or that of early 2025; see `LerobotFlow.load`.
+
+    statistics, picture, openness, unread: see `Evaluation`; unread is comma-separated.
+    """
+    names = tuple(name for name in unread.split(",") if name)
+    evaluation = Evaluation(statistics, picture, openness, names)
+    return Pi0.load(checkpoint, device, dtype, random_weights, weights_seed, evaluation)
 
 
 def load_pi0_tiny(

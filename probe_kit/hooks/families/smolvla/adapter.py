@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoint import side_files
-from probe_kit.hooks.families.lerobot_flow import LerobotFlow, Stack, flow_stacks
+from probe_kit.hooks.families.lerobot_flow import LerobotFlow
+from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
 from probe_kit.hooks.views import PADDING
 from probe_kit.models.smolvla import build_smolvla, current_smolvla_keys
 

@@ -1,0 +1,27 @@
+"""What an evaluation does around a checkpoint: picture, state, statistics that no file decides."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Picture = Literal["padded", "padded-top-left", "squashed"]
+PICTURES: tuple[Picture, ...] = ("padded", "padded-top-left", "squashed")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How observations and actions are treated around the network.
+
+    statistics: a file, the name of a shipped one, `none` for numbers that are units already, or None for what the
+    checkpoint says. picture: how a picture comes to the network's resolution; None for what the layout of the
+    checkpoint implies. openness: the state's last number, see `state_layout`. unread: settings of an old
+    config.json that are left out.
+    """
+
+    statistics: str | None = None
+    picture: Picture | None = None
+    openness: str = "measured"
+    unread: tuple[str, ...] = ()
+
+
+AS_STORED = Evaluation()
+"""Nothing but what the checkpoint says."""

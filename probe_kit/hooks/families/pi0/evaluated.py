@@ -1,0 +1,122 @@
+"""pi0 as its evaluation feeds it: the settings of older files, units, pictures and states that no file decides."""
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from lerobot.policies.pi0.configuration_pi0 import PI0Config
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoint import CONFIG_FILE
+from probe_kit.hooks.families.bounds import FILES, NO_STATISTICS, StatisticsFile, statistics_in
+from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
+from probe_kit.hooks.families.lerobot_flow import STATE, LerobotFlow
+from probe_kit.hooks.families.lerobot_normaliser import Normaliser, Units
+from probe_kit.hooks.families.lerobot_window import PictureWindow, padded_top_left, squashed
+from probe_kit.hooks.families.pi0.old_layout import current_config, is_old_layout
+from probe_kit.hooks.state_layout import ARM_NUMBERS, laid_out
+
+EVALUATED_WITH: Mapping[str, str] = {"juexzz/INTACT-pi0-finetune-bridge": "bridge"}
+"""Checkpoints whose units only their evaluation has, and the shipped statistics that it has."""
+
+
+class EvaluatedPi0(LerobotFlow):
+    """What `Evaluation` decides of a pi0, and what follows where it decides nothing."""
+
+    @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """Also of lerobot's older layout."""
+        values = json.loads((folder / CONFIG_FILE).read_text())
+        if not is_old_layout(values):
+            return super().parse_config(folder, evaluation)
+        known = [field.name for field in fields(PI0Config)]
+        current = current_config(values, known, str(folder / CONFIG_FILE), evaluation.unread)
+        with tempfile.TemporaryDirectory() as place:
+            (Path(place) / CONFIG_FILE).write_text(json.dumps(current))
+            return super().parse_config(Path(place), evaluation)
+
+    def further_settings(self) -> dict[str, str]:
+        """What the evaluation decides, as far as it decides anything."""
+        evaluation, said = self.evaluation, {}
+        if (file := self._statistics) is not None:
+            said["statistics"] = file.sha256
+        elif evaluation.statistics is not None:
+            said["statistics"] = evaluation.statistics
+        if self.picture != "padded":
+            said["picture"] = self.picture
+        if evaluation.openness != "measured":
+            said["openness"] = evaluation.openness
+        return said
+
+    def units_of(self, feature: str, kind: str) -> Units:
+        """The checkpoint's own; where it has none, those of its evaluation. Raises CheckpointError for both."""
+        given = self.evaluation.statistics
+        if given is not None and (own := self._own(feature, kind)) is not None and own.mode != "IDENTITY":
+            raise CheckpointError(
+                f"{self.checkpoint} holds the statistics of its {feature} itself ({own.source}), and {given} were "
+                "given too; leave -M statistics out"
+            )
+        if given == NO_STATISTICS:
+            nothing = np.zeros(0, np.float32)
+            return Normaliser("IDENTITY", nothing, nothing, 0.0, "-M statistics=none")
+        if self._statistics is not None:
+            part: Literal["proprio", "action"] = "proprio" if kind == "STATE" else "action"
+            action_numbers = int(self.config.output_features["action"].shape[0])
+            return self._statistics.bounds(part, self._state_numbers if kind == "STATE" else action_numbers)
+        if (own := self.own_units(feature, kind)) is not None:
+            return own
+        raise CheckpointError(
+            f"{self.checkpoint} leaves the units of its {feature} to its evaluation and has no "
+            f"{' or '.join(FILES)}. Pass -M statistics=bridge, or a FILE with p01 and p99 of action and "
+            "proprio, or none if its numbers are metres and radians"
+        )
+
+    def _own(self, feature: str, kind: str) -> Normaliser | None:
+        try:
+            return self.own_units(feature, kind)
+        except CheckpointError:
+            return None
+
+    @cached_property
+    def _statistics(self) -> StatisticsFile | None:
+        """As given; or, for a checkpoint without own ones, from its folder or its evaluation. Else None."""
+        given = self.evaluation.statistics
+        if given is None and self._own(STATE, "STATE") is None and self._own("action", "ACTION") is None:
+            given = statistics_in(self.folder) or EVALUATED_WITH.get(self.checkpoint)
+        return None if given in (None, NO_STATISTICS) else StatisticsFile.read(str(given))
+
+    @cached_property
+    def picture(self) -> Picture:
+        """How pictures come to the network's resolution: as asked, or as the checkpoint's layout implies."""
+        if self.evaluation.picture is not None:
+            return self.evaluation.picture
+        if self._statistics is not None:
+            return "squashed"
+        values = json.loads((self.folder / CONFIG_FILE).read_text())
+        return "padded-top-left" if is_old_layout(values) else "padded"
+
+    def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]; squashed and padded ones at the network's resolution."""
+        if self.picture == "padded":
+            return super().look(camera, images)
+        if self.window(camera) != PictureWindow():
+            raise CheckpointError(
+                f"{self.checkpoint} looks at a part of its pictures; -M picture={self.picture} cannot be combined "
+                "with that. Leave it out"
+            )
+        height, width = self.config.image_resolution
+        if self.picture == "squashed":
+            return super().look(camera, [squashed(image, (height, width)) for image in images])
+        return padded_top_left(super().look(camera, images), (height, width))
+
+    def laid_out(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Seven numbers where the evaluation's statistics are of seven."""
+        seven = self.evaluation.statistics is not None or self._statistics is not None
+        return laid_out(state, self._state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)

@@ -1,0 +1,178 @@
+"""The protocol's pi0: units, picture and state that its evaluation decides, on a generated tiny checkpoint."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from probe_kit.env.arm_models import WIDOWX
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks import Observation
+from probe_kit.hooks.families.bounds import StatisticsFile
+from probe_kit.hooks.families.pi0 import adapter, evaluated
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.registry import find_family
+from probe_kit.hooks.state_layout import CLOSED, OPENED, laid_out
+from tests.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_intact(tmp_path_factory.mktemp("intact") / "pi0")
+
+
+@pytest.fixture(scope="module")
+def statistics(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_statistics(tmp_path_factory.mktemp("statistics") / "client.json")
+
+
+@pytest.fixture(scope="module")
+def policy(folder: Path, statistics: Path) -> Pi0:
+    return load_pi0(str(folder), statistics=str(statistics))
+
+
+@pytest.fixture
+def seen() -> Observation:
+    image = np.random.default_rng(1).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    state = np.array([0.292, -0.006, 0.135, -0.0045, 0.0568, -0.019, 0.0, 0.8], np.float32)
+    return Observation(image, state, "Put the cube on the red shape")
+
+
+@pytest.mark.parametrize("openness", ["measured", "release"])
+def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
+    folder: Path, statistics: Path, policy: Pi0, seen: Observation, openness: str
+) -> None:
+    """Everything around the network recomputed in float64: squashed picture, seven numbers, p01 and p99."""
+    asked = (
+        policy if openness == "measured" else load_pi0(str(folder), statistics=str(statistics), openness=openness)
+    )
+    low, high = bounds_of("proprio")
+    gripper = 0.8 if openness == "measured" else 1 - (0.015 + 0.8 * 0.022)
+    numbers = np.array([*seen.state[:6], gripper], np.float64)
+    state = np.clip((numbers - low) / (high - low) * 2 - 1, -1, 1)
+    picture = cv2.resize(seen.image, (96, 96), interpolation=cv2.INTER_LANCZOS4)
+    raw = network_chunk(asked, picture, state, seen.instruction, SEED)
+    first, last = bounds_of("action")
+    expected = (raw + 1) / 2 * (last - first) + first
+    expected[:, 6] = raw[:, 6] > 0.5
+
+    actions = asked.act([seen], [SEED])
+    assert actions.shape == (1, 4, 7)
+    np.testing.assert_allclose(actions[0], expected, atol=1e-5)
+    assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}
+    assert asked.misfit() is None
+
+
+def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, statistics: Path, policy: Pi0) -> None:
+    settings = policy.card.settings
+    assert settings["statistics"] == StatisticsFile.read(str(statistics)).sha256
+    assert settings["picture"] == "squashed"
+    assert "openness" not in settings
+    released = load_pi0(str(folder), statistics=str(statistics), openness="release", picture="padded")
+    assert released.card.settings["openness"] == "release"
+    assert "picture" not in released.card.settings
+    assert policy.card.chunk == 4
+    assert "BOUNDS from client.json" in policy.card.notes[-1]
+
+
+def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(folder: Path, seen: Observation) -> None:
+    policy = load_pi0(str(folder))
+    assert "-M statistics=bridge" in str(policy.misfit())
+    with pytest.raises(CheckpointError, match="-M statistics=bridge"):
+        policy.act([seen], [0])
+
+
+def test_statistics_that_lie_in_the_folder_are_read(folder: Path, statistics: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "pi0"))
+    shutil.copy(statistics, copy / "dataset_statistics.json")
+    policy = load_pi0(str(copy))
+    assert policy.misfit() is None
+    np.testing.assert_allclose(policy.action_units.low, bounds_of("action")[0], rtol=1e-6)
+
+
+def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hub is stood in for by a folder: what is proved is what follows from the name."""
+    name = find_family("pi0").default_checkpoint
+    assert name in evaluated.EVALUATED_WITH
+    monkeypatch.setattr("probe_kit.hooks.families.lerobot_flow.checkpoint_folder", lambda _: folder)
+    policy = adapter.load_pi0(str(name))
+    assert policy.misfit() is None
+    assert policy.state_units.source == "bridge statistics shipped with probe_kit"
+    assert policy.picture == "squashed"
+
+
+def test_shipped_statistics_are_those_of_the_bridge_data() -> None:
+    shipped = StatisticsFile.read("bridge")
+    action, state = shipped.bounds("action", 7), shipped.bounds("proprio", 7)
+    assert action.low[0] == np.float32(-0.028539552688598632)
+    assert state.high[5] == np.float32(1.8378053522109963)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("{", "are no JSON"),
+        ("[]", "are a list"),
+        ("{}", "as none; this checkpoint needs 7"),
+        ('{"action": {"p01": [0], "p99": [1]}, "proprio": {"p01": [0], "p99": [1]}}', r"\(1,\) and \(1,\)"),
+        (json.dumps({p: {"p01": [1.0] * 7, "p99": [0.0] * 7} for p in ("action", "proprio")}), "p99 lies below"),
+        (json.dumps({"action": {"p01": [float("nan")] * 7, "p99": [0.0] * 7}}), "not finite"),
+    ],
+)
+def test_statistics_that_cannot_be_meant_are_refused(tmp_path: Path, content: str, complaint: str) -> None:
+    file = tmp_path / "client.json"
+    file.write_text(content)
+    with pytest.raises(CheckpointError, match=complaint):
+        _ = StatisticsFile.read(str(file)).bounds("action", 7)
+
+
+def test_a_statistics_file_that_is_not_there_is_named(folder: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no statistics at nowhere\.json"):
+        load_pi0(str(folder), statistics="nowhere.json")
+
+
+def test_openness_as_the_release_has_it_uses_the_fingers_of_our_widowx() -> None:
+    assert (WIDOWX.closed, WIDOWX.opened) == (CLOSED, OPENED)
+    state = np.arange(8, dtype=np.float32)[None]
+    np.testing.assert_array_equal(laid_out(state, 7), [[0, 1, 2, 3, 4, 5, 7]])
+    state[0, 7] = 1.0
+    assert laid_out(state, 8, "release")[0, 7] == pytest.approx(1 - 0.037)
+    assert state[0, 7] == 1.0
+
+
+def test_listening_is_the_inference_that_acting_makes(policy: Pi0, seen: Observation) -> None:
+    heard = policy.listen([seen], [SEED])
+    np.testing.assert_array_equal(policy.action_units.restore(heard), policy.act([seen], [SEED]))
+
+
+def test_a_checkpoint_of_other_actions_and_another_state_can_be_listened_to(
+    folder: Path, tmp_path: Path, seen: Observation
+) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "base"))
+    config = json.loads((copy / "config.json").read_text())
+    config["input_features"]["observation.state"]["shape"] = [32]
+    config["output_features"]["action"]["shape"] = [32]
+    (copy / "config.json").write_text(json.dumps(config))
+    policy = load_pi0(str(copy))
+    assert "acts in 32 dimensions" in str(policy.misfit())
+    assert policy.deaf_to() == ("state",)
+    with pytest.raises(CheckpointError, match="acts in 32 dimensions"):
+        policy.act([seen], [0])
+    heard = policy.listen([seen], [SEED])
+    assert heard.shape == (1, 4, 32)
+    moved = replace(seen, state=seen.state + 1)
+    np.testing.assert_array_equal(policy.listen([moved], [SEED]), heard)
+
+
+@pytest.mark.parametrize("option", [{"picture": "cropped"}, {"openness": "wide"}])
+def test_options_of_other_values_are_refused(option: dict[str, str]) -> None:
+    with pytest.raises(UsageError, match="expected one of"):
+        find_family("pi0").check("/nowhere", options=option)
