@@ -16,6 +16,7 @@ from probe_kit.identity import derive_seed
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_categories
 from probe_kit.suite.converters import act2answer, compbench, iconqa, mmbench, okvqa, vlthink
+from probe_kit.suite.converters.act2answer_pairs import SOURCE as ACT2ANSWER
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
 from probe_kit.suite.converters.emission import emit, sample
@@ -99,11 +100,11 @@ def convert(
     Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
     should be; `out` is then left as it was.
     """
-    if source not in (*SOURCES, act2answer.SOURCE):
-        raise UsageError(f"unknown source {source!r}; available: {', '.join((*SOURCES, act2answer.SOURCE))}.")
+    if source not in (*SOURCES, ACT2ANSWER):
+        raise UsageError(f"unknown source {source!r}; available: {', '.join((*SOURCES, ACT2ANSWER))}.")
     if n < 1:
         raise UsageError(f"n is {n}; expected at least 1 item per category.")
-    if source == act2answer.SOURCE:
+    if source == ACT2ANSWER:
         if curation is not None or emit_curation is not None:
             raise UsageError(f"{source} takes no curation: its questions are taken over as they are.")
         return act2answer.convert_set(Path(root), Path(out), categories, n, options)
