@@ -77,8 +77,7 @@ class Scene:
     def reset(self, pictures: Mapping[Side, Image.Image], cube_position: XYZ, cube_yaw: float) -> None:
         """Put everything back to its start, with these pictures on the tiles."""
         if not (self._healthy and self.textures.has_room(len(pictures))):
-            # restoreState does not heal a state that was once not finite, and only a reload frees textures.
-            self._build()
+            self._reload()
         self.client.restoreState(self._saved)
         # The saved cube floats far above the table: one step lets contacts of the last episode expire.
         self.client.stepSimulation()
@@ -199,6 +198,16 @@ class Scene:
                 self._put(self.tiles[side], TILE_LIMBO[side], spec.tile_yaw)
         self._saved = client.saveState()
         self._healthy = True
+
+    def _reload(self) -> None:
+        """Load everything into a new server.
+
+        restoreState does not heal a state that was once not finite, and resetSimulation keeps a copy of every
+        texture (0.2 MB): only the end of a server frees all of its memory.
+        """
+        self.client.close()
+        self.client = BulletClient()
+        self._build()
 
     def _find_home(self) -> Array:
         spec, posture, limits = self.spec, np.array(self.arm.model.posture), self.spec.limits

@@ -15,8 +15,8 @@ from probe_kit.env.bullet import BulletClient
 
 TEXTURE_PIXELS = 256
 """Side of a texture; a tile covers about 170 pixels of the rendered picture."""
-TEXTURE_BUDGET = 512
-"""Textures per loaded scene. PyBullet frees none of them before the whole scene is reloaded."""
+TEXTURE_BUDGET = 128
+"""Textures per loaded scene, 0.6 MB each. PyBullet frees none of them before the scene is reloaded."""
 
 
 def write_quad(path: Path, side: float) -> None:
