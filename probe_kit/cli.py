@@ -5,31 +5,38 @@ stderr.
 """
 
 import signal
+import sys
+import warnings
+from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
 import typer.core
-from rich.markup import escape
 
 from probe_kit.commands import demo, doctor
-from probe_kit.console import err, out
-from probe_kit.errors import ProbeKitError, UsageError
+from probe_kit.console import marked, out, say
+from probe_kit.endings import tell
+from probe_kit.errors import UsageError
 from probe_kit.extract.commands import MOVED, extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import verify
+from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import show, train
 from probe_kit.train.power_commands import power
 
-INTERRUPTED = 130
 ORDER = ("demo", "doctor", "models", "suite", "extract", "run", "train", "power", "retention", "export", "verify")
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 """click's UsageError, from the copy of click that typer uses, whichever that is."""
+_FOR_TYPER: tuple[type[BaseException], ...] = (
+    typer.Exit, typer.Abort, typer.BadParameter.__mro__[2], BrokenPipeError
+)  # fmt: skip
+"""What typer answers: an exit code, complaints about arguments, and a reader such as `head` that has enough."""
 
 
 class Commands(typer.core.TyperGroup):
@@ -51,25 +58,10 @@ class Commands(typer.core.TyperGroup):
         """Run the chosen command."""
         try:
             return self._run(ctx)
-        except KeyboardInterrupt:
-            err.print("[yellow]interrupted[/]; everything finished so far is kept, the same command continues")
-            raise typer.Exit(INTERRUPTED) from None
-        except ProbeKitError as error:
-            err.print(
-                f"[bold red]{type(error).__name__}[/]: {escape(str(error))}", highlight=False, soft_wrap=True
-            )
-            for note in getattr(error, "__notes__", []):
-                err.print(f"  {escape(note)}", highlight=False, soft_wrap=True)
-            raise typer.Exit(error.exit_code) from error
-        except _PATH_ERRORS as error:
-            if error.filename is None:
-                raise
-            err.print(
-                f"[bold red]{UsageError.__name__}[/]: {escape(_path_message(error))}",
-                highlight=False,
-                soft_wrap=True,
-            )
-            raise typer.Exit(UsageError.exit_code) from error
+        except _FOR_TYPER:
+            raise
+        except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last to hear of it
+            raise typer.Exit(tell(error)) from error
 
     def _run(self, ctx: Any) -> Any:
         try:
@@ -87,6 +79,7 @@ class Commands(typer.core.TyperGroup):
         if homes:
             named = ", ".join(f"`probe-kit {path}`" for path in homes)
             error.message, error.possibilities = f"{option} is no option here, but one of {named}.", None
+        error.message = visible(str(error.message))
         found: Exception = error
         return found
 
@@ -105,14 +98,6 @@ def _options(command: Any) -> set[str]:
     return {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
 
 
-_PATH_ERRORS = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""What the system says of a path that cannot be what it was given for."""
-
-
-def _path_message(error: OSError) -> str:
-    return f"{error.filename2 or error.filename} cannot be used: {error.strerror}. Give another path"
-
-
 app = typer.Typer(
     cls=Commands,
     help="What does a robot policy still know, where inside it, and where on the way to the action is it lost?",
@@ -128,7 +113,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from probe_kit import __version__
 
-        out.print(f"probe-kit {__version__}", highlight=False)
+        out.print(f"probe-kit {__version__}")
         raise typer.Exit
 
 
@@ -148,7 +133,16 @@ for command in (extract, export, demo, models, verify, train, power, retention, 
     app.command()(command)
 
 
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as a note on stderr; where in our code it was raised is of no use to anybody here."""
+    say(marked("[yellow]warning:[/] {}", message))
+
+
 def main() -> None:
     """Entry point; a SIGTERM counts as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # signs that the terminal's encoding lacks are no reason to fail
+            stream.reconfigure(errors="backslashreplace")
+    warnings.showwarning = _show_warning
     app()

@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
-from probe_kit.console import counter, err, out, print_json, progress
+from probe_kit.console import counter, err, marked, out, print_json, progress
 
 if TYPE_CHECKING:
     from probe_kit.doctor import Finding
@@ -43,7 +42,7 @@ def demo(
     with progress() as bar:
         made = run_demo(out_folder, lambda stage: counter(bar, stage))
     out.print(made.table.to_rich())
-    out.print(made.next_steps(), highlight=False, soft_wrap=True)
+    out.print(made.next_steps(), soft_wrap=True)
 
 
 def doctor(
@@ -63,6 +62,7 @@ def doctor(
 
 def _print_findings(findings: "list[Finding]") -> None:
     from rich.table import Table
+    from rich.text import Text
 
     colours = {"ok": "green", "note": "yellow", "missing": "red"}
     table = Table(show_header=False, box=None, pad_edge=False)
@@ -70,7 +70,7 @@ def _print_findings(findings: "list[Finding]") -> None:
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        advice = f"\n[dim]{escape(finding.advice)}[/]" if finding.advice else ""
-        mark = f"[{colours[finding.state]}]{finding.state}[/]"
-        table.add_row(mark, finding.subject, escape(finding.seen) + advice)
+        advice = marked("\n[dim]{}[/]", finding.advice) if finding.advice else ""
+        mark = marked(f"[{colours[finding.state]}]{{}}[/]", finding.state)
+        table.add_row(mark, finding.subject, Text.assemble(finding.seen, advice))
     out.print(table)

@@ -4,6 +4,9 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.text import Text
+
+from probe_kit.console import marked
 from probe_kit.extract import Run
 from probe_kit.extract.store.layout import VIDEOS
 from probe_kit.organisms import TRAINED, Finding, NamedProgress, compare, probed
@@ -25,21 +28,22 @@ class Demo:
     run: Run
     table: RetentionTable
 
-    def next_steps(self) -> str:
+    def next_steps(self) -> Text:
         """Where to look, and what to try."""
-        lines = [
-            f"[bold]Look at[/] {self.folder / 'report.html'}  everything on one page, in a browser",
+        lines: list[str | Text] = [
+            marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
             f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
             f"        {self.folder / 'episode.gif'}  what one episode looks like",
             f"        {self.folder / 'table.md'}  the tables above",
             f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
-            "[bold]Try[/]     probe-kit suite show            the questions",
+            marked("[bold]Try[/]     probe-kit suite show            the questions"),
             "        probe-kit extract --model expert --items 4    a policy that knows the answers",
             "        probe-kit models                the models that can be probed",
         ]
         if self.run.random_weights:
-            lines.insert(0, "[bold yellow]The policy has random weights:[/] expect SR near 0 and no signal.")
-        return "\n".join(lines)
+            warning = "[bold yellow]The policy has random weights:[/] expect SR near 0 and no signal."
+            lines.insert(0, marked(warning))
+        return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:

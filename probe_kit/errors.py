@@ -75,6 +75,10 @@ class WeightsError(ProbeKitError):
     exit_code = 3
 
 
+class PolicyFailedError(ProbeKitError):
+    """The code of a policy raised an error of its own, ended the process, or gave what are no actions."""
+
+
 class CheckpointError(ProbeKitError):
     """A file that belongs to a checkpoint is missing or contradicts another."""
 
@@ -127,7 +131,7 @@ class SettingsMismatchError(ProbeKitError):
 
 
 class DiskSpaceError(ProbeKitError):
-    """The run would not fit on the disk."""
+    """The disk is full or read-only, or the run would not fit on it."""
 
     exit_code = 3
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, err, out, progress, split
+from probe_kit.console import counter, err, marked, out, progress, say, split
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def _print_plan(extraction: "Extraction", location: "Location") -> None:
     }
     table = Table(show_header=False, title="plan", box=None)
     for name, value in rows.items():
-        table.add_row(f"[dim]{name}[/]", value)
+        table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
 
 
@@ -217,7 +217,7 @@ def _describe(stored: Any) -> str:
 def _print_outcomes(run: "Run") -> None:
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
-    err.print(f"{len(run.episodes)} episodes: {text}", highlight=False)
+    say(f"{len(run.episodes)} episodes: {text}")
     step = "retention" if not run.streams else "train"
-    err.print(f"next: [bold]probe-kit {step} {run.location}[/]", highlight=False, soft_wrap=True)
-    out.print(str(run.location), highlight=False, soft_wrap=True)
+    say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
+    out.print(str(run.location), soft_wrap=True)

@@ -3,9 +3,8 @@
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
-from probe_kit.console import out, print_json
+from probe_kit.console import marked, out, print_json
 
 
 def models(
@@ -24,14 +23,14 @@ def models(
         print_json(rows)
         return
     for row in rows:
-        out.print(f"[bold]{row['model']}[/]  {escape(row['description'])}", highlight=False)
+        out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
         for key in ("checkpoint", "streams", "embodiment", "does", "ready", "notes"):
             if row[key]:
-                out.print(f"  [dim]{key:10}[/] {escape(row[key])}", highlight=False, soft_wrap=True)
+                out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
-            out.print(f"  [dim]option    [/] {escape(line)}", highlight=False, soft_wrap=True)
+            out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:

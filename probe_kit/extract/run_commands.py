@@ -30,7 +30,7 @@ def verify(
         failed = f", {found.failed} failed" if found.failed else ""
         out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
         for problem in found.problems:
-            out.print(f"damaged: {problem}", highlight=False, markup=False, soft_wrap=True)
+            out.print(f"damaged: {problem}", soft_wrap=True)
     if not found.ok:
         raise typer.Exit(DAMAGED)
 
@@ -58,4 +58,4 @@ def export(
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")
     with err.status("exporting"):
-        out.print(str(export_run(location, style, target, partial)), highlight=False, soft_wrap=True)
+        out.print(str(export_run(location, style, target, partial)), soft_wrap=True)

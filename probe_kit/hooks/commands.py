@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.markup import escape
 
-from probe_kit.console import out, print_json
+from probe_kit.console import marked, out, print_json
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,6 +49,6 @@ def _print_verification(verification: "Verification") -> None:
         column.overflow = "fold"
     for c in verification.comparisons:
         error = "-" if c.error is None else f"{c.error:.2e}"
-        status = f"[{colours[c.status]}]{c.status}[/]"
-        table.add_row(c.output, error, f"{c.tolerance:.0e}", status, escape(c.note))
+        status = marked(f"[{colours[c.status]}]{{}}[/]", c.status)
+        table.add_row(c.output, error, f"{c.tolerance:.0e}", status, c.note)
     out.print(table)

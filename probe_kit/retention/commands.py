@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.markup import escape
 
-from probe_kit.console import err, out, split
+from probe_kit.console import err, marked, out, print_json_text, print_text, say, split
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -65,9 +64,10 @@ def retention(
     if style == "table":
         out.print(table.to_rich())
     else:
-        typer.echo(getattr(table, f"to_{style}")())
+        show = print_json_text if style == "json" else print_text
+        show(getattr(table, f"to_{style}")())
         for note in table.notes:
-            err.print(f"[yellow]note:[/] {escape(note)}", highlight=False, soft_wrap=True)
+            say(marked("[yellow]note:[/] {}", note))
     if figures is not None:
         _save_figures(listed, table, figures)
     if html is not None:
@@ -75,7 +75,7 @@ def retention(
 
         with err.status("drawing the report"):
             written = write_report(listed, html, table)
-        err.print(f"report: {written}", highlight=False, soft_wrap=True)
+        say(f"report: {written}")
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:
@@ -153,4 +153,4 @@ def _save_figures(runs: "list[Run]", table: "RetentionTable", folder: Path) -> N
     from probe_kit.retention.displays import gallery, save_figures
 
     for path in save_figures(gallery(runs, table), folder):
-        err.print(f"figure: {path}", highlight=False, soft_wrap=True)
+        say(f"figure: {path}")

@@ -37,7 +37,7 @@ def show(
 
     suite = default_suite() if folder is None else load_suite(folder)
     for path in contact_sheets(suite, out_folder):
-        out.print(str(path), highlight=False, soft_wrap=True)
+        out.print(str(path), soft_wrap=True)
 
 
 @app.command("list")
@@ -90,8 +90,8 @@ def validate(
     else:
         for category, accuracy in least.items():
             seen = f"{category}: a leak is found in 4 of 5 suites of this size from {100 * accuracy:.1f} % on"
-            out.print(seen, highlight=False, markup=False, soft_wrap=True)
-        out.print(report.to_text(), highlight=False, markup=False, soft_wrap=True)
+            out.print(seen, soft_wrap=True)
+        out.print(report.to_text(), soft_wrap=True)
     raise typer.Exit(0 if report.ok else 1)
 
 
@@ -123,7 +123,7 @@ def convert(
     """Turn a benchmark's files into a suite, counting every stage beside the paper's numbers."""
     from probe_kit.suite.converters import convert as convert_source
 
-    with err.status(f"converting {source}"):
+    with err.status("converting"):
         suite = convert_source(
             source,
             root,
@@ -136,7 +136,7 @@ def convert(
             **_options(option or []),
         )
     counts = ", ".join(f"{c} {sum(i.category == c for i in suite.items)}" for c in suite.categories)
-    out.print(f"{suite.identity}: {counts} items in {out_folder}", highlight=False, soft_wrap=True)
+    out.print(f"{suite.identity}: {counts} items in {out_folder}", soft_wrap=True)
 
 
 def _options(pairs: list[str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from rich.text import Text
 
-from probe_kit.console import counter, err, out, print_json, progress, split
+from probe_kit.console import counter, marked, out, print_json, progress, say, split
 from probe_kit.errors import UsageError
 from probe_kit.fitting_tables import Cell, FittingTable, Part
 
@@ -97,8 +97,8 @@ def train(
         )
     _print_peaks(results, opened.random_weights)
     if not results.controls.excess:
-        err.print("signal is judged against chance only: give --suite, or a --twin by random weights")
-    err.print(f"next: [bold]probe-kit retention {run}[/]", highlight=False, soft_wrap=True)
+        say("signal is judged against chance only: give --suite, or a --twin by random weights")
+    say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
 def show(
@@ -116,7 +116,7 @@ def show(
     out.print(_facts(found))
     if not found.probes:
         step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
-        out.print(f"no probes: {step}", highlight=False, soft_wrap=True)
+        out.print(f"no probes: {step}", soft_wrap=True)
 
 
 def _facts(found: "Inventory") -> "Table":

@@ -1,0 +1,47 @@
+"""JSON that others wrote: bounded in size and depth, with nothing in it that cannot be written again."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import ProbeKitError
+
+MOST_BYTES = 256 << 20
+"""The largest JSON file that is read; the vocabularies of tokenizers are a tenth of it."""
+_HALF = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+def parse_json(content: bytes | str) -> Any:
+    """The value. Raises ValueError for what is no UTF-8 or no JSON, nests too deeply, or has half characters."""
+    try:
+        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        value = json.loads(text)
+        (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
+    except RecursionError:
+        raise ValueError("it nests too deeply") from None
+    except UnicodeEncodeError:
+        raise ValueError("it holds half a surrogate pair, which is no character") from None
+    return value
+
+
+def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:
+    """What the file says. Raises `raises` with `advice` if it is missing, too large, unreadable or no JSON."""
+    try:
+        if (size := file.stat().st_size) > MOST_BYTES:
+            raise raises(f"{file} has {size / 1e6:,.0f} MB; expected JSON of at most {MOST_BYTES >> 20} MB. {advice}")
+        return parse_json(file.read_bytes())
+    except FileNotFoundError:
+        raise raises(f"{file} is missing. {advice}") from None
+    except OSError as error:
+        raise raises(f"{file} cannot be read ({error.strerror}). {advice}") from error
+    except ValueError as error:
+        raise raises(f"{file} is no JSON ({error}). {advice}") from error
+
+
+def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> dict[str, Any]:
+    """What the file says, if that is an object; raises as `read_json` does."""
+    value = read_json(file, raises, advice)
+    if not isinstance(value, dict):
+        raise raises(f"{file} holds a JSON {type(value).__name__}; expected an object. {advice}")
+    return value
