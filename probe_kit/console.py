@@ -126,7 +126,7 @@ def progress() -> Iterator[Progress]:
 def counter(bar: Progress, description: str) -> Callable[..., None]:
     """A callback (done, total, …) that moves one bar of `bar`, or says lines where there is no terminal."""
     if not err.is_terminal:
-        return Heartbeat(description, lambda line: err.print(line, highlight=False, markup=False, soft_wrap=True))
+        return Heartbeat(description, say)
     task = bar.add_task(description, total=None)
 
     def advance(done: int, total: int, *_: object) -> None:

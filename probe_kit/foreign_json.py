@@ -29,7 +29,8 @@ def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:
     """What the file says. Raises `raises` with `advice` if it is missing, too large, unreadable or no JSON."""
     try:
         if (size := file.stat().st_size) > MOST_BYTES:
-            raise raises(f"{file} has {size / 1e6:,.0f} MB; expected JSON of at most {MOST_BYTES >> 20} MB. {advice}")
+            most = f"expected JSON of at most {MOST_BYTES / 1e6:,.0f} MB"
+            raise raises(f"{file} has {size / 1e6:,.0f} MB; {most}. {advice}")
         return parse_json(file.read_bytes())
     except FileNotFoundError:
         raise raises(f"{file} is missing. {advice}") from None
