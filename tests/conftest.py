@@ -94,6 +94,12 @@ def golden_spatialvla() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_vlm() -> Path:
+    """References of models that answer, one folder each, and of their pictures at real sizes."""
+    return _golden("vlm")
+
+
+@pytest.fixture(scope="session")
 def pi0_tiny() -> "Pi0":
     from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 

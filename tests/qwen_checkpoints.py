@@ -1,6 +1,7 @@
 """What small checkpoints built on Qwen's vision-language models share: tokenizer, processor files, sizes."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,19 @@ ID = {token: 256 + index for index, token in enumerate(SPECIAL)}
 VOCABULARY = 272
 
 
-def write_tokenizer(folder: Path) -> Path:
-    """Byte-level BPE without merges, as `tokenizer.json`: it knows every word."""
+def write_tokenizer(folder: Path, special: Sequence[str] = SPECIAL) -> Path:
+    """Byte-level BPE without merges, as `tokenizer.json`: it knows every word.
+
+    special: tokens whose ids follow the 256 bytes, the first of them padding.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     bytes_ = {letter: index for index, letter in enumerate(sorted(ByteLevel.alphabet()))}
     tokenizer = Tokenizer(BPE(bytes_, []))
     tokenizer.pre_tokenizer = ByteLevel(add_prefix_space=False)
     tokenizer.decoder = ByteLevelDecoder()
-    tokenizer.add_special_tokens(list(SPECIAL))
+    tokenizer.add_special_tokens(list(special))
     tokenizer.save(str(folder / "tokenizer.json"))
-    settings = {"tokenizer_class": "Qwen2Tokenizer", "eos_token": "<|im_end|>", "pad_token": "<|endoftext|>"}
+    settings = {"tokenizer_class": "Qwen2Tokenizer", "eos_token": "<|im_end|>", "pad_token": special[0]}
     (folder / "tokenizer_config.json").write_text(json.dumps(settings))
     return folder
 

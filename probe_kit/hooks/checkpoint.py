@@ -57,10 +57,13 @@ def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
 
 
-def check_files(folder: Path, types: Sequence[str], weights: bool = True) -> None:
+def check_files(
+    folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
+) -> None:
     """Look at what can be wrong with a checkpoint before anything heavy is imported.
 
-    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read.
+    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
+    for other types that people may take for one of them, what to do.
     Raises CheckpointError for a missing or unreadable config or one of another model, WeightsError for missing
     weights.
     A folder of a LoRA adapter is left to its loader, which knows its base.
@@ -76,9 +79,8 @@ def check_files(folder: Path, types: Sequence[str], weights: bool = True) -> Non
         raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
     found = config.get("type") or config.get("model_type") if isinstance(config, dict) else None
     if found not in types:
-        raise CheckpointError(
-            f"{file} holds a {found!r} model; expected {' or '.join(types)}. Pass the right --model"
-        )
+        way_out = dict(instead).get(str(found), "Pass the right --model")
+        raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
     if weights and (lacking := missing_weights(folder)):
         raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
 

@@ -29,7 +29,9 @@ class Family:
     default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
     loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
     random_weights) gives a Model, and takes `weights_seed` if its random twins can differ; verifier(folder,
-    recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device.
+    recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device; it
+    takes the name of one where there are `sizes`. stored_names: `module:constant`, how names of tensors in
+    released files become those of the network, see `probe_kit.models.naming`.
     options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, a Reader.
     hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
     config.json. packages: modules of an extra that it needs, with the name of that extra.
@@ -38,7 +40,8 @@ class Family:
     source: name of the reader whose network this policy grew from, if it is one of ours. sizes: hub ids of the
     released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
-    none, and then only the loader knows one when it sees it. needs_checkpoint: nothing is there by default.
+    none, and then only the loader knows one when it sees it. instead: for other such types that people may take
+    for one of them, what to do. needs_checkpoint: nothing is there by default.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -51,6 +54,7 @@ class Family:
     notes: str = ""
     verifier: str | None = None
     full_size: str | None = None
+    stored_names: str | None = None
     options: tuple[Option, ...] = ()
     acts: bool = True
     reads: bool = False
@@ -58,6 +62,7 @@ class Family:
     hub: tuple[tuple[str, str], ...] = ()
     packages: tuple[tuple[str, str], ...] = ()
     config_types: tuple[str, ...] = ()
+    instead: tuple[tuple[str, str], ...] = ()
     needs_checkpoint: bool = False
     source: str | None = None
     sizes: tuple[tuple[str, str], ...] = ()
@@ -71,7 +76,8 @@ class Family:
                 )
         if self.sizes:
             names = tuple(name for name, _ in self.sizes)
-            size = Option(SIZE, str, "Which of the released sizes, instead of --checkpoint.", names[0], names)
+            said = f"A released size ({', '.join(names)}) instead of --checkpoint."
+            size = Option(SIZE, str, said, names[0], names)
             object.__setattr__(self, "options", (*self.options, size))
 
     def load(
@@ -130,7 +136,7 @@ class Family:
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if place is not None and self.config_types:
-            check_files(checkpoint_folder(place), self.config_types, weights=not random_weights)
+            check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
         return chosen
 
     def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
@@ -149,7 +155,12 @@ class Family:
         path = getattr(self, purpose)
         if path is None:
             raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
-        return imported(path)
+        found: Callable[..., Any] = imported(path)
+        return found
+
+    def renames(self) -> tuple[tuple[str, str], ...]:
+        """How names of tensors in released files become the network's; empty if they are the same."""
+        return () if self.stored_names is None else tuple(imported(self.stored_names))
 
     def missing(self) -> str:
         """What this machine lacks to run the family, its default checkpoint included; empty if it is ready."""
@@ -190,8 +201,7 @@ def check_machine(device: str, dtype: str | None) -> None:
         raise UsageError(f"device {device!r} cannot be used: {reason}. {what_is_here()}") from error
 
 
-def imported(path: str) -> Callable[..., Any]:
-    """The function that `module:function` names."""
-    module, function = path.split(":")
-    found: Callable[..., Any] = getattr(import_module(module), function)
-    return found
+def imported(path: str) -> Any:
+    """What `module:name` names."""
+    module, name = path.split(":")
+    return getattr(import_module(module), name)

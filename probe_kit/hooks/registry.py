@@ -17,7 +17,20 @@ if TYPE_CHECKING:
     from probe_kit.hooks.model import Model, Policy
 
 ENTRY_POINTS = "probe_kit.policies"
-FOLDERS = ("pi0", "smolvla", "openvla", "spatialvla", "prismatic", "magma", "xiaomi", "internvla")
+FOLDERS = (
+    "pi0",
+    "smolvla",
+    "openvla",
+    "spatialvla",
+    "prismatic",
+    "magma",
+    "xiaomi",
+    "internvla",
+    "paligemma",
+    "qwen2_5_vl",
+    "qwen3_vl",
+    "internvl",
+)
 """In the order in which `probe-kit models` lists them."""
 
 

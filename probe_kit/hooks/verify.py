@@ -13,6 +13,7 @@ from torch import Tensor
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.registry import find_family
+from probe_kit.models.naming import renamed
 
 Status = Literal["ok", "over", "not compared"]
 Produce = Callable[[], NDArray[Any]]
@@ -53,12 +54,13 @@ def compare(
     produced: Mapping[str, Produce],
     tolerance: float,
     valid: Mapping[str, NDArray[np.bool_]],
+    absolute: bool = False,
 ) -> tuple[Comparison, ...]:
     """Compare every recorded output but the inputs (`in_…`).
 
     tolerance: of an output whose values are below one; larger values may differ by as much of the largest one.
     produced: how to make each output we can make. valid: per output a mask over its leading axes behind the
-    first, where only some positions mean anything.
+    first, where only some positions mean anything. absolute: the tolerance is the same for larger values.
     """
     comparisons = []
     for name in sorted(recorded):
@@ -74,7 +76,9 @@ def compare(
             note = f"shape {ours.shape}, recorded {theirs.shape}"
             comparisons.append(Comparison(name, "over", None, tolerance, note))
             continue
-        error, allowed = _largest_error(ours, theirs, valid.get(name)), _allowed(theirs, tolerance)
+        error = _largest_error(ours, theirs, valid.get(name))
+        exact = not np.issubdtype(theirs.dtype, np.floating)
+        allowed = tolerance if absolute and not exact else _allowed(theirs, tolerance)
         comparisons.append(Comparison(name, "ok" if error <= allowed else "over", error, allowed))
     return tuple(comparisons)
 
@@ -113,29 +117,26 @@ def verify_reference(family: str, folder: Path) -> Verification:
 def verify_keys(family: str, file: Path) -> Verification:
     """Build the full-size model on the meta device and compare names, shapes and dtypes with a recorded list.
 
-    file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}. Keys that the family
-    declares as `unstored` may be recorded; they are listed as not compared.
+    file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}, under the network's
+    names or those of released files. Keys that the family declares as `unstored` may be recorded; they are listed
+    as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
+    several released sizes the one that the list differs least from is meant.
     """
     if not file.is_file():
         raise UsageError(f"key list {file} does not exist")
     raw = file.read_bytes()
     recorded = json.loads(gzip.decompress(raw) if file.suffix == ".gz" else raw)["keys"]
     known = find_family(family)
-    ours = {name: _described(tensor) for name, tensor in known.function("full_size")().state_dict().items()}
-    unstored = sorted(name for name in recorded.keys() - ours.keys() if _is_declared(name, known.unstored))
-    theirs = {
-        name: (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items() if name not in unstored
-    }
-    wrong = [f"{name}: missing here" for name in sorted(theirs.keys() - ours.keys())]
-    wrong += [f"{name}: not recorded" for name in sorted(ours.keys() - theirs.keys())]
-    wrong += [
-        f"{name}: {ours[name]}, recorded {theirs[name]}"
-        for name in sorted(ours.keys() & theirs.keys())
-        if ours[name] != theirs[name]
-    ]
+    build, renames = known.function("full_size"), known.renames()
+    theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
+    sizes: list[str | None] = [name for name, _ in known.sizes] or [None]
+    found = {size: _differences(build(size) if size else build(), theirs, known.unstored) for size in sizes}
+    size = min(found, key=lambda name: len(found[name]))
+    wrong, unstored = found[size], sorted(name for name in theirs if _is_declared(name, known.unstored))
     whole = Comparison(
-        f"{len(theirs)} keys", "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8])
-    )
+        f"{len(theirs) - len(unstored)} keys{f' of {size}' if size else ''}",
+        "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8]),
+    )  # fmt: skip
     left_out = Comparison(
         f"{len(unstored)} keys the network does not have", "not compared", None, 0.0,
         f"declared by the family as never read: {', '.join(unstored)}",
@@ -143,10 +144,32 @@ def verify_keys(family: str, file: Path) -> Verification:
     return Verification(family, str(file), (whole, left_out) if unstored else (whole,))
 
 
+Described = tuple[tuple[int, ...], str]
+
+
+def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[str, ...]) -> list[str]:
+    """What is wrong with a list of keys; nothing if it is this network's."""
+    state = network.state_dict(keep_vars=True)
+    ours = {name: _described(tensor) for name, tensor in state.items()}
+    present = {id(state[name]) for name in ours.keys() & theirs.keys()}
+    wrong = [
+        f"{name}: missing here" for name in sorted(theirs.keys() - ours.keys()) if not _is_declared(name, unstored)
+    ]
+    wrong += [
+        f"{name}: not recorded" for name in sorted(ours.keys() - theirs.keys()) if id(state[name]) not in present
+    ]
+    wrong += [
+        f"{name}: {ours[name]}, recorded {theirs[name]}"
+        for name in sorted(ours.keys() & theirs.keys())
+        if ours[name] != theirs[name]
+    ]
+    return wrong
+
+
 def _is_declared(name: str, declared: tuple[str, ...]) -> bool:
     """Whether `name` is one of `declared`, or begins with one that ends in a dot."""
     return any(name == entry or (entry.endswith(".") and name.startswith(entry)) for entry in declared)
 
 
-def _described(tensor: Tensor) -> tuple[tuple[int, ...], str]:
+def _described(tensor: Tensor) -> Described:
     return tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")

@@ -28,3 +28,26 @@ class Packed:
             ids[index, : len(row) - 1], ids[index, -1] = torch.tensor(row[:-1]), row[-1]
             mask[index, : len(row) - 1], mask[index, -1] = True, True
         return cls(ids, mask)
+
+
+@dataclass(frozen=True)
+class LeftPacked:
+    """Prompts as one batch: ids (B, T) int64 and mask (B, T) int64, 0 at padding, which stands before each row."""
+
+    ids: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[int]], padding: int, device: str = "cpu") -> "LeftPacked":
+        """Pack one prompt per row."""
+        longest = max(map(len, rows))
+        ids = torch.full((len(rows), longest), padding)
+        mask = torch.zeros((len(rows), longest), dtype=torch.long)
+        for index, row in enumerate(rows):
+            ids[index, longest - len(row) :] = torch.tensor(row)
+            mask[index, longest - len(row) :] = 1
+        return cls(ids.to(device), mask.to(device))
+
+    def positions(self, first: int = 0) -> Tensor:
+        """(B, T) positions that count tokens, not padding, from `first`."""
+        return (self.mask.cumsum(dim=1) - 1).clamp(min=0) + first

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -28,23 +29,34 @@ def fill[Network: nn.Module](
     read: Callable[[], Weights],
     dtype: str | None,
     tied: Callable[[Network], tuple[str, ...]],
+    named: Callable[[str], str] = str,
 ) -> Filled[Network]:
     """The network that `build(dtype, device)` makes, with exactly the weights that `read()` gives.
 
     dtype: float32 or bfloat16; default that of the tensors in the file. tied: parameters that are another one's
-    double, which a file may leave out; called with the network. Raises UsageError for another dtype, WeightsError
-    for weights that are not exactly the network's.
+    double, which a file may leave out; called with the network. named: the network's name of a tensor in the file.
+    Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
     """
     weights = read()
     name = checked_dtype(dtype or _stored_dtype(weights))
     network = build(DTYPES[name], "meta")
     tensors = {
-        key: value.to(DTYPES[name]) if value.is_floating_point() else value
+        named(key): value.to(DTYPES[name]) if value.is_floating_point() else value
         for key, value in weights.tensors.items()
     }
+    if len(tensors) < len(weights.tensors):
+        raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
     audit = load_weights(network, weights, tensors, tied(network), assign=True)
-    network.vlm.tie_weights()  # type: ignore[operator, union-attr]
-    if empty := [key for key, tensor in network.state_dict().items() if tensor.is_meta]:
+    tie: Any = getattr(network, "vlm", network)
+    tie.tie_weights()
+    for double in set(tied(network)) & set(tensors):
+        if not torch.equal(network.state_dict()[double], tensors[double]):
+            raise WeightsError(
+                f"{weights.source}: {double} differs from the tensor that config.json ties it to "
+                "(tie_word_embeddings); one of the two files is another model's"
+            )
+    every = {**network.state_dict(), **dict(network.named_buffers())}
+    if empty := [key for key, tensor in every.items() if tensor.is_meta]:
         raise WeightsError(f"{weights.source}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
     network.requires_grad_(False)
     return Filled(network, audit, name, None)

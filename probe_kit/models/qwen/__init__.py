@@ -6,14 +6,26 @@ The networks themselves are transformers' own Qwen classes. Nothing here listens
 from probe_kit.models.building import build_empty, fill_rotary, without_precision
 from probe_kit.models.qwen.chat import IMAGE, image_slots
 from probe_kit.models.qwen.inputs import QwenInputs, pack_inputs
+from probe_kit.models.qwen.networks import (
+    QWEN2_5_NAMES,
+    build_qwen2_5_vl,
+    build_qwen3_vl,
+    full_size_qwen2_5_vl,
+    full_size_qwen3_vl,
+)
 from probe_kit.models.qwen.pictures import QwenPictures, merged_tokens
 
 __all__ = [
     "IMAGE",
+    "QWEN2_5_NAMES",
     "QwenInputs",
     "QwenPictures",
     "build_empty",
+    "build_qwen2_5_vl",
+    "build_qwen3_vl",
     "fill_rotary",
+    "full_size_qwen2_5_vl",
+    "full_size_qwen3_vl",
     "image_slots",
     "merged_tokens",
     "pack_inputs",

@@ -1,0 +1,38 @@
+"""InternVL, on transformers' own network."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "internvl",
+        "InternVL3.5 (InternViT, Qwen3 decoder; pictures as tiles), on transformers' own network",
+        "OpenGVLab/InternVL3_5-8B-HF",
+        "probe_kit.hooks.families.internvl.adapter:load_internvl",
+        streams="backbone 37 layers, answer 37 layers (8B)",
+        embodiment="none: answers, does not act",
+        notes="the repositories that end in -HF; 8B 17 GB, 38B 77 GB in bfloat16",
+        verifier="probe_kit.hooks.families.internvl.adapter:verify_internvl",
+        config_types=("internvl",),
+        instead=(
+            (
+                "internvl_chat",
+                "It is laid out for its authors' own code; take the repository of the same name that ends in -HF",
+            ),
+        ),
+        full_size="probe_kit.models.internvl:full_size_internvl",
+        stored_names="probe_kit.models.internvl:FILE_NAMES",
+        sizes=(
+            ("8B", "OpenGVLab/InternVL3_5-8B-HF"),
+            ("38B", "OpenGVLab/InternVL3_5-38B-HF"),
+        ),
+        options=(
+            Option(
+                "tiles", str, "1: every picture as one tile; auto: as released.", "auto", choices=("auto", "1")
+            ),
+            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
+        ),
+        acts=False,
+        reads=True,
+    ),
+)

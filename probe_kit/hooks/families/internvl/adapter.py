@@ -1,0 +1,92 @@
+"""The adapter for InternVL: Qwen's chat without a system turn, pictures as tiles."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+from numpy.typing import NDArray
+from torch import Tensor
+from transformers import InternVLConfig
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.families.qwen_reader import ASSISTANT, USER
+from probe_kit.hooks.families.vlm import Loaded, Pictures, VisionLanguageModel
+from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
+from probe_kit.hooks.families.vlm_text import Frame
+from probe_kit.hooks.families.vlm_verify import verify_vlm
+from probe_kit.hooks.model import Tap
+from probe_kit.hooks.verify import Comparison
+from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
+
+TILES = ("auto", "1")
+_RECIPE = Recipe(InternVLConfig.from_dict, build_internvl, FILE_NAMES)
+
+
+class InternVL(VisionLanguageModel):
+    """A loaded InternVL. tiles: `auto` cuts pictures as released, `1` shows every one as one tile."""
+
+    family: ClassVar[str] = "internvl"
+    frame: ClassVar[Frame] = Frame(f"{USER}<img>", "</img>\n", USER, ASSISTANT)
+    picture_token: ClassVar[str | None] = "<IMG_CONTEXT>"
+
+    def __init__(self, loaded: Loaded, tokenizer: str | None = None, tiles: str = "auto") -> None:
+        if tiles not in TILES:
+            raise UsageError(f"tiles is {tiles!r}; expected {' or '.join(TILES)}")
+        self.tiles = tiles
+        super().__init__(loaded, tokenizer, tiles=tiles)
+
+    @property
+    def vision_size(self) -> tuple[int, int]:
+        """Blocks and width of the vision tower."""
+        vision = self.network.config.vision_config
+        return int(vision.num_hidden_layers), int(vision.hidden_size)
+
+    def vision_tap(self, layer: int) -> Tap:
+        """The first norm of a block; the last site is what leaves the tower. A row per tile."""
+        tower = self.network.model.vision_tower
+        blocks = tower.encoder.layer
+        return Tap(tower.layernorm if layer == len(blocks) else blocks[layer].layernorm_before, 1)
+
+    @property
+    def _side(self) -> int:
+        return int(self.network.config.vision_config.image_size[0])
+
+    @cached_property
+    def pictures(self) -> TiledPictures:
+        """How pictures become tiles."""
+        return TiledPictures.from_folder(self.loaded.folder, self._side, self.tiles == "auto")
+
+    def picture_ids(self, height: int, width: int) -> list[int]:
+        """As many per tile as are left of its patches after their neighbours were joined."""
+        config = self.network.config
+        patches = self._side // int(config.vision_config.patch_size[0])
+        joined = int(patches * float(config.downsample_ratio)) ** 2
+        return [int(config.image_token_id)] * (joined * self.pictures.tiles(height, width))
+
+    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+        """pixel_values (tiles of all pictures, 3, S, S)."""
+        return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
+
+
+def load_internvl(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    tiles: str = "auto",
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> InternVL:
+    """Load InternVL of any size, from a folder or hub id in the layout of the `-HF` repositories; see `load_vlm`.
+
+    tiles: see `InternVL`. tokenizer: folder of another one.
+    """
+    loaded = load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed)
+    return InternVL(loaded, tokenizer, tiles)
+
+
+def verify_internvl(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
+    """Compare a reference."""
+    return verify_vlm(load_internvl(str(folder / "checkpoint"), dtype="float32"), folder, recorded)

@@ -1,0 +1,23 @@
+"""PaliGemma, on transformers' own network."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "paligemma",
+        "PaliGemma 3B (SigLIP, Gemma 2B; the prompt attends both ways), pi0's source",
+        "google/paligemma-3b-pt-224",
+        "probe_kit.hooks.families.paligemma.adapter:load_paligemma",
+        streams="backbone 19 layers, answer 19 layers",
+        embodiment="none: answers, does not act",
+        notes="Gemma licence, gated; pt, not mix: it was not trained to follow instructions; 5.9 GB in bfloat16",
+        verifier="probe_kit.hooks.families.paligemma.adapter:verify_paligemma",
+        config_types=("paligemma",),
+        full_size="probe_kit.models.paligemma:full_size_paligemma",
+        stored_names="probe_kit.models.paligemma:FILE_NAMES",
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        acts=False,
+        reads=True,
+    ),
+)

@@ -1,0 +1,85 @@
+"""The adapter for PaliGemma: picture, beginning of sequence, question, newline. The prompt attends both ways."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from transformers import PaliGemmaConfig
+
+from probe_kit.hooks.families.vlm import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
+from probe_kit.hooks.families.vlm_text import Frame
+from probe_kit.hooks.families.vlm_verify import verify_vlm
+from probe_kit.hooks.model import Tap
+from probe_kit.hooks.verify import Comparison
+from probe_kit.models.packing import LeftPacked
+from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
+
+_RECIPE = Recipe(PaliGemmaConfig.from_dict, build_paligemma, FILE_NAMES)
+_FIRST_POSITION = 1
+
+
+class PaliGemma(VisionLanguageModel):
+    """A loaded PaliGemma."""
+
+    family: ClassVar[str] = "paligemma"
+    frame: ClassVar[Frame] = Frame("", "<bos>", "<bos>", "\n")
+    picture_token: ClassVar[str | None] = "<image>"
+
+    @property
+    def vision_size(self) -> tuple[int, int]:
+        """Blocks and width of the vision tower."""
+        vision = self.network.config.vision_config
+        return int(vision.num_hidden_layers), int(vision.hidden_size)
+
+    def vision_tap(self, layer: int) -> Tap:
+        """The first norm of a block; the last site enters the norm that ends the tower."""
+        tower = self.network.model.vision_tower.vision_model
+        blocks = tower.encoder.layers
+        return Tap(tower.post_layernorm if layer == len(blocks) else blocks[layer].layer_norm1, 1)
+
+    @cached_property
+    def pictures(self) -> SquarePictures:
+        """How pictures become squares."""
+        return SquarePictures.from_folder(self.loaded.folder, int(self.network.config.vision_config.image_size))
+
+    def picture_ids(self, height: int, width: int) -> list[int]:
+        """As many for every size: a picture is shrunk to the tower's square."""
+        del height, width
+        vision = self.network.config.vision_config
+        return [int(self.network.config.image_token_id)] * (vision.image_size // vision.patch_size) ** 2
+
+    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+        """pixel_values (B, 3, S, S)."""
+        return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
+
+    def positions(self, packed: LeftPacked, shown: dict[str, Tensor]) -> Tensor:
+        """(B, T), counted from one."""
+        del shown
+        return packed.positions(_FIRST_POSITION)
+
+    def further(self, packed: LeftPacked) -> dict[str, Tensor]:
+        """token_type_ids: zero says that a position belongs to the prompt, which attends both ways."""
+        return {"token_type_ids": torch.zeros_like(packed.ids)}
+
+
+def load_paligemma(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> PaliGemma:
+    """Load PaliGemma from a folder or hub id; see `load_vlm`. tokenizer: folder of another one."""
+    return PaliGemma(load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed), tokenizer)
+
+
+def verify_paligemma(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
+    """Compare a reference."""
+    return verify_vlm(load_paligemma(str(folder / "checkpoint"), dtype="float32"), folder, recorded)

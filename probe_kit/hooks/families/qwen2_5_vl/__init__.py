@@ -1,0 +1,28 @@
+"""Qwen2.5-VL, on transformers' own network."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "qwen2.5-vl",
+        "Qwen2.5-VL (vision tower with windows, Qwen2 decoder), on transformers' own network",
+        "Qwen/Qwen2.5-VL-7B-Instruct",
+        "probe_kit.hooks.families.qwen2_5_vl.adapter:load_qwen2_5_vl",
+        streams="backbone 29 layers, answer 29 layers (7B)",
+        embodiment="none: answers, does not act",
+        notes="7B 17 GB, 32B 67 GB in bfloat16; 3B is InternVLA-M1's source",
+        verifier="probe_kit.hooks.families.qwen2_5_vl.adapter:verify_qwen2_5_vl",
+        config_types=("qwen2_5_vl",),
+        full_size="probe_kit.models.qwen:full_size_qwen2_5_vl",
+        stored_names="probe_kit.models.qwen:QWEN2_5_NAMES",
+        sizes=(
+            ("7B", "Qwen/Qwen2.5-VL-7B-Instruct"),
+            ("32B", "Qwen/Qwen2.5-VL-32B-Instruct"),
+            ("3B", "Qwen/Qwen2.5-VL-3B-Instruct"),
+        ),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        acts=False,
+        reads=True,
+    ),
+)

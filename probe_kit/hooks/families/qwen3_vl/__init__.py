@@ -1,0 +1,27 @@
+"""Qwen3-VL, on transformers' own network."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "qwen3-vl",
+        "Qwen3-VL (vision tower with DeepStack, Qwen3 decoder), on transformers' own network",
+        "Qwen/Qwen3-VL-8B-Instruct",
+        "probe_kit.hooks.families.qwen3_vl.adapter:load_qwen3_vl",
+        streams="backbone 37 layers, answer 37 layers (8B)",
+        embodiment="none: answers, does not act",
+        notes="8B 18 GB, 32B 67 GB in bfloat16; 4B is Xiaomi-R0's source",
+        verifier="probe_kit.hooks.families.qwen3_vl.adapter:verify_qwen3_vl",
+        config_types=("qwen3_vl",),
+        full_size="probe_kit.models.qwen:full_size_qwen3_vl",
+        sizes=(
+            ("8B", "Qwen/Qwen3-VL-8B-Instruct"),
+            ("32B", "Qwen/Qwen3-VL-32B-Instruct"),
+            ("4B", "Qwen/Qwen3-VL-4B-Instruct"),
+        ),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        acts=False,
+        reads=True,
+    ),
+)

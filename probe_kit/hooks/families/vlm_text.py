@@ -1,0 +1,181 @@
+"""Questions to ids: the fixed strings that a vision-language model was trained with around them.
+
+Read by the `tokenizers` library from the checkpoint's own `tokenizer.json`; no template is rendered.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from tokenizers import Tokenizer
+
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+
+TOKENIZER_FILE, SETTINGS_FILE, GENERATION_FILE = (
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "generation_config.json",
+)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The fixed strings around a question.
+
+    before: in front of the picture's positions. behind: between them and the question. bare: in front of a
+    question that comes without a picture. end: behind the question; the answer begins there.
+    """
+
+    before: str
+    behind: str
+    bare: str
+    end: str
+
+    def __str__(self) -> str:
+        return f"{self.before}[picture]{self.behind}[question]{self.end} or {self.bare}[question]{self.end}"
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """A whole prompt.
+
+    text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
+    picture: first and last but one position of the picture; equal where there is none.
+    """
+
+    text: str
+    ids: tuple[int, ...]
+    question: tuple[bool, ...]
+    picture: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FramedText:
+    """Speaks with a model. folder: of the tokenizer. vocabulary: ids the model has. ends: of an answer."""
+
+    folder: Path
+    frame: Frame
+    vocabulary: int
+    ends: frozenset[int]
+
+    @classmethod
+    def of(cls, folder: Path, frame: Frame, config: Any, generation: Path) -> "FramedText":
+        """From the files in `folder`.
+
+        config: of the language model. generation: folder that may hold generation_config.json.
+        Raises CheckpointError for missing files and for a tokenizer of another model.
+        """
+        if not (folder / TOKENIZER_FILE).is_file():
+            raise CheckpointError(
+                f"{folder / TOKENIZER_FILE} is missing. The tokenizer comes with the checkpoint: copy it from the "
+                "model's page, or name a folder that has it with -M tokenizer=DIR"
+            )
+        text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
+        if (highest := max(text._tokenizer.get_vocab(with_added_tokens=True).values())) >= text.vocabulary:
+            raise CheckpointError(
+                f"{folder / TOKENIZER_FILE} has ids up to {highest}; this model has {text.vocabulary}. "
+                "The tokenizer belongs to another checkpoint"
+            )
+        return text
+
+    @cached_property
+    def _tokenizer(self) -> Any:
+        return Tokenizer.from_file(str(self.folder / TOKENIZER_FILE))
+
+    @cached_property
+    def padding(self) -> int:
+        """The id that pads; it is masked."""
+        beside = self.folder / SETTINGS_FILE
+        named = _read(beside).get("pad_token")
+        content = named.get("content") if isinstance(named, dict) else named
+        found = self._tokenizer.token_to_id(content) if content else None
+        return 0 if found is None else int(found)
+
+    def check_token(self, token: str, number: int) -> None:
+        """Raise CheckpointError unless the tokenizer knows `token` by the id that the model expects."""
+        if (found := self._tokenizer.token_to_id(token)) != number:
+            raise CheckpointError(
+                f"{self.folder / TOKENIZER_FILE} has {token} as id {found}, config.json says {number}. "
+                "The tokenizer belongs to another checkpoint"
+            )
+
+    def prompt(
+        self, question: str, begun: str = "", picture: Sequence[int] | None = None, marks: int = 0
+    ) -> Prompt:
+        """The prompt of a question.
+
+        begun: how the answer has begun already. picture: ids at the positions of a picture, None without one;
+        `marks` of them at either end are no picture but say where it begins and ends.
+        Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
+        """
+        self._refuse_markers(question + begun)
+        lead = self.frame.bare if picture is None else self.frame.behind
+        text = lead + question + self.frame.end + begun
+        before = [] if picture is None else [*self._encode(self.frame.before).ids, *picture]
+        behind = self._encode(text)
+        start, stop = len(lead), len(lead) + len(question)
+        asked = [
+            first < stop and last > start and not special
+            for (first, last), special in zip(behind.offsets, behind.special_tokens_mask, strict=True)
+        ]
+        shown = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
+        return Prompt(text, (*before, *behind.ids), (*[False] * len(before), *asked), shown)
+
+    def _encode(self, text: str) -> Any:
+        encoding = self._tokenizer.encode(text, add_special_tokens=False)
+        unknown = getattr(self._tokenizer.model, "unk_token", None)
+        if unknown is not None and self._tokenizer.token_to_id(unknown) in encoding.ids:
+            raise InstructionError(
+                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would answer without "
+                f"reading it. Tokens: {encoding.tokens}"
+            )
+        return encoding
+
+    def _refuse_markers(self, text: str) -> None:
+        for token in self._tokenizer.get_added_tokens_decoder().values():
+            if token.special and token.content in text:
+                raise InstructionError(
+                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
+                    "write it without"
+                )
+
+    def option(self, prompt: Prompt, option: str) -> int:
+        """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
+        before, whole = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
+        if whole[: len(before)] != before or len(whole) == len(before):
+            raise UsageError(
+                f"the option {option!r} melts into the end of the prompt: {whole[len(before) - 2 :]} instead of "
+                f"{before[len(before) - 2 :]} and more. Give it as it stands behind the prompt"
+            )
+        return int(whole[len(before)])
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids up to an end, without special tokens."""
+        said = list(takewhile(lambda number: number not in self.ends, ids))
+        return str(self._tokenizer.decode(said, skip_special_tokens=True)).strip()
+
+
+def _ends(folder: Path, config: Any) -> frozenset[int]:
+    """What generation_config.json says, or else the language model's configuration. Raises CheckpointError."""
+    found = _read(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
+    numbers = found if isinstance(found, list) else [found]
+    if None in numbers or not numbers:
+        raise CheckpointError(
+            f"neither {folder / GENERATION_FILE} nor config.json names eos_token_id, the end of an answer. "
+            "Copy the file from the model's page"
+        )
+    return frozenset(map(int, numbers))
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """A file's values; none without it. Raises CheckpointError for one that is no JSON."""
+    if not file.is_file():
+        return {}
+    try:
+        return dict(json.loads(file.read_text()))
+    except ValueError as error:
+        raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
