@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 PAGE = "commands.md"
-_PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z ]+) -->$", re.MULTILINE)
+_PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z -]+) -->$", re.MULTILINE)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -71,4 +71,4 @@ def _default(parameter: Any) -> str:
 
 def _text(text: str | None) -> str:
     """One line per paragraph; a bar would end the cell of a table."""
-    return (text or "").strip().replace("|", "\\|")
+    return (text or "").strip().replace("\b\n", "").replace("|", "\\|")

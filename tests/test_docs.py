@@ -65,7 +65,8 @@ def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> 
         if hasattr(command, "commands"):
             todo += [(f"{name} {child}", found) for child, found in command.commands.items()]
             continue
-        (section,) = re.findall(rf"^{name}\W*$(.*?)(?=^probe-kit [a-z ]+\W*$|\Z)", shown, re.MULTILINE | re.DOTALL)
+        until_next = rf"^{name}\W*$(.*?)(?=^probe-kit [a-z -]+\W*$|\Z)"
+        (section,) = re.findall(until_next, shown, re.MULTILINE | re.DOTALL)
         for parameter in command.params:
             option = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name.upper()
             assert option == "--help" or re.search(rf"(?<![\w-]){option}(?![\w-])", section), f"{name} {option}"

@@ -3,8 +3,10 @@
 from probe_kit.suite.build import build_suite, default_suite
 from probe_kit.suite.categories import CATEGORIES, Category
 from probe_kit.suite.contact_sheet import contact_sheets
+from probe_kit.suite.from_csv import suite_from_csv
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.suite.manifest import load_suite
+from probe_kit.suite.own_items import Terms
 from probe_kit.suite.own_pictures import PicturePair, suite_from_pictures
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite
@@ -23,11 +25,13 @@ __all__ = [
     "Report",
     "Side",
     "Suite",
+    "Terms",
     "build_suite",
     "contact_sheets",
     "default_suite",
     "load_picture",
     "load_suite",
+    "suite_from_csv",
     "suite_from_pictures",
     "validate_suite",
 ]

@@ -1,10 +1,17 @@
-"""The twelve categories of Act2Answer (paper, table of tasks) with their domains."""
+"""The twelve categories of Act2Answer (paper, table of tasks) with their domains, and categories of one's own."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from probe_kit.errors import UnknownCategoryError
+from probe_kit.errors import UnknownCategoryError, UsageError
+
+OWN_DOMAIN = "own"
+"""The domain of every category that is none of the paper's."""
+RESERVED = ("all", "mean")
+"""Names that tables use for what is over all categories."""
+_SLUG = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,32 @@ _ALL = (
     Category("living-world", "Living World", "biological"),
 )
 CATEGORIES: dict[str, Category] = {category.slug: category for category in _ALL}
+
+
+def category_of(slug: str) -> Category:
+    """The category of this name: one of the paper's, or one of a suite's own."""
+    return CATEGORIES.get(slug) or Category(slug, slug.replace("-", " ").capitalize(), OWN_DOMAIN)
+
+
+def is_slug(name: str) -> bool:
+    """Whether a category may have this name: small letters, digits and inner hyphens, at most 40, not reserved."""
+    return _SLUG.fullmatch(name) is not None and name not in RESERVED
+
+
+def check_slug(name: str) -> str:
+    """The name as given. Raises UsageError if no category may have it."""
+    if not is_slug(name):
+        raise UsageError(
+            f"{name!r} cannot name a category: expected up to 40 small letters, digits and inner hyphens, such as "
+            f"`ripe-fruit`, and none of {', '.join(RESERVED)}"
+        )
+    return name
+
+
+def in_order(slugs: Iterable[str]) -> tuple[str, ...]:
+    """Each name once: the paper's categories in its order, then the others by the alphabet."""
+    given = set(slugs)
+    return (*(slug for slug in CATEGORIES if slug in given), *sorted(given - CATEGORIES.keys()))
 
 
 def check_categories(names: Sequence[str], available: Sequence[str]) -> tuple[str, ...]:

@@ -27,6 +27,38 @@ def build(
     out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
 
 
+@app.command("from-csv")
+def from_csv(
+    table: Annotated[
+        Path, typer.Argument(help="CSV: instruction,correct,wrong[,group,category,object,other_object].")
+    ],
+    out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
+    license_name: Annotated[str, typer.Option("--license", help="What others may do with the pictures (SPDX).")],
+    attribution: Annotated[str, typer.Option(help="Whom to name for the pictures.")] = "the author of the table",
+    category: Annotated[str, typer.Option(help="Of rows that name none.")] = "questions",
+    name: Annotated[str | None, typer.Option(help="Of the suite; default the table's file name.")] = None,
+    real_faces: Annotated[bool, typer.Option("--real-faces", help="Some pictures show real people.")] = False,
+) -> None:
+    """Make a suite of your own questions: a line each, pictures as paths beside the table.
+
+    \b
+    instruction,correct,wrong,group,category
+    Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
+
+    Rows of one group, or that share a picture, are never in training and test at once. Both layouts of every row
+    are played; the answer lies left and right in turn.
+    """
+    from probe_kit.suite import Terms, suite_from_csv
+
+    terms = Terms(license_name, attribution, contains_real_face=real_faces)
+    suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
+    count, groups = len(suite.items), len({item.group_id for item in suite.items})
+    out.print(
+        f"{suite.identity}: {count} items in {groups} groups in {out_folder}", highlight=False, soft_wrap=True
+    )
+    err.print(f"next: probe-kit suite validate {out_folder} --baselines", highlight=False, soft_wrap=True)
+
+
 @app.command("show")
 def show(
     folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
@@ -48,7 +80,8 @@ def list_categories(
     """List the categories of a suite with their item counts."""
     from rich.table import Table
 
-    from probe_kit.suite import CATEGORIES, default_suite, load_suite
+    from probe_kit.suite import default_suite, load_suite
+    from probe_kit.suite.categories import category_of
 
     suite = default_suite() if folder is None else load_suite(folder)
     counts = {c: sum(item.category == c for item in suite.items) for c in suite.categories}
@@ -59,7 +92,7 @@ def list_categories(
     for column in table.columns:
         column.overflow = "fold"
     for slug, count in counts.items():
-        category = CATEGORIES[slug]
+        category = category_of(slug)
         table.add_row(slug, category.title, category.domain, str(count), str(2 * count))
     out.print(table)
 

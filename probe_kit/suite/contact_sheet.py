@@ -5,7 +5,7 @@ from textwrap import wrap
 
 from PIL import Image, ImageDraw, ImageFont
 
-from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.categories import CATEGORIES, category_of
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite, missing_categories
@@ -42,10 +42,10 @@ def contact_sheets(suite: Suite, out_folder: Path | str) -> list[Path]:
 
 
 def _header(suite: Suite, category: str, count: int) -> list[str]:
-    missing = [CATEGORIES[slug].title for slug in missing_categories(suite.items)]
+    missing = [category_of(slug).title for slug in missing_categories(suite.items)]
     have = f"{len(CATEGORIES) - len(missing)} of {len(CATEGORIES)} categories"
     lines = [
-        f"{CATEGORIES[category].title}: {count} items of {suite.identity}, {have}",
+        f"{category_of(category).title}: {count} items of {suite.identity}, {have}",
         f"Curation: {', '.join(suite.card.get('curation', [])) or 'not stated'}."
         + (f" Not in this suite: {', '.join(missing)}." if missing else ""),
     ]

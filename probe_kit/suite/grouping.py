@@ -1,6 +1,6 @@
 """Which items belong together: folds must never separate items that share a picture or are twins."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from probe_kit.identity import sha256_json
@@ -18,15 +18,18 @@ def ties(item: Item) -> tuple[str, ...]:
     )
 
 
-def with_groups(items: Sequence[Item]) -> tuple[Item, ...]:
+def with_groups(items: Sequence[Item], named: Mapping[str, str] | None = None) -> tuple[Item, ...]:
     """The items with `group_id` set to their connected component over shared ties.
 
-    The name of a group is a hash of its members' ids, so it does not depend on the order of the items.
+    named: by item id, a group that a user gave; it ties as a shared picture does. The name of a group is a hash of
+    its members' ids, so it does not depend on the order of the items.
     """
     forest = _Forest()
     for item in items:
         for tie in ties(item):
             forest.join(item.item_id, tie)
+        if named and item.item_id in named:
+            forest.join(item.item_id, f"named {named[item.item_id]}")
     members: dict[str, list[str]] = {}
     for item in items:
         members.setdefault(forest.root(item.item_id), []).append(item.item_id)

@@ -9,7 +9,7 @@ from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.identity import canonical_json, sha256_text
-from probe_kit.suite.categories import CATEGORIES, check_categories
+from probe_kit.suite.categories import CATEGORIES, check_categories, in_order
 from probe_kit.suite.items import LAYOUTS, Episode, Item
 
 # What makes two suites the same one: what is asked, what is seen, and what belongs together. File names,
@@ -37,9 +37,9 @@ def content_sha256(items: Iterable[Item]) -> str:
 
 
 def count_by_category(items: Iterable[Item]) -> dict[str, int]:
-    """Number of items per category slug, in the order of CATEGORIES."""
+    """Number of items per category slug, in the order of `in_order`."""
     counts = Counter(item.category for item in items)
-    return {slug: counts[slug] for slug in CATEGORIES if slug in counts}
+    return {slug: counts[slug] for slug in in_order(counts)}
 
 
 def missing_categories(items: Iterable[Item]) -> list[str]:
@@ -79,7 +79,7 @@ class Suite:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """Slugs of the categories that have items, in the order of CATEGORIES."""
+        """Slugs of the categories that have items, in the order of `in_order`."""
         return tuple(count_by_category(self.items))
 
     def episodes(self) -> list[Episode]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.suite.baselines import Baseline, run_baselines, save_baselines
-from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.categories import category_of
 from probe_kit.suite.manifest import read_suite
 from probe_kit.suite.suite import missing_categories
 from probe_kit.suite.validation.findings import Finding, listing, warning
@@ -55,9 +55,9 @@ class Report:
     def to_text(self) -> str:
         """For a terminal: at most 20 findings of each rule, then the baselines, then the verdict."""
         lines = [listing(self.errors), listing(self.warnings)]
-        lines += [f"{CATEGORIES[baseline.category].title}: {baseline}" for baseline in self.baselines or ()]
+        lines += [f"{category_of(baseline.category).title}: {baseline}" for baseline in self.baselines or ()]
         if self.missing:
-            lines.append(f"Not in this suite: {', '.join(CATEGORIES[slug].title for slug in self.missing)}.")
+            lines.append(f"Not in this suite: {', '.join(category_of(slug).title for slug in self.missing)}.")
         verdict = "valid" if self.ok else "not valid"
         lines.append(f"{self.suite}: {verdict}, {len(self.errors)} errors, {len(self.warnings)} warnings")
         return "\n".join(line for line in lines if line)
@@ -87,13 +87,14 @@ def validate_suite(
         gates = run_baselines(suite, seed, progress)
         save_baselines(suite, gates)
         findings += _leaks(gates)
-    return Report(suite.identity, tuple(missing_categories(suite.items)), tuple(findings), gates)
+    once = tuple(dict.fromkeys(findings))  # two pictures of two items can give one line twice
+    return Report(suite.identity, tuple(missing_categories(suite.items)), once, gates)
 
 
 def _leaks(baselines: tuple[Baseline, ...]) -> list[Finding]:
     """W05: a baseline knows more than a coin."""
     return [
-        warning("W05", CATEGORIES[baseline.category].title, str(baseline))
+        warning("W05", category_of(baseline.category).title, str(baseline))
         for baseline in baselines
         if not baseline.ok
     ]

@@ -1,9 +1,10 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from PIL import Image, ImageDraw
 
-from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
+from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite import PicturePair, load_suite, suite_from_pictures, validate_suite
 
 TERMS = {"name": "mine", "license": "CC0-1.0", "attribution": "nobody"}
@@ -33,7 +34,7 @@ def test_every_pair_is_asked_both_ways_and_the_suite_is_valid(discs: dict[str, P
     suite = suite_from_pictures(tmp_path / "mine", pairs_of(discs), **TERMS)
     report = validate_suite(suite.folder)
     assert report.ok, report.to_text()
-    assert {finding.rule for finding in report.warnings} == {"W03", "W04"}  # few questions, discs of equal outline
+    assert {finding.rule for finding in report.warnings} == {"W04", "W09"}  # colours tell discs apart
     assert load_suite(suite.folder).identity == suite.identity
     assert [item.instruction for item in suite.items[:2]] == [
         "Put the cube on the red shape",
@@ -77,11 +78,43 @@ def test_bad_pairs_are_refused_and_nothing_is_written(discs: dict[str, Path], tm
         suite_from_pictures(tmp_path / "mine", [], **TERMS)
     with pytest.raises(UsageError, match="twice"):
         suite_from_pictures(tmp_path / "mine", [pair, turned], **TERMS)
-    with pytest.raises(UnknownCategoryError, match="Did you mean 'color'"):
-        suite_from_pictures(tmp_path / "mine", [PicturePair("colour", "a", red, "b", green)], **TERMS)
+    for name in ("mean", "all", "Colour", "a b", "-a", ""):
+        with pytest.raises(UsageError, match="cannot name a category"):
+            suite_from_pictures(tmp_path / "mine", [PicturePair(name, "a", red, "b", green)], **TERMS)
     with pytest.raises(SuiteError, match="names a side"):
         suite_from_pictures(tmp_path / "mine", [PicturePair("color", "left one", red, "b", green)], **TERMS)
     missing = PicturePair("color", "red shape", red, "green shape", tmp_path / "nothing.png")
     with pytest.raises(SuiteError, match=r"nothing\.png"):
         suite_from_pictures(tmp_path / "mine", [missing], **TERMS)
     assert not (tmp_path / "mine").exists()
+
+
+def test_a_category_of_ones_own_is_a_row_and_a_misspelt_one_is_pointed_out(
+    discs: dict[str, Path], tmp_path: Path
+) -> None:
+    pair = PicturePair("ripe-fruit", "red one", discs["red"], "green one", discs["green"])
+    suite = suite_from_pictures(tmp_path / "mine", [pair], **TERMS)
+    assert suite.categories == ("ripe-fruit",)
+    assert load_suite(suite.folder).items == suite.items
+    assert "Ripe fruit" in validate_suite(suite.folder).to_text()
+    misspelt = suite_from_pictures(tmp_path / "other", [replace(pair, category="colour")], **TERMS)
+    assert [str(f) for f in validate_suite(misspelt.folder).warnings if f.rule == "W08"] == [
+        "W08 colour: is none of the paper; if 'color' is meant, rename it"
+    ]
+
+
+def test_nearly_the_same_pictures_in_different_groups_are_said_once(
+    tmp_path: Path, discs: dict[str, Path]
+) -> None:
+    again = {}
+    for colour in ("red", "green"):
+        Image.open(discs[colour]).save(path := tmp_path / f"{colour}.jpg", quality=80)
+        again[colour] = path
+    pairs = [
+        PicturePair("color", "red one", discs["red"], "green one", discs["green"]),
+        PicturePair("color", "red two", again["red"], "green two", again["green"]),
+    ]
+    suite = suite_from_pictures(tmp_path / "mine", pairs, **TERMS)
+    lines = [str(finding) for finding in validate_suite(suite.folder).warnings if finding.rule == "W03"]
+    assert lines
+    assert len(lines) == len(set(lines))

@@ -20,7 +20,7 @@ from probe_kit.suite.converters.act2answer_pairs import SOURCE as ACT2ANSWER
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
 from probe_kit.suite.converters.emission import emit, sample
-from probe_kit.suite.converters.filters import Look, look_of, picture_problem, text_problem
+from probe_kit.suite.converters.filters import picture_problem, text_problem
 from probe_kit.suite.converters.llm import propose_wording
 from probe_kit.suite.converters.options import (
     CompBenchOptions,
@@ -35,6 +35,7 @@ from probe_kit.suite.converters.pairing import Bundle, Proposal, pair_candidates
 from probe_kit.suite.converters.rewriting import rewrite
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
+from probe_kit.suite.looks import Look, look_of
 from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.wording import instruction_for

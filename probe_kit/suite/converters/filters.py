@@ -2,18 +2,13 @@
 
 import unicodedata
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from probe_kit.suite.converters.options import ConvertOptions
-from probe_kit.suite.pictures import difference_hash, pixels_sha256
-from probe_kit.suite.validation.warnings import NEAR_DUPLICATE_BITS
 from probe_kit.suite.wording import side_words
 
-_SAME_COLOR = 6  # levels, on average over a small picture
 _LEAST_EDGE_ENERGY = 0.25  # of the original, after a picture was as small as on the screen
 
 
@@ -39,29 +34,6 @@ def _edges_lost(image: Image.Image, tile: int) -> bool:
 def _edge_energy(image: Image.Image) -> float:
     grey = np.asarray(image.convert("L"), np.float64)
     return float(sum((np.diff(grey, axis=axis) ** 2).sum() for axis in (0, 1)))
-
-
-@dataclass(frozen=True)
-class Look:
-    """What two pictures are compared by: pixels, brightness and, as shapes come in several colours, colour."""
-
-    pixels_sha256: str
-    brightness: int
-    colors: npt.NDArray[np.float64]
-
-    def same_as(self, other: "Look") -> bool:
-        """Whether two pictures are, or nearly are, the same."""
-        if self.pixels_sha256 == other.pixels_sha256:
-            return True
-        if (self.brightness ^ other.brightness).bit_count() > NEAR_DUPLICATE_BITS:
-            return False
-        return float(np.abs(self.colors - other.colors).mean()) < _SAME_COLOR
-
-
-def look_of(image: Image.Image) -> Look:
-    """The look of one picture."""
-    colors = np.asarray(image.convert("RGB").resize((16, 16)), np.float64)
-    return Look(pixels_sha256(image), difference_hash(image), colors)
 
 
 def text_problem(instruction: str, phrase: str, options: ConvertOptions) -> str | None:

@@ -5,15 +5,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
-from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
 from probe_kit.suite.validation.findings import Finding, error
 
 SCHEMA_MAJOR = "1"
 
 _ENUMS: dict[str, tuple[str, ...]] = {
-    "category": tuple(CATEGORIES),
-    "domain": tuple(dict.fromkeys(category.domain for category in CATEGORIES.values())),
+    "domain": (*dict.fromkeys(category.domain for category in CATEGORIES.values()), OWN_DOMAIN),
     "transfer_type": ("near", "moderate", "heavy", "procedural"),
     "construction": ("native_pair", "choice_vs_distractor", "cross_item", "recolored", "procedural"),
     "object_article": ("the", "none"),
@@ -58,6 +57,8 @@ def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
         elif name in _ENUMS and record[name] not in _ENUMS[name]:
             allowed = ", ".join(_ENUMS[name])
             yield error("E02", where, f"field {name!r} is {record[name]!r}; expected one of {allowed}")
+        elif name == "category" and not is_slug(record[name]):
+            yield error("E02", where, f"field 'category' is {record[name]!r}; expected one like 'ripe-fruit'")
 
 
 def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:

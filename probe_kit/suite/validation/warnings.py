@@ -1,25 +1,26 @@
-"""W01 to W04, W06 and W07: true things about a suite that one should know before trusting its numbers."""
+"""W01 to W04 and W06 to W09: true things about a suite that one should know before trusting its numbers."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from difflib import get_close_matches
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
-from probe_kit.suite.categories import CATEGORIES
+from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
 from probe_kit.suite.items import Item
-from probe_kit.suite.pictures import difference_hash, load_picture
+from probe_kit.suite.looks import NEAR_DUPLICATE_BITS, Look, look_of
+from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite, count_by_category
 from probe_kit.suite.validation.findings import Finding, warning
 from probe_kit.suite.validation.rules import SIDES
 
 LEAST_ROLE_BALANCE = 0.4
 FEWEST_ITEMS = 30
-NEAR_DUPLICATE_BITS = 4
+FEWEST_GROUPS = 5
 SCREEN_PIXELS = 40  # a tile's side on a 224 px frame, see docs/suite.md
 
 _FEWEST_USES = 5  # below, no balance can be told
@@ -33,7 +34,7 @@ def sides_balanced(suite: Suite) -> Iterator[Finding]:
     """W01: per category, as many answers lie left as right in the original layout."""
     for category, sides in side_counts(suite.items).items():
         if abs(sides["left"] - sides["right"]) > 1:
-            yield warning("W01", CATEGORIES[category].title, f"{sides['left']} left / {sides['right']} right")
+            yield warning("W01", category_of(category).title, f"{sides['left']} left / {sides['right']} right")
 
 
 def side_counts(items: Sequence[Item]) -> dict[str, Counter[str]]:
@@ -50,7 +51,7 @@ def roles_balanced(suite: Suite) -> Iterator[Finding]:
         uses = target + distractor
         if uses >= _FEWEST_USES and min(target, distractor) / uses < LEAST_ROLE_BALANCE:
             message = f"concept {concept!r} is target {target}×, distractor {distractor}×"
-            yield warning("W02", CATEGORIES[category].title, message)
+            yield warning("W02", category_of(category).title, message)
 
 
 def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]:
@@ -72,18 +73,19 @@ def pictures_distinct(suite: Suite) -> Iterator[Finding]:
                 if item.picture(side).is_file():
                     pictures.setdefault(item.picture(side), item)
     items = list(pictures.values())
-    hashes = np.array([difference_hash(load_picture(path)) for path in pictures], np.uint64)
-    for one, other in _close_pairs(hashes):
+    for one, other in _near_duplicates([look_of(load_picture(path)) for path in pictures]):
         if items[one].group_id != items[other].group_id:
             names = f"items {items[one].item_id} and {items[other].item_id}"
             yield warning("W03", names, "show nearly the same picture but are in different groups")
 
 
-def _close_pairs(hashes: npt.NDArray[np.uint64]) -> Iterator[tuple[int, int]]:
-    for one in range(len(hashes)):
+def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
+    hashes = np.array([look.brightness for look in looks], np.uint64)
+    for one in range(len(looks)):
         distances = np.bitwise_count(hashes[one + 1 :] ^ hashes[one])
-        for other in np.flatnonzero(distances <= NEAR_DUPLICATE_BITS):
-            yield one, one + 1 + int(other)
+        for other in one + 1 + np.flatnonzero(distances <= NEAR_DUPLICATE_BITS):
+            if looks[one].same_as(looks[other]):
+                yield one, int(other)
 
 
 def enough_items(suite: Suite) -> Iterator[Finding]:
@@ -91,9 +93,20 @@ def enough_items(suite: Suite) -> Iterator[Finding]:
     requested = suite.card.get("options", {}).get("items_per_category")
     for category, count in count_by_category(suite.items).items():
         if requested is not None and count != requested:
-            yield warning("W04", CATEGORIES[category].title, f"{count} of {requested} requested")
+            yield warning("W04", category_of(category).title, f"{count} of {requested} requested")
         elif count < FEWEST_ITEMS:
-            yield warning("W04", CATEGORIES[category].title, f"{count} items; fewer than {FEWEST_ITEMS}")
+            yield warning("W04", category_of(category).title, f"{count} items; fewer than {FEWEST_ITEMS}")
+
+
+def enough_groups(suite: Suite) -> Iterator[Finding]:
+    """W09: enough independent groups per category for probes to be trained on some and tested on others."""
+    groups: dict[str, set[str]] = {category: set() for category in suite.categories}
+    for item in suite.items:
+        groups[item.category].add(item.group_id)
+    for category, members in groups.items():
+        if len(members) < FEWEST_GROUPS:
+            message = f"{len(members)} independent groups; probes need at least {FEWEST_GROUPS}"
+            yield warning("W09", category_of(category).title, message)
 
 
 def legible(suite: Suite) -> Iterator[Finding]:
@@ -131,7 +144,15 @@ def side_word_signs(suite: Suite) -> Iterator[Finding]:
         message = (
             f"{phrase!r} names a side in {len(list(items))} items; a model asked for left or right may stumble"
         )
-        yield warning("W07", CATEGORIES[category].title, message)
+        yield warning("W07", category_of(category).title, message)
+
+
+def categories_meant(suite: Suite) -> Iterator[Finding]:
+    """W08: a category of one's own is not one of the paper's misspelt."""
+    for slug in suite.categories:
+        near = get_close_matches(slug, CATEGORIES, n=1, cutoff=0.8)
+        if category_of(slug).domain == OWN_DOMAIN and near:
+            yield warning("W08", slug, f"is none of the paper; if {near[0]!r} is meant, rename it")
 
 
 WARNING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
@@ -139,6 +160,8 @@ WARNING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
     roles_balanced,
     pictures_distinct,
     enough_items,
+    enough_groups,
     legible,
     side_word_signs,
+    categories_meant,
 )

@@ -3,7 +3,8 @@ import pytest
 from PIL import Image
 
 from probe_kit.suite.converters import ConvertOptions
-from probe_kit.suite.converters.filters import look_of, picture_problem, text_problem
+from probe_kit.suite.converters.filters import picture_problem, text_problem
+from probe_kit.suite.looks import look_of
 
 OPTIONS = ConvertOptions()
 

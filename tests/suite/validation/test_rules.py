@@ -51,7 +51,7 @@ def ask_for_both(records: list[Record]) -> None:
         (drop_field, r"E02 metadata.jsonl:1: field 'pair_id' is missing"),
         (set_field("gen", "none"), r"E02 metadata.jsonl:1: field 'gen' is 'none'; expected a dict"),
         (set_field("correct_side", "centre"), r"E02 .*'correct_side' is 'centre'; expected one of left, right"),
-        (set_field("category", "colour"), r"E02 .*'category' is 'colour'; expected one of emotion, "),
+        (set_field("category", "My colours"), r"E02 .*'category' is 'My colours'; expected one like 'ripe-fruit'"),
         (set_field("schema_version", "2.0"), r"E03 metadata.jsonl:1: uses schema 2.0; this tool reads 1.x"),
         (repeat_id, r"E04 item a2a-embedded-color-\w+: the id appears in lines 1 and 2"),
         (set_field("left_file_name", "images/no.png"), r"E05 item .*: picture 'images/no.png' not found"),

@@ -1,0 +1,139 @@
+"""A study of one's own, from a table and a handful of pictures."""
+
+from pathlib import Path
+
+import pytest
+from PIL import Image, ImageDraw
+from typer.testing import CliRunner
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.suite import Suite, Terms, suite_from_csv, validate_suite
+from probe_kit.suite.commands import app
+
+TERMS = Terms("CC0-1.0", "nobody")
+FRUIT = ("yellow", "green", "red", "orange", "brown", "purple")
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Six fruit of one outline and six colours."""
+    for colour in FRUIT:
+        image = Image.new("RGB", (300, 260), "white")
+        ImageDraw.Draw(image).ellipse((60, 40, 220, 200), fill=colour)
+        image.save(tmp_path / f"{colour}.png")
+    return tmp_path
+
+
+def made(folder: Path, *lines: str, header: str = "instruction,correct,wrong,group,category") -> Suite:
+    table = folder / "fruit.csv"
+    table.write_text("\n".join((header, *lines)), encoding="utf-8")
+    return suite_from_csv(table, folder / "suite", terms=TERMS)
+
+
+def test_a_six_picture_study_is_a_valid_suite(pictures: Path) -> None:
+    suite = made(
+        pictures,
+        "Put the cube on the ripe banana,yellow.png,green.png,banana,ripe-fruit",
+        '"Put the cube on the apple, not the pear",red.png,orange.png,,ripe-fruit',
+        "Move it onto plums,purple.png,brown.png,,ripe-fruit",
+    )
+    report = validate_suite(suite.folder)
+    assert report.ok, report.to_text()
+    assert not {finding.rule for finding in report.warnings} & {"W03", "W08"}  # colours tell them apart
+    assert suite.name == "fruit"
+    assert suite.categories == ("ripe-fruit",)
+    assert [item.correct_side for item in suite.items] == ["left", "right", "left"]
+    assert [item.object_phrase for item in suite.items] == ["ripe banana", "apple, not the pear", "plums"]
+    assert [item.object_article for item in suite.items] == ["the", "the", "none"]
+    for item, colour in zip(suite.items, ("yellow", "red", "purple"), strict=True):
+        seen = Image.open(item.picture(item.correct_side)).convert("RGB").getpixel((140, 130))
+        assert seen == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
+
+
+def test_rows_of_a_group_or_with_a_common_picture_stay_together(pictures: Path) -> None:
+    suite = made(
+        pictures,
+        "Put the cube on the banana,yellow.png,green.png,kitchen,a",
+        "Put the cube on the apple,red.png,orange.png,kitchen,a",
+        "Put the cube on the plum,purple.png,brown.png,,a",
+        "Put the cube on the fig,purple.png,green.png,,a",
+    )
+    groups = [item.group_id for item in suite.items]
+    assert len(set(groups)) == 1  # green ties the fig to the banana, purple the plum to the fig
+    apart = made_again(pictures)
+    assert len({item.group_id for item in apart.items}) == 2
+
+
+def made_again(pictures: Path) -> Suite:
+    lines = (
+        "Put the cube on the banana,yellow.png,green.png,kitchen",
+        "Put the cube on the apple,red.png,orange.png,kitchen",
+        "Put the cube on the plum,purple.png,brown.png,",
+    )
+    table = pictures / "again.csv"
+    table.write_text("\n".join(("instruction,correct,wrong,group", *lines)))
+    return suite_from_csv(table, pictures / "again", category="b", terms=TERMS)
+
+
+def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(pictures: Path) -> None:
+    suite = made(
+        pictures,
+        "Put the cube on the banana,yellow.png,green.png",
+        "Put the cube on the lime,green.png,yellow.png",
+        header="instruction,correct,wrong",
+    )
+    one, other = suite.items
+    assert one.pair_id == other.pair_id
+    assert one.left_pixels_sha256 == other.left_pixels_sha256
+    assert {one.correct_side, other.correct_side} == {"left", "right"}
+
+
+@pytest.mark.parametrize(
+    ("header", "line", "message"),
+    [
+        ("instruction,correct", "x,y", "expected instruction, correct, wrong"),
+        ("instruction,correct,wrong,colour", "x,y,z,c", "expected instruction, correct, wrong"),
+        ("instruction,correct,wrong", "Put the cube on the lime,,green.png", "line 2 has no correct"),
+        ("instruction,correct,wrong", "Put it on a lime, please,green.png,red.png", "line 2 has more fields"),
+        ("instruction,correct,wrong", "Banana!,yellow.png,green.png", "line 2: what is asked for cannot be told"),
+        ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,mean", "'mean' cannot name"),
+        ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,A/B", "'A/B' cannot name"),
+        ("instruction,correct,wrong", "", "no line below"),
+    ],
+)  # fmt: skip
+def test_a_table_that_cannot_be_used_is_refused_by_its_line(
+    header: str, line: str, message: str, pictures: Path
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        made(pictures, line, header=header)
+    assert not (pictures / "suite").exists()
+
+
+def test_the_same_question_twice_is_refused_with_both_lines(pictures: Path) -> None:
+    line = "Put the cube on the banana,yellow.png,green.png,,"
+    with pytest.raises(UsageError, match="lines 2 and 3"):
+        made(pictures, line, line)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("Put the cube on the lime,nowhere.png,red.png,,", "nowhere.png"),
+        ("Put the cube on the left lime,green.png,red.png,,", "names a side"),
+        ("Put the cube on the lime,green.png,green.png,,", "same picture"),
+    ],
+)
+def test_a_question_that_breaks_a_rule_writes_nothing(line: str, message: str, pictures: Path) -> None:
+    with pytest.raises(SuiteError, match=message):
+        made(pictures, line)
+    assert not (pictures / "suite").exists()
+
+
+def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) -> None:
+    table = pictures / "fruit.csv"
+    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n")
+    arguments = ["from-csv", str(table), "--out", str(pictures / "suite"), "--license", "CC0-1.0"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "1 items in 1 groups" in result.output
+    assert "suite validate" in result.output
