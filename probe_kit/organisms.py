@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.retention import RetentionRow, retention
-from probe_kit.retention.cells import beats, bounded_value, number, percent
+from probe_kit.retention.cells import beats, bounded_value, margin_value, number, percent
 from probe_kit.retention.success import Regime
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -152,7 +152,7 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.sr), percent(row.delta), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
+        percent(row.sr), margin_value(row), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
         beats(row), percent(row.action_accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

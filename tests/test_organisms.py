@@ -1,5 +1,7 @@
 """The verdict over a row, and the truths the organisms were made to have."""
 
+from dataclasses import replace
+
 import pytest
 
 from probe_kit.console import out
@@ -47,6 +49,16 @@ def test_only_the_trained_organism_knows_anything() -> None:
     assert TRAINED.expected("state") == "encoded, unused"
     assert TRAINED.expected("counting") == "absent"
     assert {organism.expected("color") for organism in ORGANISMS if organism != TRAINED} == {"absent"}
+
+
+def test_the_table_shows_the_margin_that_decides() -> None:
+    """Over 48 episodes Δ is 14.1 points, over their 24 items 20.0, and that is what the verdict rests on."""
+    shown = replace(row(0.66, 0.3), delta=0.1414, delta_regime=0.2001)
+    with out.capture() as printed:
+        out.print(to_rich([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
+    text = printed.get()
+    assert "20.0" in text
+    assert "14.1" not in text
 
 
 def test_the_table_counts_the_true_verdicts() -> None:

@@ -41,16 +41,16 @@ def success_interval(row: RetentionRow) -> str:
 
 
 def retention_value(row: RetentionRow) -> str:
-    """Plain retention, or why there is none."""
-    if not row.retention_defined or row.retention is None:
+    """Bounded retention with its interval, or why there is none; after a mean, what it leaves out."""
+    if not row.retention_defined:
         return row.retention_note
-    return " ".join(filter(None, [number(row.retention), row.retention_note and f"({row.retention_note})"]))
+    return " ".join(filter(None, [bounded_value(row), row.retention_note and f"({row.retention_note})"]))
 
 
 def bounded_value(row: RetentionRow) -> str:
-    """Bounded retention with its interval; a dash where retention is not defined."""
+    """Bounded retention with its interval; n/a where retention is not defined."""
     if not row.retention_defined:
-        return "–"
+        return "n/a"
     return with_limits(number(row.retention_bounded), row.retention_bounded_ci, number)
 
 
@@ -68,11 +68,62 @@ def debiased_value(row: RetentionRow) -> str:
     return with_limits(number(row.retention_debiased), row.retention_ci, number)
 
 
-def place(layer: int | None, iteration: int | None = None) -> str:
-    """Where the best site is: its layer, and after @ the iteration where the stream has several."""
+def plain_value(row: RetentionRow) -> str:
+    """The published ratio; a dash where retention is not defined."""
+    return number(row.retention) if row.retention_defined else "–"
+
+
+FURTHER_RETENTION: list[Column] = [
+    ("area [95 %]", area_value),
+    ("debiased [95 %]", debiased_value),
+    ("published", plain_value),
+]
+"""What stands behind bounded retention, which every table leads with."""
+
+
+def margin_value(row: RetentionRow) -> str:
+    """The Δ that decides the regime, in points: over as many items as count."""
+    return percent(row.delta_regime)
+
+
+def paper_margin(row: RetentionRow) -> str:
+    """The paper's Δ in points, over episodes; it decides nothing here."""
+    return percent(row.delta)
+
+
+def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
+    """Where the best site is: its layer, after @ the iteration where the stream has several, and after + how many
+    other sites are as good.
+    """
     if layer is None:
         return "–"
-    return str(layer) if iteration is None else f"{layer} @{iteration}"
+    more = f" +{ties}" if ties else ""
+    return f"{layer}{more}" if iteration is None else f"{layer} @{iteration}{more}"
+
+
+def prefix_place(row: RetentionRow) -> str:
+    """Where the backbone's best site is."""
+    return place(row.prefix_layer, None, row.prefix_ties)
+
+
+def action_place(row: RetentionRow) -> str:
+    """Where the best site of the action is."""
+    return place(row.action_layer, row.action_iteration, row.action_ties)
+
+
+def first_iteration(row: RetentionRow) -> str:
+    """Accuracy of the best layer at the first iteration, in percent; a dash where the stream runs once."""
+    return percent(row.action_first_accuracy)
+
+
+def call_value(row: RetentionRow) -> str:
+    """Which captured inference was probed, from 0; a dash without probes."""
+    return "–" if row.call is None else str(row.call)
+
+
+def call_words(call: int) -> str:
+    """A captured inference in words: 0 is the only one before the arm has moved."""
+    return f"call {call}" + (", before anything moves" if call == 0 else ", counted from 0")
 
 
 def beats(row: RetentionRow) -> str:
@@ -150,7 +201,12 @@ DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
     ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
     ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
     ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
-    ("debiased retention [95 %]", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
+    (
+        "bounded retention [95 %]",
+        lambda row: with_limits(number(row.retention_bounded), row.retention_bounded_ci, number),
+    ),
+    ("area [95 %]", lambda row: with_limits(number(row.retention_area), row.retention_area_ci, number)),
+    ("debiased [95 %]", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
 ]
 """Beside the category."""
 

@@ -10,18 +10,22 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
+    FURTHER_RETENTION,
     Column,
-    area_value,
+    action_place,
     beats,
     bounded_value,
+    call_words,
     controlled,
-    debiased_value,
     difference_title,
+    first_iteration,
+    margin_value,
     model_name,
     number,
     once_per_category,
+    paper_margin,
     percent,
-    place,
+    prefix_place,
     probed,
     with_limits,
 )
@@ -79,17 +83,20 @@ def _sides(row: RetentionRow) -> str:
     return f"{percent(row.sr_left, 0)} / {percent(row.sr_right, 0)}"
 
 
-def _retention(row: RetentionRow) -> str:
-    return number(row.retention) if row.retention_defined else "n/a"
-
-
-_OUTCOME_LEGEND = "wrong, outside, never moved (part of outside): each in % of all episodes"
-_SITE_LEGEND = "layer: the first of the best; after @ the iteration (flow step or action token); p family-wise"
+_OUTCOME_LEGEND = (
+    "Δ decides the regime, over as many items as count; wrong, outside, never moved (part of outside): each in % "
+    "of all episodes"
+)
+_SITE_LEGEND = (
+    "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
+    "of which the first sees no action yet; p family-wise"
+)
 
 _SUCCESS: dict[str, Sequence[Column]] = {
     "Does it act on the answer?": [
         ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
-        ("± Δ", lambda row: percent(row.delta)),
+        ("± Δ", margin_value),
+        ("paper's Δ", paper_margin),
         ("regime", _regime),
         ("left / right", _sides),
     ],
@@ -102,20 +109,19 @@ _SUCCESS: dict[str, Sequence[Column]] = {
 _RETENTION: dict[str, Sequence[Column]] = {
     "In the backbone": [
         ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
-        ("layer", lambda row: place(row.prefix_layer)),
+        ("layer", prefix_place),
         ("p", lambda row: number(row.prefix_p_fwe, 3)),
         ("beats", beats),
     ],
     "Where the action is made": [
         ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
-        ("layer", lambda row: place(row.action_layer, row.action_iteration)),
+        ("layer", action_place),
         ("p", lambda row: number(row.action_p_fwe, 3)),
+        ("first iteration %", first_iteration),
     ],
     "What is retained": [
         ("bounded [95 %]", bounded_value),
-        ("area [95 %]", area_value),
-        ("debiased [95 %]", debiased_value),
-        ("plain", _retention),
+        *FURTHER_RETENTION,
         ("gap", lambda row: percent(row.gap)),
     ],
 }
@@ -176,6 +182,8 @@ def _sizes(rows: Sequence[RetentionRow]) -> str:
     flags = [percent(row.p_flagged) for row in single if row.p_flagged is not None]
     if flags:
         parts.append(f"no action in {' / '.join(dict.fromkeys(flags))} % of steps (flagged)")
+    if calls := sorted({row.call for row in single if row.call is not None}):
+        parts.append("; ".join(map(call_words, calls)))
     if chances := {percent(row.chance) for row in single if row.chance is not None}:
         parts.append(f"chance {' or '.join(sorted(chances))} %")
     return ", ".join(parts)

@@ -1,7 +1,7 @@
 """Groups of runs against each other: what co-training, fine-tuning or RL changed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from probe_kit.retention.estimates import Estimate, Estimates, Limits, average
@@ -15,8 +15,9 @@ class Difference:
     """`group` minus `minus` in one category and view, each group the mean of its runs; 95 % intervals.
 
     paired: whether both ran the same items, which are then drawn together; otherwise each group's on its own.
-    Retention is the debiased one, None unless it is defined in both groups. In a row of category `mean`, numbers
-    are averages over the categories that both groups have.
+    `retention` is the debiased one, `retention_bounded` the one that tables lead with; None unless defined in both
+    groups. call: the captured inference that both were probed at, None without probes or where they differ. In a
+    row of category `mean`, numbers are averages over the categories that both groups have.
     """
 
     group: str
@@ -32,6 +33,11 @@ class Difference:
     action_ci: Limits | None = None
     retention: float | None = None
     retention_ci: Limits | None = None
+    retention_bounded: float | None = None
+    retention_bounded_ci: Limits | None = None
+    retention_area: float | None = None
+    retention_area_ci: Limits | None = None
+    call: int | None = None
 
 
 def group_differences(groups: Mapping[str, Sequence[Drawn]]) -> list[Difference]:
@@ -39,9 +45,11 @@ def group_differences(groups: Mapping[str, Sequence[Drawn]]) -> list[Difference]
     found = []
     for name, other in combinations(groups, 2):
         here, there = (_by_view(groups[one]) for one in (name, other))
+        calls = {one.row.call for one in (*groups[name], *groups[other])}
+        call = calls.pop() if len(calls) == 1 else None
         for view in here:
             if view in there:
-                found += _compare(name, other, view, here[view], there[view])
+                found += [replace(row, call=call) for row in _compare(name, other, view, here[view], there[view])]
     return found
 
 
@@ -80,12 +88,9 @@ def _compare(
 
 
 def _row(group: str, minus: str, category: str, view: str | None, paired: bool, gap: Estimates) -> Difference:
-    prefix, action, retention = (
-        _value(gap.get(name)) for name in ("prefix_accuracy", "action_accuracy", "retention_debiased")
-    )
-    return Difference(
-        group, minus, category, view, paired, gap["sr"].value, gap["sr"].ci, *prefix, *action, *retention
-    )
+    names = ("prefix_accuracy", "action_accuracy", "retention_debiased", "retention_bounded", "retention_area")
+    rest = [part for name in names for part in _value(gap.get(name))]
+    return Difference(group, minus, category, view, paired, gap["sr"].value, gap["sr"].ci, *rest)
 
 
 def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:

@@ -1,18 +1,24 @@
 """The retention table in LaTeX: booktabs rules, and five heat colours for retention."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    FURTHER_RETENTION,
+    action_place,
+    beats,
+    call_value,
     controlled,
-    debiased_value,
     difference_title,
+    first_iteration,
+    margin_value,
     model_name,
+    paper_margin,
     percent,
-    place,
+    prefix_place,
     probed,
     retention_value,
     title,
@@ -39,8 +45,11 @@ def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), 
     """
     parts = [_retention_table(rows)]
     if controlled(rows):
-        names = ["Model", *(name for name, _ in CONTROL_COLUMNS)]
-        cells = [[model_name(row), *(cell(row) for _, cell in CONTROL_COLUMNS)] for row in probed(rows)]
+        names = ["Model", "view", "call", *(name for name, _ in CONTROL_COLUMNS)]
+        cells = [
+            [model_name(row), row.view or "–", call_value(row), *(cell(row) for _, cell in CONTROL_COLUMNS)]
+            for row in probed(rows)
+        ]
         parts.append(_plain_table(title("Controls", rows), names, cells))
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
@@ -81,10 +90,9 @@ def _retention_table(rows: Sequence[RetentionRow]) -> str:
             *colours,
             r"\begin{table}",
             rf"\caption{{{escape(title('Success rate and retention', rows))}}}",
-            r"\begin{tabular}{lllrrrrrrrll}",
+            rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in _COLUMNS)}}}",
             r"\toprule",
-            r"Model & View & Category & $n$ & SR & $\Delta$ & Prefix & Layer & Action & Layer"
-            r" & Retention & Debiased [95\,\%] \\",
+            " & ".join(heading for heading, _, _ in _COLUMNS) + r" \\",
             r"\midrule",
             *body[:-1],
             r"\bottomrule",
@@ -100,25 +108,37 @@ def escape(text: str) -> str:
     return "".join(_SPECIAL.get(character, character) for character in text)
 
 
+_COLUMNS: list[tuple[str, Callable[[RetentionRow], str], str]] = [
+    ("Model", model_name, "l"),
+    ("View", lambda row: row.view or "–", "l"),
+    ("Call", call_value, "r"),
+    ("Category", lambda row: row.category, "l"),
+    ("$n$", lambda row: str(row.n_episodes), "r"),
+    ("SR", lambda row: percent(row.sr), "r"),
+    (r"$\Delta$", margin_value, "r"),
+    (r"$\Delta$ (paper)", paper_margin, "r"),
+    ("Prefix", lambda row: percent(row.prefix_accuracy), "r"),
+    ("Layer", prefix_place, "r"),
+    ("Action", lambda row: percent(row.action_accuracy), "r"),
+    ("Layer", action_place, "r"),
+    ("First it.", first_iteration, "r"),
+    ("Prefix beats", beats, "l"),
+    (r"Retention, bounded [95\,\%]", retention_value, "l"),
+    *((escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FURTHER_RETENTION),
+]
+"""Heading in LaTeX, content as text, alignment."""
+
+
 def _line(row: RetentionRow) -> str:
-    cells = [
-        model_name(row),
-        row.view or "–",
-        row.category,
-        str(row.n_episodes),
-        percent(row.sr),
-        percent(row.delta),
-        percent(row.prefix_accuracy),
-        place(row.prefix_layer),
-        percent(row.action_accuracy),
-        place(row.action_layer, row.action_iteration),
-        retention_value(row),
-        debiased_value(row),
-    ]
-    escaped = [escape(cell) for cell in cells]
-    if row.retention_defined and row.retention is not None:
-        escaped[10] = rf"\cellcolor{{{heat_colour(row.retention)}}}{escaped[10]}"
-    return " & ".join(escaped) + r" \\"
+    cells = [_coloured_retention(cell, row) for _, cell, _ in _COLUMNS]
+    return " & ".join(cells) + r" \\"
+
+
+def _coloured_retention(cell: Callable[[RetentionRow], str], row: RetentionRow) -> str:
+    text = escape(cell(row))
+    if cell is not retention_value or not row.retention_defined or row.retention_bounded is None:
+        return text
+    return rf"\cellcolor{{{heat_colour(row.retention_bounded)}}}{text}"
 
 
 def heat_colour(value: float) -> str:

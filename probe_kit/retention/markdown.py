@@ -7,18 +7,21 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    FURTHER_RETENTION,
     Column,
-    area_value,
+    action_place,
     beats,
-    bounded_value,
+    call_value,
     controlled,
-    debiased_value,
     difference_title,
+    first_iteration,
+    margin_value,
     model_name,
     number,
     once_per_category,
+    paper_margin,
     percent,
-    place,
+    prefix_place,
     probed,
     retention_value,
     success_interval,
@@ -32,7 +35,8 @@ SUCCESS_COLUMNS: list[Column] = [
     ("model", model_name),
     ("category", lambda row: row.category),
     ("SR % [95 %]", success_interval),
-    ("Δ %", lambda row: percent(row.delta)),
+    ("± Δ %", margin_value),
+    ("paper's Δ %", paper_margin),
     ("wrong %", lambda row: percent(row.p_wrong)),
     ("outside %", lambda row: percent(row.p_oob)),
     ("never moved %", lambda row: percent(row.p_never_moved)),
@@ -46,21 +50,21 @@ SUCCESS_COLUMNS: list[Column] = [
 RETENTION_COLUMNS: list[Column] = [
     ("model", model_name),
     ("view", lambda row: row.view or "–"),
+    ("call", call_value),
     ("category", lambda row: row.category),
+    ("bounded retention [95 %]", retention_value),
+    *FURTHER_RETENTION,
     ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
-    ("at layer", lambda row: place(row.prefix_layer)),
+    ("at layer", prefix_place),
     ("p", lambda row: number(row.prefix_p_fwe, 3)),
     ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
-    ("at layer @iteration", lambda row: place(row.action_layer, row.action_iteration)),
+    ("at layer @iteration", action_place),
     ("p", lambda row: number(row.action_p_fwe, 3)),
-    ("retention", retention_value),
-    ("debiased [95 %]", debiased_value),
+    ("first iteration %", first_iteration),
     ("gap %", lambda row: percent(row.gap)),
     ("chance %", lambda row: percent(row.chance)),
     ("groups", lambda row: "–" if row.n_groups is None else str(row.n_groups)),
     ("backbone beats", beats),
-    ("bounded [95 %]", bounded_value),
-    ("area [95 %]", area_value),
 ]
 
 
@@ -73,7 +77,7 @@ def markdown(
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
         columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–")]
-        columns += CONTROL_COLUMNS
+        columns += [("call", call_value), *CONTROL_COLUMNS]
         parts.append(_rows_table("Controls", probed(rows), columns))
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]

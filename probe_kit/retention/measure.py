@@ -29,11 +29,15 @@ curve draws a line for each of `all`, and one line for the `best` of every layer
 
 @dataclass(frozen=True)
 class Peak:
-    """The best site of a stream: its held-out accuracy and family-wise p."""
+    """The best site of a stream: its held-out accuracy and family-wise p.
+
+    ties: how many other sites of the stream are as accurate; `site` is the first of them all.
+    """
 
     site: Site
     accuracy: float
     p_fwe: float
+    ties: int = 0
 
 
 @dataclass(frozen=True)
@@ -73,9 +77,10 @@ def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak
     rows = _rows(curve, stream, iterations)
     if rows.size == 0:
         return None
-    accuracy = curve.correct[rows].mean(axis=1)
-    best = rows[np.argmax(accuracy)]
-    return Peak(curve.sites[best], float(accuracy.max()), float(curve.p_fwe()[best]))
+    right = curve.correct[rows].sum(axis=1)
+    best = rows[np.argmax(right)]
+    ties = int((right == right.max()).sum()) - 1
+    return Peak(curve.sites[best], float(curve.correct[best].mean()), float(curve.p_fwe()[best]), ties)
 
 
 def measure_retention(

@@ -64,11 +64,11 @@ class Behaviour:
 
 @dataclass(frozen=True, kw_only=True)
 class BackbonePeak:
-    """The backbone's best site.
+    """The backbone's best site, the first one on ties.
 
-    prefix_selectivity: its accuracy above that of the same probe on random labels of items. prefix_beats: whether
-    it is better than `chance`, `binding` and `twin`, family-wise; None for a control that was not run.
-    prefix_twin: how much more accurate it is than that of `twin`.
+    prefix_ties: how many other sites are as accurate. prefix_selectivity: its accuracy above that of the same
+    probe on random labels of items. prefix_beats: whether it is better than `chance`, `binding` and `twin`,
+    family-wise; None for a control that was not run. prefix_twin: how much more accurate it is than `twin`'s.
     """
 
     prefix_accuracy: float | None = None
@@ -80,6 +80,7 @@ class BackbonePeak:
     prefix_beats: dict[str, bool | None] = field(default_factory=dict)
     prefix_twin: float | None = None
     prefix_twin_ci: Limits | None = None
+    prefix_ties: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +103,7 @@ class ActionPeak:
     action_twin_ci: Limits | None = None
     action_first_accuracy: float | None = None
     action_first_layer: int | None = None
+    action_ties: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -168,6 +168,7 @@ class _Probed:
             prefix_beats=self.beats["prefix"],
             prefix_twin=None if twin is None else twin.difference,
             prefix_twin_ci=None if twin is None else twin.ci,
+            prefix_ties=peak.ties,
         )
 
     def action(self, estimates: Estimates) -> ActionPeak:
@@ -189,6 +190,7 @@ class _Probed:
             action_twin_ci=None if twin is None else twin.ci,
             action_first_accuracy=None if first is None else first.accuracy,
             action_first_layer=None if first is None else first.site.layer,
+            action_ties=peak.ties,
         )
 
     def background(self, success: SuccessRate) -> Background:

@@ -212,13 +212,14 @@ def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
     mark = ", RANDOM WEIGHTS" if random_weights else ""
+    mark += f", call {results.settings.call}"
     peaks = results.scores.sort_values("accuracy", ascending=False, kind="stable")
     for view, of_view in peaks.groupby("view", sort=False):
-        best = [rows.iloc[0] for _, rows in of_view.groupby(["category", "stream"])]
+        best = [_first_of_ties(rows) for _, rows in of_view.groupby(["category", "stream"])]
         headings = ("best site", "accuracy % [95 %]", "family-wise p", "beats", "n")
         table = FittingTable(
             title=f"Best site per stream, view {view}{mark}",
-            caption="",
+            caption="+: as many other sites tie with it",
             name="category",
             names=tuple(str(row["category"]) for row in best),
             styles=("",) * len(best),
@@ -227,10 +228,18 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
         out.print(table)
 
 
+def _first_of_ties(rows: "pd.DataFrame") -> "pd.Series[Any]":
+    """The best of a stream's sites, in order of accuracy, with the number of others that are as good."""
+    best = rows.iloc[0].copy()
+    best["ties"] = int((rows["accuracy"] == best["accuracy"]).sum()) - 1
+    return best
+
+
 def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
     accuracy, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
     p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
-    return tuple(map(Cell, (str(row["site"]), f"{accuracy} [{low}, {high}]", p, _beats(row), str(row["n"]))))
+    site = f"{row['site']} +{row['ties']}" if row["ties"] else str(row["site"])
+    return tuple(map(Cell, (site, f"{accuracy} [{low}, {high}]", p, _beats(row), str(row["n"]))))
 
 
 def _beats(best: "pd.Series[Any]") -> str:

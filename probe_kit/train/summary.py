@@ -15,14 +15,18 @@ def results_text(settings: ProbeSettings) -> str:
     random = ", RANDOM WEIGHTS" if settings.random_weights else ""
     return (
         f"<ProbeResults {settings.key} of {settings.model}{random}: {', '.join(settings.categories)}; "
-        f"views {', '.join(settings.views)}; target {settings.target}; {settings.permutations} relabellings>"
+        f"views {', '.join(settings.views)}; target {settings.target}; call {settings.call}; "
+        f"{settings.permutations} relabellings>"
     )
 
 
 def results_html(settings: ProbeSettings, scores: "pd.DataFrame") -> str:
     """The best site of every category, view and stream."""
     random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
-    title = f"Probes of {settings.model}{random}, target {settings.target}: the best site of each stream"
+    title = (
+        f"Probes of {settings.model}{random}, target {settings.target}, call {settings.call}: the best site of "
+        "each stream, + as many others that tie"
+    )
     columns = ("category", "view", "stream", "best site", "accuracy % [95 %]", "family-wise p", "n")
     note = (
         f"{settings.permutations} relabellings, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
@@ -32,11 +36,15 @@ def results_html(settings: ProbeSettings, scores: "pd.DataFrame") -> str:
 
 
 def _best(scores: "pd.DataFrame") -> "pd.DataFrame":
-    by_stream = scores.groupby(["category", "view", "stream"], sort=False)
-    return scores.loc[by_stream["accuracy"].idxmax()]
+    names = ["category", "view", "stream"]
+    best = scores.groupby(names, sort=False)["accuracy"].transform("max")
+    tied = scores.assign(ties=scores["accuracy"] == best)
+    tied["ties"] = tied.groupby(names, sort=False)["ties"].transform("sum") - 1
+    return tied.loc[tied.groupby(names, sort=False)["accuracy"].idxmax()]
 
 
 def _cells(row: "pd.Series") -> tuple[str, ...]:
     accuracy = f"{100 * row['accuracy']:.1f} [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
     p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
-    return row["category"], row["view"], row["stream"], row["site"], accuracy, p, str(row["n"])
+    site = f"{row['site']} +{row['ties']}" if row["ties"] else row["site"]
+    return row["category"], row["view"], row["stream"], site, accuracy, p, str(row["n"])

@@ -89,6 +89,7 @@ def expected(row: dict[str, object]) -> dict[str, list[float]]:
             [
                 row["sr"],
                 row["sr_ci"],
+                row["delta_regime"],
                 row["delta"],
                 score,
                 row["sr_left"],
@@ -96,17 +97,21 @@ def expected(row: dict[str, object]) -> dict[str, list[float]]:
                 row["p_wrong"],
                 row["p_oob"],
             ],
-            [SHARE, SHARE, SHARE, (1, 1), WHOLE, WHOLE, SHARE, SHARE],
+            [SHARE, SHARE, SHARE, SHARE, (1, 1), WHOLE, WHOLE, SHARE, SHARE],
         ),
         "Retention": rounded(
             [
-                *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer", "p_fwe")),
-                *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration", "p_fwe")),
+                *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer")),
+                row["prefix_ties"] or None,
+                row["prefix_p_fwe"],
+                *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration")),
+                row["action_ties"] or None,
+                *(row[f"action_{name}"] for name in ("p_fwe", "first_accuracy")),
                 *(row[f"retention_{name}"] if defined else None for name in RETENTIONS),
                 row["retention"] if defined else None,
                 row["gap"],
             ],
-            [SHARE, SHARE, PLACE, P, SHARE, SHARE, PLACE, PLACE, P, *[RATIO] * 7, SHARE],
+            [SHARE, SHARE, PLACE, PLACE, P, SHARE, SHARE, PLACE, PLACE, PLACE, P, SHARE, *[RATIO] * 7, SHARE],
         ),
         "Controls": rounded(
             [
@@ -163,7 +168,7 @@ def test_text_says_backbone_and_action_and_latex_the_papers_columns(table: Reten
         assert not re.search("prefix|expert", text), text
     assert sum("backbone" in text for text in (*headings, *lines)) >= 10
     assert sum("action" in text for text in (*headings, *lines)) >= 10
-    assert "& Prefix & Layer & Action & Layer & Retention &" in table.to_latex()
+    assert "& Prefix & Layer & Action & Layer & First it. &" in table.to_latex()
 
 
 def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:

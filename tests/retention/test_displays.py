@@ -193,15 +193,15 @@ def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) 
     row = table.rows[0]
     assert SideTableDisplay.from_table(table).cells[0][0].values == (row.sr_left, row.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
-    assert color.values == (row.retention, row.retention_debiased)
+    assert color.values == (row.retention_bounded, row.retention)
     assert shape.values == (None, None), "no backbone signal"
 
 
 def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
     display = RetentionTableDisplay.from_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})])).plot()
     texts = [text.get_text() for text in display.ax_.texts]
-    plain, debiased = display.cells[0][0].values
-    assert texts[:4] == [f"{plain:.2f}", f"{debiased:.2f}", "–", "–"]
+    bounded, published = display.cells[0][0].values
+    assert texts[:4] == [f"{bounded:.2f}", f"{published:.2f}", "–", "–"]
 
 
 def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_table: Any) -> None:

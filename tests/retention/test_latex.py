@@ -15,8 +15,11 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
 
 def test_text_is_escaped_and_only_defined_retention_is_coloured(table: RetentionTable) -> None:
     text = table.to_latex()
-    lines = {line.split(" & ")[2]: line for line in text.splitlines() if line.startswith("pi0-tiny (random")}
-    assert r"\cellcolor{pkheat3}0.50" in lines["color"]
+    lines = {line.split(" & ")[3]: line for line in text.splitlines() if line.startswith("pi0-tiny (random")}
+    row = table.rows[0]
+    assert row.retention_bounded is not None
+    shown = rf"\cellcolor{{{heat_colour(row.retention_bounded)}}}{row.retention_bounded:.2f}"
+    assert shown in lines["color"]
     assert "cellcolor" not in lines[r"traffic\_sign"]
     assert text.count("{") == text.count("}")
     assert r"(suite@1\#0123456789ab; random weights)" in text

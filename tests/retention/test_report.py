@@ -131,7 +131,7 @@ def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: Pro
 def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
     made = retention_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows)
     assert made is not None
-    position = [column.name for column in made.columns].index("retention")
+    position = [column.name for column in made.columns].index("bounded [95\u00a0%]")
     color, shape = (row[position] for row in made.body)
     assert color.heat is not None
     assert (shape.text, shape.sort, shape.heat, shape.note) == ("n/a", None, None, "n/a (no backbone signal)")

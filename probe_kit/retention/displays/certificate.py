@@ -18,6 +18,7 @@ class Certificate:
 
     weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
     n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
+    call: captured inference that was probed, None without probes.
     """
 
     model: str
@@ -28,6 +29,7 @@ class Certificate:
     settings: str
     probes: str | None = None
     target: str = "correct"
+    call: int | None = None
 
     @classmethod
     def of_run(cls, run: RunReader) -> Self:
@@ -43,7 +45,7 @@ class Certificate:
         n = f"n = {_span(sizes)} episodes per category"
         return cls(
             settings.model, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
-            results.key, settings.target,
+            results.key, settings.target, settings.call,
         )  # fmt: skip
 
     @classmethod
@@ -58,18 +60,20 @@ class Certificate:
             n,
             row.run_settings,
             row.probe_settings,
+            call=row.call,
         )
 
     @property
-    def parts(self) -> tuple[str, str, str, str, str, str]:
+    def parts(self) -> tuple[str, str, str, str, str, str, str]:
         """What a line under a figure says, most important first; random weights are named in capitals.
 
-        Model, suite, n, target, probes, weights; empty where there is nothing to say.
+        Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
         """
         return (
             f"{self.model} {RANDOM}" if self.random_weights else self.model,
             self.suite,
             self.n,
+            "" if self.call is None else f"call {self.call}",
             f"target {self.target}" if self.target != "correct" else "",
             f"probes {self.probes}" if self.probes else "",
             f"weights {self.weights[:SHOWN]}" if self.weights else "",

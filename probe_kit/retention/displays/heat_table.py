@@ -156,11 +156,11 @@ class SideTableDisplay(HeatTableDisplay):
 
 
 class RetentionTableDisplay(HeatTableDisplay):
-    """Plain and debiased retention by model and category; empty where the backbone carries no signal."""
+    """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
 
-    title = "Retention: published ratio | debiased"
+    title = "Retention: bounded | published ratio"
     note = "dash: no backbone signal, so the ratio has no meaning"
-    parts = ("published", "debiased")
+    parts = ("bounded", "published")
     scale, digits = 1.0, 2
 
     @classmethod
@@ -168,7 +168,7 @@ class RetentionTableDisplay(HeatTableDisplay):
         """From a retention table with probes. Raises UsageError if no run was probed."""
 
         def cell(row: RetentionRow) -> Cell:
-            values = (row.retention, row.retention_debiased) if row.retention_defined else (None, None)
+            values = (row.retention_bounded, row.retention) if row.retention_defined else (None, None)
             return Cell(values)
 
         return cls._of([row for row in table.all_rows if row.view is not None], cell)

@@ -9,9 +9,19 @@ GLOSSARY = MappingProxyType(
             "% interval, whole groups of questions resampled. Two pictures: guessing gives 50 %."
         ),
         "Δ": (
-            "How far from 50 % guessing alone may lead if every episode were a question of its own, as the paper "
-            "has it. The reading is stricter: it counts questions, and those that share a picture and are "
-            "answered alike as fewer."
+            "How far from 50 % guessing alone may lead, which decides the reading. It counts questions, and those "
+            "that share a picture and are answered alike as fewer."
+        ),
+        "paper's Δ": (
+            "The same if every episode were a question of its own, as the paper has it. It decides nothing here."
+        ),
+        "call": (
+            "Which inference of an episode was probed, counted from 0: call 0 comes before anything has moved. A "
+            "policy that reaches for the cube first may not need the answer yet."
+        ),
+        "first iteration": (
+            "Best layer at the first iteration, which sees pure noise. Late iterations hold the decision itself, "
+            "as a noisy action."
         ),
         "wrong": "Share of episodes that ended on the other picture.",
         "outside": "Share of episodes that ended on neither picture.",
@@ -53,7 +63,8 @@ GLOSSARY = MappingProxyType(
         "chance": "Accuracy of always naming the more frequent side.",
         "layer": (
             "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first "
-            "of several that are equally good. After @: the iteration, a flow-matching step or an action token."
+            "of several that are equally good; after +: how many others are. After @: the iteration, a "
+            "flow-matching step or an action token."
         ),
         "p": (
             "Probability that the best layer of a stream looks this good when the answers are relabelled at "

@@ -64,15 +64,15 @@ def _headlines(mean: RetentionRow) -> list[Headline]:
 
 
 def _retention_headline(mean: RetentionRow) -> Headline:
-    if not mean.retention_defined or mean.retention_debiased is None:
+    if not mean.retention_defined or mean.retention_bounded is None:
         return Headline("n/a", "retention", "no backbone signal to retain")
-    return Headline(f"{mean.retention_debiased:.2f}", "retention, debiased", _interval_words(mean))
+    return Headline(f"{mean.retention_bounded:.2f}", "retention, bounded", _interval_words(mean))
 
 
 def _interval_words(row: RetentionRow) -> str:
-    if row.retention_ci is None:
+    if row.retention_bounded_ci is None:
         return "no interval"
-    low, high = row.retention_ci
+    low, high = row.retention_bounded_ci
     return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
 
 
@@ -115,11 +115,11 @@ def _judge(rows: Sequence[RetentionRow]) -> str:
 
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
     counted = [row for row in rows if row.retention_defined]
-    if not counted or mean.retention_debiased is None:
+    if not counted or mean.retention_bounded is None:
         return "Retention is not defined: where the backbone knows no more than the controls, nothing is retained."
     left = f" ({len(mean.left_out)} left out for lack of a backbone signal)" if mean.left_out else ""
     return (
-        f"Of what can be read in the backbone above chance, a share of {mean.retention_debiased:.2f} can still be "
+        f"Of what can be read in the backbone above chance, a share of {mean.retention_bounded:.2f} can still be "
         f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
     )
 
@@ -160,17 +160,22 @@ def read_row(row: RetentionRow) -> list[str]:
     if row.prefix_accuracy is not None:
         found.append(
             f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
-            f"{row.prefix_depth:.2f}: {_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
+            f"{row.prefix_depth:.2f}{_ties_words(row.prefix_ties)}: "
+            f"{_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
         )
     if row.action_accuracy is not None:
         step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
         found.append(
-            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}: "
-            f"{_clear_words(row.action_p_fwe, row.action_beats)}."
+            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}"
+            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_beats)}."
         )
-    if row.retention_defined and row.retention_debiased is not None:
-        found.append(f"Debiased retention {row.retention_debiased:.2f} ({_interval_words(row)}).")
+    if row.retention_defined and row.retention_bounded is not None:
+        found.append(f"Bounded retention {row.retention_bounded:.2f} ({_interval_words(row)}).")
     return found
+
+
+def _ties_words(ties: int | None) -> str:
+    return f" and at {ties} other site{'s' * (ties > 1)} as well" if ties else ""
 
 
 def _clear_words(p: float | None, beats: Beats) -> str:

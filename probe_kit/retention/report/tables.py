@@ -7,9 +7,11 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    action_place,
     area_value,
     beats,
     bounded_value,
+    call_value,
     controlled,
     debiased_value,
     difference_title,
@@ -17,7 +19,8 @@ from probe_kit.retention.cells import (
     number,
     once_per_category,
     percent,
-    place,
+    plain_value,
+    prefix_place,
     probed,
     success_interval,
     with_limits,
@@ -137,13 +140,16 @@ _VIEW = _Column(
     "How the tokens of an episode became one vector.",
 )
 
+_CALL = _Column("call", call_value, lambda row: row.call, "call")
+
 _BEHAVIOUR = [
     *_NAMES,
     _Column(
         "SR % [95 %]", success_interval, lambda row: row.sr, "SR", lambda row: row.sr,
         lambda row: row.regime == Regime.KNOWLEDGE,
     ),
-    _share("± Δ", "delta", "Δ"),
+    _share("± Δ", "delta_regime", "Δ"),
+    _share("paper's Δ", "delta", "paper's Δ"),
     _Column(
         "reading", lambda row: _REGIMES.get(row.regime) or f"score {number(row.normalised_score, 1)}",
         lambda row: row.sr, "reading",
@@ -172,30 +178,26 @@ _MORE_BEHAVIOUR = [
 _RETENTION = [
     *_NAMES,
     _VIEW,
+    _CALL,
+    _Column(
+        "bounded [95 %]", bounded_value, _bounded, "bounded", _bounded, note=lambda row: row.retention_note,
+    ),
+    _Column("area [95 %]", area_value, _area, "area", _area),
+    _Column("debiased [95 %]", debiased_value, _debiased, "debiased", _debiased),
+    _Column("published", plain_value, _retention, "retention", _retention),
     _Column(
         "backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent),
         lambda row: row.prefix_accuracy, "backbone", strong=lambda row: row.prefix_signal,
     ),
-    _Column("layer", lambda row: place(row.prefix_layer), lambda row: row.prefix_layer, "layer"),
+    _Column("layer", prefix_place, lambda row: row.prefix_layer, "layer"),
     _Column("p", lambda row: _p(row.prefix_p_fwe), lambda row: row.prefix_p_fwe, "p"),
     _Column(
         "action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent),
         lambda row: row.action_accuracy, "action", strong=lambda row: row.action_signal,
     ),
-    _Column(
-        "layer @iteration", lambda row: place(row.action_layer, row.action_iteration),
-        lambda row: row.action_layer, "layer",
-    ),
+    _Column("layer @iteration", action_place, lambda row: row.action_layer, "layer"),
     _Column("p", lambda row: _p(row.action_p_fwe), lambda row: row.action_p_fwe, "p"),
-    _Column(
-        "retention", lambda row: number(row.retention) if row.retention_defined else "n/a", _retention,
-        "retention", _retention, note=lambda row: row.retention_note,
-    ),
-    _Column("bounded [95 %]", bounded_value, _bounded, "bounded", _bounded),
-    _Column("area [95 %]", area_value, _area, "area", _area),
-    _Column(
-        "debiased [95 %]", debiased_value, _debiased, "debiased", _debiased,
-    ),
+    _share("first iteration %", "action_first_accuracy", "first iteration"),
     _Column("gap", lambda row: percent(row.gap), lambda row: row.gap, "gap"),
     _Column("backbone beats", beats, beats, "beats"),
     _share("chance %", "chance", "chance"),
@@ -236,6 +238,7 @@ def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
     columns = [
         _NAMES[0],
         _VIEW,
+        _CALL,
         *(_Column(name, cell, cell, _CONTROL_MEANINGS.get(name)) for name, cell in CONTROL_COLUMNS),
     ]
     return _table("Controls", probed(rows), columns)

@@ -1,0 +1,115 @@
+"""What every form of table has in common: bounded retention first, the call, the first iteration, ties, Δ."""
+
+import io
+import re
+from collections.abc import Callable
+
+import pytest
+from rich.console import Console
+
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.differences import Difference
+from probe_kit.retention.report.readings import read_row, summarise
+from probe_kit.retention.report.tables import HtmlTable, behaviour_table, difference_tables, retention_table
+from probe_kit.train import ArrayRun
+
+ProbedRun = Callable[..., ArrayRun]
+TIED = ([0.5, 0.9, 0.9], [[0.6, 0.8], [0.8, 0.8]])
+FURTHER = ("area", "debiased", "published")
+
+
+@pytest.fixture
+def table(probed_run: ProbedRun) -> RetentionTable:
+    runs = [probed_run({"color": TIED}, name) for name in ("one", "other")]
+    return retention({"first": [runs[0]], "second": [runs[1]]})
+
+
+def headings(table: HtmlTable | None) -> str:
+    assert table is not None
+    return " | ".join(column.name for column in table.columns).replace("\u00a0", " ")
+
+
+def console(table: RetentionTable) -> str:
+    screen = Console(width=240, file=io.StringIO())
+    screen.print(table.to_rich())
+    return screen.file.getvalue()  # type: ignore[attr-defined,no-any-return]
+
+
+def every_form(table: RetentionTable) -> dict[str, str]:
+    """Text from the retention table on, by form; the one of a page is its headings and cells."""
+    html = retention_table(table.all_rows)
+    assert html is not None
+    cells = " | ".join(cell.text for cell in html.body[0])
+    return {
+        "console": console(table).split("Retention, view")[1],
+        "markdown": table.to_markdown().split("**Retention")[1],
+        "latex": table.to_latex().split(r"\toprule")[1],
+        "page": f"{headings(html)}\n{cells}",
+    }
+
+
+def test_every_table_leads_with_bounded_retention(table: RetentionTable) -> None:
+    differences = {
+        "difference, page": headings(difference_tables(table.differences)[0]),
+        "difference, markdown": table.to_markdown().split("**Difference")[1],
+        "difference, latex": table.to_latex().split(r"\caption{Difference")[1],
+        "difference, console": console(table).split("Difference: ")[1],
+    }
+    for form, text in (every_form(table) | differences).items():
+        places = [text.lower().find(name) for name in ("bounded", *FURTHER)]
+        wanted = places[:3] if form.startswith("difference") else places
+        assert -1 not in wanted, (form, places)
+        assert wanted == sorted(wanted), (form, places)
+
+
+def test_every_table_names_the_call_the_first_iteration_and_ties(table: RetentionTable) -> None:
+    for form, text in every_form(table).items():
+        assert re.search(r"\bcall\b", text, re.IGNORECASE), form
+        assert re.search(r"first it", text, re.IGNORECASE), form
+        assert "80.0" in text.split("first it")[-1].lower(), form
+        assert re.search(r"(?<![@\d])1 \+1\b", text), (form, "two layers of the backbone are as good")
+        assert re.search(r"1 @0 \+2\b", text), (form, "three sites of the expert are as good")
+
+
+def test_ties_stand_in_the_row_and_in_the_reading(table: RetentionTable) -> None:
+    row = table.rows[0]
+    assert (row.prefix_ties, row.action_ties) == (1, 2)
+    words = " ".join(read_row(row))
+    assert "and at 1 other site as well" in words
+    assert "and at 2 other sites as well" in words
+
+
+def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable) -> None:
+    row = table.rows[0]
+    assert row.delta is not None
+    assert row.delta_regime is not None
+    assert row.delta < row.delta_regime
+    deciding, papers = f"{100 * row.delta_regime:.1f}", f"{100 * row.delta:.1f}"
+    page = behaviour_table(table.all_rows)
+    texts = {
+        "console": console(table),
+        "markdown": table.to_markdown(),
+        "latex": table.to_latex(),
+        "page": " | ".join(cell.text for cell in page.body[0]),
+    }
+    for form, text in texts.items():
+        assert -1 < text.find(deciding) < text.find(papers), form
+
+
+def test_the_summary_quotes_bounded_retention(table: RetentionTable) -> None:
+    rows = [row for row in table.all_rows if row.group == "first"]
+    bounded = rows[-1].retention_bounded
+    assert bounded is not None
+    assert bounded != rows[-1].retention_debiased
+    headline = summarise(rows).headlines[-1]
+    assert (headline.name, headline.value) == ("retention, bounded", f"{bounded:.2f}")
+
+
+def test_differences_hold_all_three_estimates_and_the_call(table: RetentionTable) -> None:
+    (row, _) = table.differences
+    assert isinstance(row, Difference)
+    first, second = (one for one in table.rows if one.category == "color")
+    for name in ("retention_bounded", "retention_area"):
+        assert getattr(row, name) == pytest.approx(getattr(first, name) - getattr(second, name))
+        assert getattr(row, f"{name}_ci") is not None
+    assert row.call == 0
