@@ -18,12 +18,17 @@ def build(
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all embedded ones.")] = None,
     n: Annotated[int, typer.Option("--n", help="Items per category, even: items come as twins.")] = 150,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    suite_version: Annotated[
+        int,
+        typer.Option(help="1, which the embedded policy was trained on, or 2, which gives less away for free."),
+    ] = 1,
 ) -> None:
     """Draw the embedded suite into FOLDER."""
     from probe_kit.suite import build_suite
 
     with progress() as bar:
-        suite = build_suite(folder, split(categories), n, seed, progress=counter(bar, "drawing items"))
+        drawing = counter(bar, "drawing items")
+        suite = build_suite(folder, split(categories), n, seed, progress=drawing, version=suite_version)
     out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
 
 

@@ -9,6 +9,7 @@ from probe_kit.suite.generators.emotion import EMOTION
 from probe_kit.suite.generators.generator import Concept, Generator, Tile
 from probe_kit.suite.generators.living_world import LIVING_WORLD
 from probe_kit.suite.generators.public_info import PUBLIC_INFO
+from probe_kit.suite.generators.second import SECOND
 from probe_kit.suite.generators.shape import SHAPE
 from probe_kit.suite.generators.state import STATE
 from probe_kit.suite.generators.symmetry import SYMMETRY
@@ -16,13 +17,21 @@ from probe_kit.suite.generators.time import TIME
 from probe_kit.suite.generators.traffic import TRAFFIC
 from probe_kit.suite.wording import instruction_for
 
-__all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]
+__all__ = ["GENERATORS", "Concept", "Generator", "Tile", "generators_of", "vocabulary"]
 
 _ALL = (
     *(EMOTION, ATTRIBUTE, STATE, COLOR, SHAPE, SYMMETRY),
     *(COUNTING, TIME, PUBLIC_INFO, TRAFFIC, LIVING_WORLD),
 )
 GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in _ALL}
+"""By category, of version 1 of the suite."""
+
+_OF_SECOND = GENERATORS | {generator.category: generator for generator in SECOND}
+
+
+def generators_of(version: int) -> dict[str, Generator[Any]]:
+    """By category, of a version of the suite: 1 or 2."""
+    return {1: GENERATORS, 2: _OF_SECOND}[version]
 
 
 def vocabulary() -> list[str]:

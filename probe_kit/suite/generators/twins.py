@@ -11,8 +11,8 @@ from typing import Any
 
 from probe_kit.identity import sha256_json
 from probe_kit.suite.categories import CATEGORIES
-from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION, Couple, draw_couples
+from probe_kit.suite.generators import generators_of
+from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUITE_VERSIONS, Couple, draw_couples
 from probe_kit.suite.generators.generator import Tile
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.making import Picture, make_item
@@ -38,13 +38,13 @@ class Twins:
     pictures: tuple[DrawnPicture, DrawnPicture]
 
 
-def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
+def draw_twins(category: str, count: int, seed: int, version: int = DEFAULT_VERSION) -> Iterator[Twins]:
     """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
-    for number, couple in enumerate(islice(draw_couples(GENERATORS[category], seed), count)):
+    for number, couple in enumerate(islice(draw_couples(generators_of(version)[category], seed), count)):
         pictures = _draw(category, couple.left_tile), _draw(category, couple.right_tile)
         gen = {
             "generator": category,
-            "version": SUITE_VERSION,
+            "version": SUITE_VERSIONS[version],
             "seed": seed,
             "couple": number,
             "left": pictures[0].tile,
@@ -95,7 +95,7 @@ def _item(couple: Couple, pictures: tuple[DrawnPicture, DrawnPicture], side: Sid
         contains_real_face=False,
         source={
             "benchmark": SUITE_NAME,
-            "version": SUITE_VERSION,
+            "version": gen["version"],
             "split": "eval",
             "source_id": pair_id,
             "url": "",

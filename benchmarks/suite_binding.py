@@ -1,0 +1,104 @@
+"""What an untrained conjunction of pictures and words gets for free on the embedded suite, by category.
+
+    python benchmarks/suite_binding.py [--versions 1,2] [--items 150] [--seeds 0] [--width 96] [--categories …]
+
+Accuracy in % of the control `binding`: of its five random layers the best one, and their mean, on the control's
+own nested folds. No model is asked. Several seeds: other drawings of the same version, averaged.
+"""
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from probe_kit.identity import derive_seed
+from probe_kit.suite import Suite, build_suite
+from probe_kit.train import ArrayRun, ProbeSettings
+from probe_kit.train.binding import LAYERS, BindingInputs
+from probe_kit.train.problem import category_problem
+from probe_kit.train.results import episodes_sha256
+from probe_kit.train.samples import Samples
+from probe_kit.train.scores import correctness
+
+
+def main() -> None:
+    """Draw the suites, fit the control, print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--versions", default="1,2")
+    parser.add_argument("--items", type=int, default=150)
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--width", type=int, default=96, help="units of a random layer; 96 is pi0-tiny's backbone")
+    parser.add_argument("--categories", default=None)
+    asked = parser.parse_args()
+    categories = asked.categories.split(",") if asked.categories else None
+    seeds = [int(seed) for seed in asked.seeds.split(",")]
+    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    with threadpool_limits(1), TemporaryDirectory() as scratch:
+        for version in asked.versions.split(","):
+            for seed in seeds:
+                folder = Path(scratch) / f"{version}-{seed}"
+                suite = build_suite(folder, categories, asked.items, seed, version=int(version))
+                for category, scores in free_accuracy(suite, asked.width).items():
+                    found.setdefault(category, {}).setdefault(version, []).append(scores)
+    table = Table(title=f"binding, {asked.items} items, width {asked.width}: best and mean of {LAYERS} layers, %")
+    for heading in ("category", *(f"version {version}" for version in asked.versions.split(","))):
+        table.add_column(heading)
+    for category, by_version in found.items():
+        table.add_row(category, *(_cell(scores) for scores in by_version.values()))
+    Console().print(table)
+
+
+def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
+    """By category, the accuracy of the best random layer and the mean of all."""
+    run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
+    inputs = BindingInputs.of(run, suite.folder)
+    settings = ProbeSettings(
+        model="none", random_weights=True, weights=None, suite=suite.identity, run_settings=run.settings_sha256,
+        episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",
+        permutations=0, seed=0,
+    )  # fmt: skip
+    found = {}
+    for category in track(suite.categories, suite.identity, console=Console(stderr=True)):
+        problem = category_problem(run.episodes, category, settings)
+        nothing = np.empty((problem.labels.size, 0), bool)
+        accuracies = []
+        for number in range(LAYERS):
+            layer = inputs.layer(problem.rows, width, derive_seed("binding", 0, number))
+            decisions = problem.fit(Samples.pooled(layer), nothing).decisions
+            accuracies.append(float(correctness(decisions, problem.labels).mean()))
+        found[category] = (max(accuracies), float(np.mean(accuracies)))
+    return found
+
+
+def _episodes(suite: Suite) -> pd.DataFrame:
+    """What a run would know of its episodes before it began."""
+    return pd.DataFrame(
+        [
+            {
+                "episode_id": episode.episode_id,
+                "item_id": episode.item.item_id,
+                "group_id": episode.item.group_id,
+                "category": episode.item.category,
+                "layout": episode.layout,
+                "side_correct": episode.side_correct,
+                "instruction": episode.item.instruction,
+                "outcome": "oob",
+            }
+            for episode in suite.episodes()
+        ]
+    )
+
+
+def _cell(scores: list[tuple[float, float]]) -> str:
+    best, mean = (100 * np.mean(part) for part in zip(*scores, strict=True))
+    return f"{best:.1f} ({mean:.1f})"
+
+
+if __name__ == "__main__":
+    main()
