@@ -88,9 +88,12 @@ def _compare(
 
 
 def _row(group: str, minus: str, category: str, view: str | None, paired: bool, gap: Estimates) -> Difference:
-    names = ("prefix_accuracy", "action_accuracy", "retention_debiased", "retention_bounded", "retention_area")
-    rest = [part for name in names for part in _value(gap.get(name))]
-    return Difference(group, minus, category, view, paired, gap["sr"].value, gap["sr"].ci, *rest)
+    prefix, action = (_value(gap.get(f"{part}_accuracy")) for part in ("prefix", "action"))
+    debiased, bounded, area = (_value(gap.get(f"retention_{part}")) for part in ("debiased", "bounded", "area"))
+    sr = gap["sr"]
+    return Difference(
+        group, minus, category, view, paired, sr.value, sr.ci, *prefix, *action, *debiased, *bounded, *area
+    )
 
 
 def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:

@@ -51,8 +51,12 @@ def train(
         str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
     call: Annotated[
-        int, typer.Option(help="Captured inference to probe, counted from 0; see extract --captured-calls.", min=0)
-    ] = 0,
+        str,
+        typer.Option(
+            help="Captured inferences to probe, counted from 0 and comma-separated, or all; see extract "
+            "--captured-calls."
+        ),
+    ] = "0",
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[
         int | None,
@@ -75,27 +79,28 @@ def train(
     opened = open_run(run, allow_partial=partial)
     beside = None if twin is None else open_run(twin, allow_partial=partial)
     pictures = suite or _embedded_suite(opened)
-    with progress() as bar:
-        results = train_probes(
-            opened,
-            split(categories),
-            split(views) or (),
-            permutations=permutations,
-            token_permutations=token_permutations,
-            target=asked,
-            call=call,
-            folds=units,
-            incomplete=rest,
-            controls=baselines if baselines is not None else _default_controls(pictures),
-            suite=pictures,
-            twin=beside,
-            seed=seed,
-            jobs=jobs,
-            device=device,
-            ray=ray,
-            progress=counter(bar, "sites"),
-        )
-    _print_peaks(results, opened.random_weights)
+    for number in _calls(call, opened):
+        with progress() as bar:
+            results = train_probes(
+                opened,
+                split(categories),
+                split(views) or (),
+                permutations=permutations,
+                token_permutations=token_permutations,
+                target=asked,
+                call=number,
+                folds=units,
+                incomplete=rest,
+                controls=baselines if baselines is not None else _default_controls(pictures),
+                suite=pictures,
+                twin=beside,
+                seed=seed,
+                jobs=jobs,
+                device=device,
+                ray=ray,
+                progress=counter(bar, f"sites, call {number}" if number else "sites"),
+            )
+        _print_peaks(results, opened.random_weights)
     if not results.controls.excess:
         say("signal is judged against chance only: give --suite, or a --twin by random weights")
     say(marked("next: [bold]probe-kit retention {}[/]", run))
@@ -170,6 +175,18 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     parts += [f"only {', '.join(probes.categories)}"] * (probes.categories != found.categories)
     parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
     return "; ".join([*parts, fitted])
+
+
+def _calls(text: str, run: "RunReader") -> list[int]:
+    """The captured inferences that were asked for, each once."""
+    from probe_kit.train.at_call import captured_calls
+
+    if text == "all":
+        return list(range(captured_calls(run)))
+    found = split(text) or ()
+    if not found or not all(part.isdecimal() for part in found):
+        raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
+    return list(dict.fromkeys(map(int, found)))
 
 
 def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":

@@ -16,8 +16,10 @@ from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
+from probe_kit.retention.call_curves import CallCurves
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
+from probe_kit.train.calls import load_calls
 
 STREAM = StoredStream("backbone", 2, 8, None, 6, ("mean", "last", "mean:language"))
 CALLS = 3
@@ -111,6 +113,18 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
     table = retention([run], keys=[later.key])
     assert any("captured inference 1" in note for note in table.notes)
     assert not any("other episodes" in note for note in table.notes)
+
+
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
+def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
+    first, *_ = [train_probes(run, ("all",), permutations=5, call=call) for call in range(CALLS)]
+    train_probes(run, ("all",), permutations=4, call=1)
+    calls = load_calls(run, first)
+    assert list(calls) == list(range(CALLS))
+    assert {one.settings.permutations for one in calls.values()} == {5}
+    line = CallCurves.of(calls, "all", "mean").line("backbone")
+    assert line.episodes.tolist() == [int(run.reached(call).sum()) for call in range(CALLS)]
+    assert line.accuracy[1] > 0.85 > line.accuracy[0]
 
 
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")

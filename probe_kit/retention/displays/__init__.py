@@ -4,6 +4,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 `gallery` makes all figures that fit a table of runs.
 """
 
+from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
 from probe_kit.retention.displays.gallery import Exhibit, gallery, save_figures
@@ -21,6 +22,7 @@ from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
 
 __all__ = [
+    "CallCurveDisplay",
     "Certificate",
     "Exhibit",
     "FinalPositionsDisplay",
@@ -34,6 +36,8 @@ __all__ = [
     "RoleCurvesDisplay",
     "SideTableDisplay",
     "SuccessTableDisplay",
+    "aligned_curves",
+    "call_curves",
     "final_positions",
     "gallery",
     "iteration_maps",

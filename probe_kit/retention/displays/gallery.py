@@ -7,7 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
+from probe_kit.retention.call_curves import CallCurves
+from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
     HeatTableDisplay,
@@ -23,6 +26,7 @@ from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.table import RetentionTable
+from probe_kit.train.calls import load_calls
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 
@@ -75,7 +79,9 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
     exhibits = _of_table(table, [one for one in results if one is not None])
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
         exhibits += _of_run(name, position, run)
-        exhibits += [] if probed is None else _of_probes(name, position, probed, table.iterations)
+        if probed is not None:
+            exhibits += _of_probes(name, position, probed, table.iterations)
+            exhibits += _of_calls(name, position, run, probed)
     return exhibits
 
 
@@ -204,6 +210,39 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
                 )
             )  # fmt: skip
     return exhibits
+
+
+def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
+    """Only where a later inference was probed as well."""
+    calls = load_calls(run, results)
+    if len(calls) < 2:
+        return []
+    views = results.settings.views
+    exhibits = [
+        Exhibit(
+            f"{name}-calls{_suffix(view, views)}", "Over the episode" + (f", view {view}" * (len(views) > 1)),
+            "probes",
+            "The best site of each part at every inference that was captured, counted from 0. Filled markers are "
+            "evidence; dotted: what the best site of relabelled data stays below. An answer that is not there at "
+            "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
+            position, partial(call_curves, calls, view, run),
+        )
+        for view in views
+    ]  # fmt: skip
+    curves = [CallCurves.of(calls, category, views[0], run) for category in results.settings.categories]
+    events = [event for event in EVENTS if any(_aligned(one, event) for one in curves)]
+    return exhibits + [
+        Exhibit(
+            f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
+            "The same, with every episode's inferences counted from its own event: 0 is the last one before it.",
+            position, partial(aligned_curves, calls, event, views[0], run),
+        )
+        for event in events
+    ]  # fmt: skip
+
+
+def _aligned(curves: CallCurves, event: str) -> bool:
+    return any(curves.aligned(stream, event) is not None for stream in curves.streams)
 
 
 def _suffix(view: str, views: Sequence[str]) -> str:

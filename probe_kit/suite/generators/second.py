@@ -57,22 +57,21 @@ def moved(placement: Placement, rng: np.random.Generator) -> Placement:
 
 
 def _colors(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Figure, Figure]:
-    one, other = (
-        replace(
-            figure,
-            background=other_color((left, right), figure.ink, rng),
-            placement=moved(figure.placement, rng),
-        )
-        for figure in COLOR.tiles(left, right, rng)
-    )
-    return one, other  # type: ignore[return-value]
+    drawn: tuple[Any, Any] = COLOR.tiles(left, right, rng)
+    one, other = (_color(figure, (left, right), rng) for figure in drawn)
+    return one, other
+
+
+def _color(figure: Figure, concepts: Sequence[Concept], rng: np.random.Generator) -> Figure:
+    background = other_color(concepts, figure.ink, rng)
+    return replace(figure, background=background, placement=moved(figure.placement, rng))
 
 
 def _hued(generator: Generator[Any]) -> Generator[Any]:
     """The same drawings on backgrounds of any hue, from which each tile's `ink` stands out."""
 
     def tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Any, Any]:
-        drawn = generator.tiles(left, right, rng)
+        drawn: tuple[Any, Any] = generator.tiles(left, right, rng)
         one, other = (replace(tile, background=hued_background(tile.ink, rng)) for tile in drawn)
         return one, other
 

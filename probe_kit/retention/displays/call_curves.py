@@ -1,0 +1,183 @@
+"""Accuracy over the captured calls of an episode, and the same counted from what happens in it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Self
+
+from probe_kit.env.events import EVENTS
+from probe_kit.errors import UsageError
+from probe_kit.hooks.sites import label_of
+from probe_kit.retention.call_curves import AlignedLine, CallCurves, CallLine, EventTimes
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.selection import known_view
+from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.style import (
+    PARTS,
+    axes_for,
+    caption,
+    legend_above,
+    panels,
+    plain,
+    significance_handles,
+    spell,
+)
+from probe_kit.train.reader import RunReader
+from probe_kit.train.results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass
+class CallCurveDisplay(Shown):
+    """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
+
+    Filled markers are above chance against all sites of their stream, and above the controls that were run; the
+    dotted line is what the best site of relabelled data stays below in 95 %. Upright lines: when the events of the
+    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
+    """
+
+    category: str
+    view: str
+    chance: float
+    lines: tuple[CallLine, ...]
+    events: tuple[EventTimes, ...]
+    aligned: Mapping[str, tuple[AlignedLine, ...]]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_results(
+        cls,
+        results: Mapping[int, ProbeResults],
+        category: str,
+        view: str | None = None,
+        run: RunReader | None = None,
+    ) -> Self:
+        """From probes by call (`load_calls`); run: for its trajectories, without which there are no events.
+
+        Raises UnknownSiteError for a view that was not probed, UsageError for fewer than two calls.
+        """
+        first = next(iter(results.values()))
+        curves = CallCurves.of(results, category, known_view(first, view), run)
+        aligned = {
+            event: tuple(line for name in curves.streams if (line := curves.aligned(name, event)) is not None)
+            for event in EVENTS
+        }
+        return cls(
+            category=category,
+            view=curves.view,
+            chance=curves.chance,
+            lines=tuple(map(curves.line, curves.streams)),
+            events=tuple(curves.event_times()),
+            aligned={event: lines for event, lines in aligned.items() if lines},
+            certificate=Certificate.of_results(first, curves.view),
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 6.2, 3.9)
+        axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
+        for line in self.lines:
+            _draw(axes, line.calls, line)
+            style = PARTS[line.part]
+            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":")
+            clear = line.significant
+            axes.plot(
+                line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
+            )
+        for number, event in enumerate(self.events):
+            _draw_event(axes, event, number)
+        _finish(axes, spell(self.category), "call (captured inference, from 0)")
+        if figure is not None:
+            _complete(figure, axes, self.certificate)
+        self.ax_ = axes
+        return self
+
+    def plot_aligned(self, event: str, ax: "Axes | None" = None) -> Self:
+        """Draw the accuracies counted from an event. Raises UsageError if too few episodes have it."""
+        if event not in self.aligned:
+            known = ", ".join(self.aligned) or "none"
+            raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {known}")
+        axes, figure = axes_for(ax, 6.2, 3.9)
+        axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
+        axes.axvline(0, color="0.6", lw=0.8)
+        for line in self.aligned[event]:
+            _draw(axes, line.offsets, line)
+        _finish(axes, f"{spell(self.category)}: {event}", "calls after the last one before it")
+        if figure is not None:
+            _complete(figure, axes, self.certificate)
+        self.ax_ = axes
+        return self
+
+
+def call_curves(
+    results: Mapping[int, ProbeResults], view: str | None = None, run: RunReader | None = None
+) -> "Figure":
+    """Accuracy over captured calls for every category; arguments and errors as of `CallCurveDisplay`."""
+    names = next(iter(results.values())).settings.categories
+    return _figure([CallCurveDisplay.from_results(results, name, view, run) for name in names], None)
+
+
+def aligned_curves(
+    results: Mapping[int, ProbeResults], event: str, view: str | None = None, run: RunReader | None = None
+) -> "Figure":
+    """The same counted from an event, for every category in which enough episodes have it."""
+    names = next(iter(results.values())).settings.categories
+    displays = [CallCurveDisplay.from_results(results, name, view, run) for name in names]
+    shown = [display for display in displays if event in display.aligned]
+    if not shown:
+        raise UsageError(f"too few episodes of any category have the event {event!r}, or no trajectories")
+    return _figure(shown, event)
+
+
+def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
+    figure, grid = panels(len(displays))
+    for display, axes in zip(displays, grid, strict=True):
+        if event is None:
+            display.plot(axes)
+        else:
+            display.plot_aligned(event, axes)
+    _complete(figure, grid[0], displays[0].certificate)
+    return figure
+
+
+def _draw(axes: "Axes", places: "object", line: CallLine | AlignedLine) -> None:
+    style = PARTS[line.part]
+    accuracy = 100 * line.accuracy
+    arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
+    axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)  # type: ignore[arg-type]
+    axes.plot(
+        places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",  # type: ignore[arg-type]
+        label=label_of(line.stream),
+    )  # fmt: skip
+
+
+def _draw_event(axes: "Axes", event: EventTimes, number: int) -> None:
+    """Names stand one below the other, as several events may fall into one call."""
+    axes.axvspan(event.low, event.high, color="0.5", alpha=0.08, lw=0)
+    axes.axvline(event.median, color="0.4", lw=0.8)
+    words = event.event + ("" if event.share > 0.995 else f" ({100 * event.share:.0f} %)")
+    axes.annotate(
+        words, (event.median, 1), (3, -8 * number - 2), xycoords=("data", "axes fraction"), fontsize=6.5,
+        textcoords="offset points", va="top", color="0.3",
+    )  # fmt: skip
+
+
+def _finish(axes: "Axes", title: str, below: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    plain(axes)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
+    axes.set_title(title, fontsize=9, loc="left")
+    axes.set_xlabel(below, fontsize=8.5)
+
+
+def _complete(figure: "Figure", axes: "Axes", certificate: Certificate) -> None:
+
+    handles: dict[str, Artist] = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    legend_above(figure, [*handles.values(), *significance_handles()])
+    figure.supylabel("best site's held-out accuracy (%)", fontsize=9)
+    caption(figure, replace(certificate, call=None))
