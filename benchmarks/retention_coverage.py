@@ -1,6 +1,10 @@
-"""Coverage of bounded and area retention, for one category and for the mean of twelve.
+"""Coverage of bounded and area retention, for one category and for the mean of twelve, and of perfect categories.
 
-    python benchmarks/retention_coverage.py [--draws 200] [--mean-draws 50] [--first-seed 0]
+    python benchmarks/retention_coverage.py [--draws 240] [--shuffles 20] [--perfect-draws 1000] [--first-seed 0]
+
+Means of twelve are made of the same draws: all of them are shuffled into twelves again and again, so that
+`draws` / 12 means that share nothing stand behind each coverage, put together in many ways. Perfect: 12 groups of
+twins in both layouts, every layer of a plateau always right.
 
 Cells: correctness of two layouts of every item at 19 backbone and 10 × 18 expert sites, neighbours correlated,
 items 0.3, streams 0.25. The truth of `bounded` is the ratio of the best sites' true accuracies above chance,
@@ -20,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from probe_kit.hooks.sites import Site
 from probe_kit.retention.bounded import area_fit, bounded_fit
-from probe_kit.retention.crossfit import Crossfit, GroupScores
+from probe_kit.retention.crossfit import Crossfit, GroupScores, crossfit
 from probe_kit.retention.estimates import Estimate, average, retention_draws
 from probe_kit.retention.measure import retention_interval
 
@@ -56,6 +60,7 @@ class World:
     growth: tuple[float, float] = (0.8, 1.0)
     items: int = 150
     neighbours: float = 0.9
+    of_group: int = 1
 
     def above(self) -> tuple[Matrix, Matrix]:
         """True accuracy above chance: (19,) of the backbone, (180,) of the expert."""
@@ -89,6 +94,15 @@ OWN = (
 )
 
 
+PERFECT = tuple(
+    World(
+        f"top {0.5 + top:.2f}, kept {kept:.2f}", top, kept, plateau(0.4), plateau(0.4), (1.0, 1.0), 24, of_group=2
+    )
+    for top in (0.5, 0.47)
+    for kept in (1.0, 0.5)
+)
+
+
 def correlated(generator: np.random.Generator, cells: int, columns: int, neighbours: float) -> Matrix:
     """(cells, columns) normal values, those of neighbouring cells correlated."""
     values = generator.standard_normal((cells, columns))
@@ -98,14 +112,15 @@ def correlated(generator: np.random.Generator, cells: int, columns: int, neighbo
 
 
 def draw(world: World, generator: np.random.Generator) -> tuple[GroupScores, GroupScores]:
-    """Backbone and expert of one data set, an item as the group."""
+    """Backbone and expert of one data set, its groups of `of_group` items each."""
     shared = generator.standard_normal(2 * world.items)
     found = []
     for above in world.above():
         of_item = np.repeat(correlated(generator, above.size, world.items, world.neighbours), 2, axis=1)
         own = correlated(generator, above.size, 2 * world.items, world.neighbours)
         values = 0.5 * shared + np.sqrt(0.75) * (np.sqrt(0.3) * of_item + np.sqrt(0.7) * own)
-        found.append(GroupScores.of(values < ndtri(0.5 + above)[:, None], np.repeat(np.arange(world.items), 2)))
+        groups = np.arange(2 * world.items) // (2 * world.of_group)
+        found.append(GroupScores.of(values < ndtri(0.5 + above)[:, None], groups))
     return found[0], found[1]
 
 
@@ -115,43 +130,58 @@ def fits(world: World, seed: int) -> tuple[Crossfit, Crossfit]:
     return bounded_fit(backbone, expert, PLACES, 0.5, seed), area_fit(backbone, expert, 0.5, seed)
 
 
-def study(world: World, draws: int, first_seed: int) -> str:
-    """Median and coverage of both estimates over `draws` data sets."""
+def study(world: World, draws: int, shuffles: int, first_seed: int) -> str:
+    """Median and coverage of both estimates over `draws` data sets, and of their means by twelve."""
     found = [fits(world, first_seed + number) for number in range(draws)]
     parts = [f"{world.name:30}"]
     for name, truth, of_kind in zip(("bounded", "area"), world.truth(), zip(*found, strict=True), strict=True):
-        intervals = [retention_interval(fit) for fit in of_kind]
-        covered = np.mean([interval.low <= truth <= interval.high for interval in intervals])
-        median = np.median([fit.expert / fit.backbone for fit in of_kind])
-        width = np.median([interval.high - interval.low for interval in intervals])
-        parts.append(f"{name} true {truth:.2f} median {median:.2f} covered {covered:4.0%} width {width:.2f}")
+        covered, median, width = coverage(of_kind, truth)
+        of_twelve, mean = mean_coverage(of_kind, truth, shuffles, first_seed)
+        parts.append(
+            f"{name} true {truth:.2f} median {median:.2f} covered {covered:5.1%} width {width:.2f}; twelve: mean "
+            f"{mean:.2f} covered {of_twelve:5.1%}"
+        )
     return "  ".join(parts)
 
 
-def mean_of_twelve(world: World, draws: int, first_seed: int) -> str:
-    """Coverage of the interval of a mean over twelve categories of one world."""
-    covered: list[list[bool]] = []
-    values: list[list[float]] = []
-    for number in range(draws):
-        found = [fits(world, first_seed + 12 * number + category) for category in range(12)]
-        means = [_mean(kind) for kind in zip(*found, strict=True)]
-        values.append([mean.value for mean in means])
-        covered.append([_covers(mean, truth) for mean, truth in zip(means, world.truth(), strict=True)])
-    (bounded, area), (value, area_value) = np.mean(covered, axis=0), np.mean(values, axis=0)
-    truth, area_truth = world.truth()
-    return (
-        f"{world.name:30}  bounded true {truth:.2f} mean {value:.2f} covered {bounded:4.0%}  "
-        f"area true {area_truth:.2f} mean {area_value:.2f} covered {area:4.0%}"
-    )
+def coverage(of_kind: Sequence[Crossfit], truth: float) -> tuple[float, float, float]:
+    """Share of intervals that hold the truth, median estimate, median width."""
+    intervals = [retention_interval(fit) for fit in of_kind]
+    covered = np.mean([interval.low <= truth <= interval.high for interval in intervals])
+    median = np.median([fit.expert / fit.backbone for fit in of_kind])
+    return float(covered), float(median), float(np.median([one.high - one.low for one in intervals]))
 
 
-def _mean(of_kind: Sequence[Crossfit]) -> Estimate:
-    return average(
-        [
-            Estimate(fit.expert / fit.backbone, retention_draws(fit, 0.5, category), category, fit.sizes.size)
-            for category, fit in enumerate(of_kind)
-        ]
-    )
+def mean_coverage(of_kind: Sequence[Crossfit], truth: float, shuffles: int, seed: int) -> tuple[float, float]:
+    """Share of intervals of means by twelve that hold the truth, and the mean of all estimates."""
+    estimates = [
+        Estimate(fit.expert / fit.backbone, retention_draws(fit, 0.5, number), number, fit.sizes.size)
+        for number, fit in enumerate(of_kind)
+    ]
+    generator, covered = np.random.default_rng(seed), []
+    for _ in range(shuffles):
+        order = generator.permutation(len(estimates))
+        twelves = [order[start : start + 12] for start in range(0, len(order) - 11, 12)]
+        covered += [_covers(average([estimates[at] for at in twelve]), truth) for twelve in twelves]
+    return float(np.mean(covered)), float(np.mean([estimate.value for estimate in estimates]))
+
+
+def perfect(world: World, draws: int, first_seed: int) -> str:
+    """Coverage of debiased, bounded and area retention where all groups of the backbone agree, or nearly so."""
+    found: dict[str, list[Crossfit]] = {"debiased": [], "bounded": [], "area": []}
+    for seed in range(first_seed, first_seed + draws):
+        backbone, expert = draw(world, np.random.default_rng(seed))
+        found["debiased"].append(crossfit(backbone, expert, 0.5, seed))
+        found["bounded"].append(bounded_fit(backbone, expert, PLACES, 0.5, seed))
+        found["area"].append(area_fit(backbone, expert, 0.5, seed))
+    truth = world.truth()
+    parts = [f"{world.name:30}"]
+    for name, of_kind in found.items():
+        covered, median, width = coverage(of_kind, truth[name == "area"])
+        parts.append(
+            f"{name} true {truth[name == 'area']:.2f} median {median:.2f} covered {covered:5.1%} width {width:.2f}"
+        )
+    return "  ".join(parts)
 
 
 def _covers(mean: Estimate, truth: float) -> bool:
@@ -162,18 +192,19 @@ def _covers(mean: Estimate, truth: float) -> bool:
 def main() -> None:
     """Run both studies and print each world as it ends."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--mean-draws", type=int, default=50)
+    parser.add_argument("--draws", type=int, default=240, help="a multiple of 12")
+    parser.add_argument("--shuffles", type=int, default=20)
+    parser.add_argument("--perfect-draws", type=int, default=1000)
     parser.add_argument("--first-seed", type=int, default=0)
-    arguments = parser.parse_args()
-    console = Console(width=170)
+    asked = parser.parse_args()
+    console = Console(width=220)
     with threadpool_limits(1):
-        console.print(f"mean of twelve categories, {arguments.mean_draws} draws")
-        for world in (TUNING[2], TUNING[4], TUNING[10], OWN[0], OWN[6]):
-            console.print(mean_of_twelve(world, arguments.mean_draws, arguments.first_seed), highlight=False)
-        console.print(f"one category, {arguments.draws} draws")
+        console.print(f"perfect categories, 12 groups, {asked.perfect_draws} draws")
+        for world in PERFECT:
+            console.print(perfect(world, asked.perfect_draws, asked.first_seed), highlight=False)
+        console.print(f"one category and means of twelve, {asked.draws} draws")
         for world in (*OWN, *TUNING):
-            console.print(study(world, arguments.draws, arguments.first_seed), highlight=False)
+            console.print(study(world, asked.draws, asked.shuffles, asked.first_seed), highlight=False)
 
 
 if __name__ == "__main__":
