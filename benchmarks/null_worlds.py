@@ -1,6 +1,7 @@
 """How often silence is called signal: p-values and controls in worlds where nothing is known.
 
-    python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda] [--worlds …]
+    python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda]
+        [--worlds …]
 
 Probes: two sites of six features, 39 relabellings refitted; groups of two twins in both layouts. Exactness is a
 matter of relabellings and folds, so a linear discriminant with the classes' prior, which names the larger class
