@@ -44,6 +44,7 @@ READS_ONLY = (
     "probe_kit.hooks.sites",
     "probe_kit.hooks.views",
     "probe_kit.env.outcome",
+    "probe_kit.env.events",
 )
 """All that probes and tables may know of the rooms that hold models and simulators."""
 
