@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import MissingExtraError, UsageError
-from probe_kit.extract.settings import ExtractSettings, refuse_other_settings
+from probe_kit.extract.settings import AskSettings, RunSettings, refuse_other_settings
 from probe_kit.extract.store.layout import RUN_FILE
 from probe_kit.identity import canonical_json
 
@@ -19,16 +19,24 @@ _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "weights_seed")
 """Settings whose value the loaded model may decide."""
 
 
-def check_model(settings: ExtractSettings, scripted: tuple[str, ...]) -> None:
+def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
     """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
 
     scripted: names of models that are none. Raises UnknownModelError and what `Family.check` raises.
     """
     if settings.ray is not None and find_spec("ray") is None:
         raise MissingExtraError("--ray needs ray, which is not installed; `pip install 'probe-kit[ray]'`")
+    from probe_kit.hooks.registry import find_family, known_families
+
+    if isinstance(settings, AskSettings):
+        reads = [name for name, family in known_families().items() if family.reads]
+        named = settings.model in scripted or not find_family(settings.model, scripted).reads
+        if named:
+            raise UsageError(
+                f"{settings.model} acts and does not answer questions; those that do: {', '.join(reads)}"
+            )
     if settings.model in scripted:
         return
-    from probe_kit.hooks.registry import find_family
 
     # Elsewhere there may be other devices than here.
     device = "cpu" if settings.workers or settings.ray else settings.device
@@ -38,7 +46,7 @@ def check_model(settings: ExtractSettings, scripted: tuple[str, ...]) -> None:
     )  # fmt: skip
 
 
-def check_place(settings: ExtractSettings, suite: "Suite", location: "Location") -> None:
+def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> None:
     """Refuse a place that cannot be written, or where a run with other settings lies.
 
     Only settings that are known without the model are compared; the writer compares all of them.
@@ -53,7 +61,7 @@ def check_place(settings: ExtractSettings, suite: "Suite", location: "Location")
     refuse_other_settings({name: stored[name] for name in known}, known, str(location))
 
 
-def _known_settings(settings: ExtractSettings, suite: "Suite") -> dict[str, Any]:
+def _known_settings(settings: RunSettings, suite: "Suite") -> dict[str, Any]:
     chosen = {name: value for name, value in settings.choices().items() if name not in _OF_THE_CHECKPOINT}
     known = {
         **chosen,

@@ -1,9 +1,10 @@
 """Extraction: let the workers play every episode that is not committed, then seal."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from probe_kit.errors import EpisodesFailedError, StoreError
 from probe_kit.extract.crews.here import run_here
@@ -11,8 +12,8 @@ from probe_kit.extract.crews.processes import run_in_processes
 from probe_kit.extract.crews.ray import run_on_ray
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Done, Event
-from probe_kit.extract.prepared import Prepared, load
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.prepared import Prepared, check_run, load, load_reader
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
 from probe_kit.extract.store.commits import write_failure
 from probe_kit.extract.store.disk import refuse_if_full
 from probe_kit.extract.store.layout import RUN_FILE
@@ -22,6 +23,9 @@ from probe_kit.extract.store.run import Run, open_run
 from probe_kit.extract.store.sealing import seal
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.notebook import notebook_progress
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Reader
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
@@ -101,21 +105,46 @@ class Extraction(Prepared):
         return error
 
 
-def prepare(settings: ExtractSettings, out: Path | str | Location | None = None) -> Extraction:
+def prepare(
+    settings: RunSettings, out: Path | str | Location | None = None, reader: "Reader | None" = None
+) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
+    reader: the model of these `AskSettings`, if it is loaded already.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     location = None if out is None else locate(out)
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
-        planned = load(replace(settings, device="cpu"), location=location)
+        planned = load(replace(settings, device="cpu"), location=location, reader=reader)
         return Extraction(settings, planned.plan, planned.card, None)
-    prepared = load(settings, location=location)
+    prepared = load(settings, location=location, reader=reader)
     return Extraction(settings, prepared.plan, prepared.card, prepared.controller)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
     """Extract a run to a folder or a URL such as `s3://bucket/prefix/run`, or continue the one that is there."""
     return prepare(settings, out).run(out, progress=progress)
+
+
+def ask_run(settings: AskSettings, out: Path | str, progress: Progress | None = None) -> Run:
+    """Ask a model about every episode of a plan, or continue the run that is there; see `extract_run`."""
+    return prepare(settings, out).run(out, progress=progress)
+
+
+def prepare_asks(
+    settings: Sequence[AskSettings], outs: Sequence[Path | str | Location | None]
+) -> Iterator[Extraction]:
+    """Several runs of one model, which is loaded once; each is prepared when its turn comes.
+
+    What is wrong with any of them, as far as it is known without the model, is said before the first.
+    Raises what `prepare` raises.
+    """
+    for own, out in zip(settings, outs, strict=True):
+        check_run(own, None if out is None else locate(out))
+    first = settings[0]
+    elsewhere = bool(first.workers or first.ray)
+    reader = load_reader(replace(first, device="cpu") if elsewhere else first)
+    for own, out in zip(settings, outs, strict=True):
+        yield prepare(own, out, reader)

@@ -1,20 +1,26 @@
 """Preparing an extraction: find the suite, load the model, plan the episodes. Nothing is written."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from probe_kit.errors import UsageError
+from probe_kit.extract.asking.phrases import phrases
 from probe_kit.extract.early import check_model, check_place
 from probe_kit.extract.plan import Plan, make_plan, plan_episodes
-from probe_kit.extract.play.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
+from probe_kit.extract.play.ask_controller import AskController
+from probe_kit.extract.play.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
 from probe_kit.extract.play.refusals import refuse_meaningless, refuse_unreachable
 from probe_kit.extract.play.rehearsal import rehearse
-from probe_kit.extract.settings import ExtractSettings, run_label
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.identity import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Reader
 
 
 @dataclass(frozen=True)
@@ -24,10 +30,10 @@ class Prepared:
     controller: None if the model is loaded again by workers elsewhere.
     """
 
-    settings: ExtractSettings
+    settings: RunSettings
     plan: Plan
     card: dict[str, Any]
-    controller: Controller | None
+    controller: ActingController | AskController | None
 
     def identity(self) -> dict[str, Any]:
         """Everything that names the stored numbers; two runs with equal identity are interchangeable."""
@@ -56,35 +62,81 @@ class Prepared:
 
     def default_name(self) -> str:
         """Folder name that repeats for the same settings, so that the same command finds its run again."""
-        return f"{self.settings.model}-{sha256_json(self.identity())[:8]}"
+        name = [self.settings.model, sha256_json(self.identity())[:8]]
+        if isinstance(self.settings, AskSettings):
+            name = ["ask", name[0], self.settings.short_name, name[1]]
+        return "-".join(name)
 
 
-def load(settings: ExtractSettings, rehearsed: bool = False, location: Location | None = None) -> Prepared:
+def load(
+    settings: RunSettings,
+    rehearsed: bool = False,
+    location: Location | None = None,
+    reader: "Reader | None" = None,
+) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     location: where it will be written, if that is known, so that it is looked at before the model is loaded.
+    reader: the model of these `AskSettings`, if it is loaded already.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
-    check_model(settings, tuple(SCRIPTED))
-    refuse_meaningless(settings)
-    suite = _suite(settings)
-    if location is not None:
-        check_place(settings, suite, location)
+    suite = check_run(settings, location)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
-    controller = _controller(settings, suite)
+    if isinstance(settings, AskSettings):
+        controller: ActingController | AskController = _asking(settings, suite, reader)
+    else:
+        controller = _acting(settings, suite)
     with_tokens = settings.tokens == "all"
-    plan = make_plan(suite, controller.streams, settings.seed, settings.captured_calls, with_tokens)
+    plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens)
     return Prepared(settings, plan, controller.identity, controller)
 
 
-def _suite(settings: ExtractSettings) -> Suite:
+def check_run(settings: RunSettings, location: Location | None = None) -> Suite:
+    """The suite of a run, once everything was checked that can be without scene and model. Raises as `load`."""
+    check_model(settings, tuple(SCRIPTED))
+    refuse_meaningless(settings)
+    suite = _suite(settings)
+    if isinstance(settings, AskSettings):
+        phrases(suite, settings.asked, settings.seed)
+    if location is not None:
+        check_place(settings, suite, location)
+    return suite
+
+
+def _suite(settings: RunSettings) -> Suite:
     if settings.suite is None:
         return default_suite().select(settings.categories, settings.items)
     return load_suite(settings.suite).select(settings.categories, settings.items)
 
 
-def _controller(settings: ExtractSettings, suite: Suite) -> Controller:
+def _asking(settings: AskSettings, suite: Suite, reader: "Reader | None") -> AskController:
+    blank = example_observations(settings.scene, suite)[0]
+    model = load_reader(settings) if reader is None else reader
+    refuse_unfit(model.card, settings.batch, blank)
+    return AskController(model, settings, suite, blank)
+
+
+def load_reader(settings: AskSettings) -> "Reader":
+    """The model that is asked. Raises UsageError if it answers no questions, and what `load_model` raises."""
+    from probe_kit.hooks import Reader, load_model
+
+    model = load_model(
+        settings.model,
+        settings.checkpoint,
+        settings.device,
+        settings.dtype,
+        settings.random_weights,
+        settings.weights_seed,
+        **settings.options,
+    )
+    if not isinstance(model, Reader):
+        raise UsageError(f"{settings.model} gave a {type(model).__name__}, which is no Reader; mend its loader")
+    return model
+
+
+def _acting(settings: RunSettings, suite: Suite) -> ActingController:
+    assert isinstance(settings, ExtractSettings)
     if settings.model in SCRIPTED:
         return ScriptedController(settings.model)
     from probe_kit.hooks import load_policy

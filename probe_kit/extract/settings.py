@@ -1,18 +1,21 @@
 """What one extraction is asked to do, and the part of it that names the result."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
+from probe_kit.extract.asking.phrases import ASKED, Asked
+from probe_kit.extract.asking.templates import P1, Template
 from probe_kit.extract.store.layout import CODECS
 from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.identity import sha256_json
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
+PICTURES = ("frame", "side-by-side", "none")
 FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
 _ELSEWHERE = {
@@ -31,23 +34,20 @@ _MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", 
 
 
 @dataclass(frozen=True)
-class ExtractSettings:
-    """Everything `probe-kit extract` can be told; the defaults are the command line's.
+class RunSettings:
+    """What a run of any kind can be told; the defaults are the command line's.
 
-    model: a family of `probe-kit models`, or `expert` / `expert-mirrored` / `idle` (scripted, no activations).
+    model: a family of `probe-kit models`.
     checkpoint: folder or hub id; None for the family's default.
     weights_seed: of a random twin's weights.
-    options: what only some families have, such as `unnorm_key`; what they lead to is in the policy's card.
+    options: what only some families have, such as `unnorm_key`; what they lead to is in the model's card.
     label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`.
-    edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
     tokens: `pooled` stores pooled views only, `all` also every token.
-    captured_calls: policy inferences captured per episode, from the first on.
-    execute: actions executed per inference; None for the policy's own.
 
     The rest changes no stored number, only how fast it comes:
-    batch: observations per call of the policy. With 1, bytes repeat exactly; with more, up to float rounding.
+    batch: observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
     frames: `ends` keeps a thumbnail of the first and last frame of every episode, `none` does not.
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
@@ -67,15 +67,10 @@ class ExtractSettings:
     scene: SceneSpec = field(default_factory=SceneSpec)
     seed: int = 0
     tokens: str = "pooled"
-    captured_calls: int = 1
-    execute: int | None = None
     label: str | None = None
-    edits: tuple[Edit, ...] = ()
-    vectors: Vectors = field(default_factory=dict)
     codec: str = "zstd"
     device: str = "cpu"
     dtype: str | None = None
-    video: str = "none"
     frames: str = "ends"
     batch: int = 1
     env_workers: int | None = None
@@ -83,35 +78,157 @@ class ExtractSettings:
     ray: str | None = None
     allow_mixed: bool = False
 
+    tokens_allowed: ClassVar[tuple[str, ...]] = TOKENS
+
     def __post_init__(self) -> None:
-        for name, allowed in (("tokens", TOKENS), ("codec", CODECS), ("video", VIDEOS), ("frames", FRAMES)):
-            if getattr(self, name) not in allowed:
-                raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
-        least = {"captured_calls": 1, "execute": 1, "items": 1, "batch": 1, "workers": 0, "env_workers": 0}
-        for name, bound in least.items():
-            value = getattr(self, name)
-            if value is not None and value < bound:
-                raise UsageError(f"{name} is {value}; expected at least {bound}")
+        self._check_one_of("tokens", self.tokens_allowed)
+        self._check_one_of("codec", CODECS)
+        self._check_one_of("frames", FRAMES)
+        for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
+            self._check_at_least(name, bound)
+
+    def _check_one_of(self, name: str, allowed: Iterable[str]) -> None:
+        if getattr(self, name) not in allowed:
+            raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
+
+    def _check_at_least(self, name: str, bound: int) -> None:
+        value = getattr(self, name)
+        if value is not None and value < bound:
+            raise UsageError(f"{name} is {value}; expected at least {bound}")
 
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
-        return plain | ({"edits": [edit.to_json() for edit in self.edits]} if self.edits else {})
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
+
+    @property
+    def stored_calls(self) -> int:
+        """Inferences captured per episode, from the first on."""
+        return 1
+
+    def films(self, number: int) -> bool:
+        """Whether episode `number` of the plan is filmed."""
+        del number
+        return False
+
+    def marks(self) -> list[str]:
+        """What a label says behind the model and its checkpoint."""
+        return []
 
 
-def run_label(settings: ExtractSettings) -> str:
+@dataclass(frozen=True)
+class ExtractSettings(RunSettings):
+    """Everything `probe-kit extract` can be told; model may also be scripted: `expert`, `expert-mirrored`,
+    `idle`.
+
+    captured_calls: policy inferences captured per episode, from the first on.
+    execute: actions executed per inference; None for the policy's own.
+    edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
+    video: GIF of the first episode, of all, or none; changes no stored number.
+    """
+
+    captured_calls: int = 1
+    execute: int | None = None
+    edits: tuple[Edit, ...] = ()
+    vectors: Vectors = field(default_factory=dict)
+    video: str = "none"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_one_of("video", VIDEOS)
+        self._check_at_least("captured_calls", 1)
+        self._check_at_least("execute", 1)
+
+    def choices(self) -> dict[str, Any]:
+        """As of every run, and the edits."""
+        return super().choices() | ({"edits": [edit.to_json() for edit in self.edits]} if self.edits else {})
+
+    @property
+    def stored_calls(self) -> int:
+        """As many as were asked for."""
+        return self.captured_calls
+
+    def films(self, number: int) -> bool:
+        """All episodes, the first one, or none."""
+        return self.video == "all" or (self.video == "first" and number == 0)
+
+    def marks(self) -> list[str]:
+        """Whether the streams were edited."""
+        return [f"edited {sha256_json([edit.to_json() for edit in self.edits])[:6]}"] if self.edits else []
+
+
+@dataclass(frozen=True)
+class AskSettings(RunSettings):
+    """Everything one run of `probe-kit ask` can be told: one model, one prompt, one size of the picture.
+
+    The size of the picture is that of `scene`. tokens may also be `none`, which stores no activations.
+    picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none` nothing.
+    asked: for what, see `ASKED`.
+    Raises UsageError for an absent object with a prompt that takes no no.
+    """
+
+    tokens: str = "none"
+    prompt: Template = P1
+    picture: str = "frame"
+    asked: Asked = "target"
+
+    tokens_allowed: ClassVar[tuple[str, ...]] = ("none", *TOKENS)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_one_of("picture", PICTURES)
+        self._check_one_of("asked", ASKED)
+        if self.asked == "absent" and not self.prompt.yes_or_no:
+            raise UsageError(
+                f"--ask absent needs a prompt that can be answered no; {self.prompt.name} does not ask for yes or "
+                "no. Use --prompt seen"
+            )
+
+    @property
+    def short_name(self) -> str:
+        """Prompt, size of the picture and what is unusual, as a folder is called."""
+        height, width = self.scene.picture_shape
+        parts = [self.prompt.name, f"{width}x{height}", self.picture, self.asked]
+        return "-".join(part for part in parts if part not in ("frame", "target"))
+
+    def choices(self) -> dict[str, Any]:
+        """As of every run, and what was asked how."""
+        plain = super().choices()
+        prompt = plain.pop("prompt")
+        height, width = self.scene.picture_shape
+        ask = {
+            "prompt": prompt.name,
+            "template": prompt.text,
+            "template_sha256": prompt.sha256,
+            "object": plain.pop("asked"),
+            "picture": plain.pop("picture"),
+            "picture_size": f"{width}x{height}",
+            "max_new_tokens": prompt.tokens,
+        }
+        return {**plain, "captured_calls": self.stored_calls, "ask": ask}
+
+    def marks(self) -> list[str]:
+        """Prompt and size, and what is unusual about picture and object."""
+        height, width = self.scene.picture_shape
+        return [
+            self.prompt.name,
+            f"{width}×{height}" if self.picture != "none" else "no picture",
+            *(["side by side"] if self.picture == "side-by-side" else []),
+            *([f"asks for the {self.asked}"] if self.asked != "target" else []),
+        ]
+
+
+def run_label(settings: RunSettings) -> str:
     """What tables call the run: base, fine-tune, random twins and other options of one family differ in it."""
+    asks = isinstance(settings, AskSettings)  # whose runs come in several, all of one label
     if settings.label is not None:
-        return settings.label
+        return " · ".join([settings.label, *(settings.marks() if asks else [])])
     parts = [settings.model]
     if settings.checkpoint is not None:
         parts.append(Path(settings.checkpoint).name)
     parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights and settings.weights_seed:
         parts.append(f"twin {settings.weights_seed}")
-    if settings.edits:
-        parts.append(f"edited {sha256_json([edit.to_json() for edit in settings.edits])[:6]}")
-    return " · ".join(parts)
+    return " · ".join([*parts, *settings.marks()])
 
 
 def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:

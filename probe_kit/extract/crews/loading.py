@@ -2,11 +2,11 @@
 
 from probe_kit.extract.play.worker import Worker
 from probe_kit.extract.prepared import load
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.locate import locate
 
 
-def load_worker(settings: ExtractSettings, run: str) -> Worker:
+def load_worker(settings: RunSettings, run: str) -> Worker:
     """A worker for a run that exists, with a model of its own.
 
     Raises SettingsMismatchError if they differ, or if this machine gives other numbers than those before it.

@@ -10,13 +10,13 @@ from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.crews.loading import load_worker
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Event
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.settings import RunSettings
 
 MORE = "more"
 
 
 def run_in_processes(
-    settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]
+    settings: RunSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]
 ) -> None:
     """Play the episodes in `settings.workers` processes; one that dies is replaced.
 
@@ -41,7 +41,7 @@ def run_in_processes(
 class _Hand:
     """The driver's view of one worker process."""
 
-    def __init__(self, slot: int, settings: ExtractSettings, run: str) -> None:
+    def __init__(self, slot: int, settings: RunSettings, run: str) -> None:
         self.slot, self._settings, self._run = slot, settings, run
         self.start()
 
@@ -98,7 +98,7 @@ def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) 
     hand.start()
 
 
-def _environment(slot: int, settings: ExtractSettings) -> dict[str, str]:
+def _environment(slot: int, settings: RunSettings) -> dict[str, str]:
     """One GPU per worker where there are GPUs, and a fair share of the cores."""
     share = max(1, (os.cpu_count() or 1) // settings.workers)
     environment = {"OMP_NUM_THREADS": str(share)}

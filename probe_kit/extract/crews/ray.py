@@ -10,7 +10,7 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.extract.crews.loading import load_worker
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Done, Event
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.commits import commit_key
 from probe_kit.extract.store.locate import locate
 
@@ -18,7 +18,7 @@ from probe_kit.extract.store.locate import locate
 EPISODES_PER_CALL = 8
 
 
-def run_on_ray(settings: ExtractSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
     """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
 
     An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
@@ -34,7 +34,7 @@ def run_on_ray(settings: ExtractSettings, run: str, scheduler: Scheduler, heard:
 class RayActor:
     """What runs on a node: the same worker as everywhere."""
 
-    def __init__(self, settings: ExtractSettings, run: str) -> None:
+    def __init__(self, settings: RunSettings, run: str) -> None:
         self._settings, self._run = settings, run
         self._opened = ExitStack()
         self._worker: Any = None
@@ -56,7 +56,7 @@ class RayActor:
 class RayCrew:
     """Actors on a cluster, as many as GPUs, or as `settings.workers` says. A context manager."""
 
-    def __init__(self, settings: ExtractSettings, run: str) -> None:
+    def __init__(self, settings: RunSettings, run: str) -> None:
         self._settings, self._run = settings, run
         self._playing: dict[Any, int] = {}
 

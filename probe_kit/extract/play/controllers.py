@@ -3,33 +3,27 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CaptureChangedActionError
+from probe_kit.extract.play.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.play.ensemble import ensemble
 from probe_kit.extract.store.layout import StoredStream
 from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.views import view_names
 from probe_kit.identity import derive_seed
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from probe_kit.extract.play.staging import EpisodeBuffers
-    from probe_kit.hooks import Policy, Roles, Site, Tape
+    from probe_kit.hooks import Policy
 
 SCRIPTED = {
     "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
     "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
     "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
 }
-# Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
-SMALL = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -49,11 +43,10 @@ class Turn:
 
 
 class Controller(Protocol):
-    """Decides what happens on every stage.
+    """Decides what happens on every stage: by acting, or by answering a question.
 
     script: for `Stage`, None if this controller acts itself.
     threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
-    flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
     """
 
     identity: dict[str, Any]
@@ -61,6 +54,17 @@ class Controller(Protocol):
     script: str | None
     threads: int | None
     on_gpu: bool
+
+    def certificate(self) -> dict[str, Any]:
+        """What was checked so far, for the run's certificate."""
+
+
+class ActingController(Controller, Protocol):
+    """Acts.
+
+    flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
+    """
+
     flagged: NDArray[np.bool_] | None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -68,9 +72,6 @@ class Controller(Protocol):
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """What the network is delivered as this instruction; None if it reads none or cannot say."""
-
-    def certificate(self) -> dict[str, Any]:
-        """What was checked so far, for the run's certificate."""
 
 
 class ScriptedController:
@@ -113,9 +114,10 @@ class PolicyController:
         """examples: an observation per instruction of the suite, as the scene will show them."""
         self.policy = policy
         self.execute = execute or policy.card.execute
-        self.captured_calls, self.with_tokens = captured_calls, with_tokens
+        self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
-        self.streams = _stored_streams(policy, examples)
+        self.streams = stored_streams(policy, policy.roles(examples))
+        self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
         card = policy.card
         self.script: str | None = None
         self.threads = 1 if card.parameters < SMALL else None
@@ -131,8 +133,6 @@ class PolicyController:
         if card.settings:
             self.identity["policy"] = dict(card.settings)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
-        self._fires: dict[str, int] = {}
-        self._check: dict[str, Any] = {}
         self._ledger: list[dict[str, Any]] = []
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -144,7 +144,13 @@ class PolicyController:
         seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if captured:
-            chunks = self._act_and_capture(observations, seeds, captured)
+            chunks = self._capturer.run(
+                lambda: self.policy.act(observations, seeds),
+                lambda actions: actions,
+                self.policy.roles(observations),
+                captured,
+                lambda: self._edited(observations),
+            )
         else:
             with self._edited(observations):
                 chunks = self.policy.act(observations, seeds)
@@ -166,11 +172,11 @@ class PolicyController:
         return ensemble(turn.past, exponent)[None]
 
     def certificate(self) -> dict[str, Any]:
-        """The policy's card, fire counts of the last capture, and what `_prove_harmless` measured."""
+        """The policy's card, fire counts of the last capture, and what the capture proved."""
         return {
             "policy": self.policy.card.to_json(),
-            "fires_per_inference": self._fires,
-            "capture_check": self._check,
+            "fires_per_inference": self._capturer.fires,
+            "capture_check": self._capturer.check,
             **({"edits": self._ledger} if self._edits else {}),
         }
 
@@ -185,82 +191,3 @@ class PolicyController:
         with applied(self.policy, self._edits, observations, self._vectors) as ledger:
             yield
         self._ledger = [asdict(entry) for entry in ledger.entries]
-
-    def _act_and_capture(
-        self, observations: Sequence[Observation], seeds: Sequence[int], captured: "dict[int, EpisodeBuffers]"
-    ) -> NDArray[np.float32]:
-        from probe_kit.hooks import capture
-
-        roles = self.policy.roles(observations)
-        views = {stream.name: stream.views for stream in self.streams}
-
-        def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
-            return _pool_rows(activation, roles[site.stream], views[site.stream])
-
-        reduce = None if self.with_tokens else pool_rows
-        # The capture is entered last, so that it reads what the edits left.
-        with self._edited(observations), capture(self.policy, self.policy.sites(), reduce) as tape:
-            chunks = self.policy.act(observations, seeds)
-        if not self._fires:
-            self._prove_harmless(observations, seeds, chunks)
-        self._fires = tape.fires
-        for row, buffers in captured.items():
-            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, buffers)
-        return chunks
-
-    def _prove_harmless(
-        self, observations: Sequence[Observation], seeds: Sequence[int], chunks: NDArray[np.float32]
-    ) -> None:
-        """Once per process: the same inference without hooks gives the same actions, bit for bit."""
-        with self._edited(observations):
-            plain = self.policy.act(observations, seeds)
-        self._check = {
-            "actions_with_hooks_sha256": _sha256(chunks),
-            "actions_without_hooks_sha256": _sha256(plain),
-            "observations": len(observations),
-        }
-        if self._check["actions_with_hooks_sha256"] != self._check["actions_without_hooks_sha256"]:
-            raise CaptureChangedActionError(
-                f"capturing changed the actions by up to {np.abs(plain - chunks).max():.3g}; they must be equal "
-                "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
-            )
-
-    def _keep(self, tape: "Tape", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers") -> None:
-        """Hand one episode's share of a capture to its buffers."""
-        import torch
-
-        buffers.keep_roles(roles)
-        for stored in self.streams:
-            own = roles[stored.name]
-            kept = torch.stack([tape[site][row] for site in stored.stream.sites()])
-            if self.with_tokens:
-                valid = torch.from_numpy(own.valid).to(kept.device)
-                bits = (kept * valid[:, None]).to(torch.bfloat16).view(torch.int16)
-                buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
-                kept = torch.stack([_pool_rows(site[None], [own], stored.views)[0] for site in kept])
-            buffers.keep_pooled(stored.name, kept)
-
-
-def _sha256(actions: NDArray[np.float32]) -> str:
-    """Of shape, type and every bit."""
-    return sha256(
-        f"{actions.dtype} {actions.shape}".encode() + np.ascontiguousarray(actions).tobytes()
-    ).hexdigest()
-
-
-def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":
-    """(B, V, D) float32 from (B, T, D), on its device."""
-    import torch
-
-    from probe_kit.hooks import pool
-
-    return torch.stack([pool(tokens, own, views) for tokens, own in zip(activation, roles, strict=True)])
-
-
-def _stored_streams(policy: "Policy", examples: Sequence[Observation]) -> list[StoredStream]:
-    """The streams at the longest sequence any of the examples makes."""
-    roles = policy.roles(examples)
-    return [
-        StoredStream.of(stream, max(len(row) for row in roles[name]), view_names(policy.role_names[name]))
-        for name, stream in policy.streams.items()
-    ]

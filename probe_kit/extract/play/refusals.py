@@ -2,18 +2,18 @@
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.play.controllers import SCRIPTED
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.card import Card
 
 
-def refuse_meaningless(settings: ExtractSettings) -> None:
+def refuse_meaningless(settings: RunSettings) -> None:
     """Raise UsageError for what has no effect: a scripted policy has no weights, no chunks and no activations."""
     if settings.weights_seed and not settings.random_weights:
         raise UsageError(
             f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
             "Leave it out, or add --random-weights"
         )
-    if settings.model not in SCRIPTED:
+    if settings.model not in SCRIPTED or not isinstance(settings, ExtractSettings):
         return
     asked = {
         "--checkpoint": settings.checkpoint is not None,

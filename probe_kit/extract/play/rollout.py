@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.play.controllers import Controller, Turn
-from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage
+from probe_kit.extract.play.controllers import ActingController, Turn
+from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Ending
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
@@ -101,7 +101,7 @@ class Play:
     """
 
     def __init__(
-        self, stages: Sequence[AskableStage], controller: Controller, ring: Ring,
+        self, stages: Sequence[AskableStage], controller: ActingController, ring: Ring,
         next_episode: Callable[[], PlannedEpisode | None], film: Callable[[PlannedEpisode], bool],
     ) -> None:  # fmt: skip
         seats = [Seat(stage) for stage in stages]
@@ -142,6 +142,7 @@ class Play:
                 if isinstance(answer, Observation):
                     seat.seen = answer
                 else:
+                    assert isinstance(answer, Ending)
                     outcome = {**answer.outcome, **seat.counts}
                     yield Rollout(
                         seat.planned, outcome, seat.buffers, answer.frames, answer.ends, answer.trajectory,

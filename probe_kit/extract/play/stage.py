@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,7 +49,16 @@ class Ending:
     trajectory: NDArray[np.float32] | None = None
 
 
-Answer = Observation | Ending
+@dataclass(frozen=True)
+class Seen:
+    """The first frame of an episode in which nothing moves. facts: what the run records of it."""
+
+    observation: Observation
+    facts: dict[str, Any]
+    ends: Ends | None = None
+
+
+Answer = Observation | Ending | Seen
 
 
 class Stage:
@@ -64,17 +74,34 @@ class Stage:
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
         """Set up an episode. Errors carry a note naming it."""
-        self._planned, self._film, self._frames = planned, film, list[NDArray[np.uint8]]()
+        self._film, self._frames = film, list[NDArray[np.uint8]]()
+        self._planned = planned
         try:
-            options = {"item": planned.episode.item, "layout": planned.episode.layout}
-            _, start = self._env.reset(seed=planned.scene_seed, options=options)
-            self._visible = start["tile_visibility"]
+            self._set_up(planned)
             self._recorder = Recorder(self._env)
             self._shoot()
-            self._first = shrink(self._env.render()) if self._keep_ends else None
             return self._see() if self.script is None else self._follow_script()
         except ProbeKitError as error:
             raise self._named(error) from None
+
+    def look(self, planned: PlannedEpisode) -> Answer:
+        """Set up an episode and show its first frame; nothing on it moves. Errors carry a note naming it."""
+        self._planned = planned
+        try:
+            self._set_up(planned)
+            return Seen(self._see(), self._facts, None if self._first is None else (self._first,))
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def _set_up(self, planned: PlannedEpisode) -> None:
+        options = {"item": planned.episode.item, "layout": planned.episode.layout}
+        _, start = self._env.reset(seed=planned.scene_seed, options=options)
+        frame = self._env.render()
+        self._facts = {
+            "first_frame_sha256": frame_sha256(frame),
+            **{f"visible_{side}": share for side, share in start["tile_visibility"].items()},
+        }
+        self._first = shrink(frame) if self._keep_ends else None
 
     def advance(self, actions: Iterable[NDArray[np.float32]]) -> Answer:
         """Carry out actions until they or the episode end."""
@@ -103,7 +130,8 @@ class Stage:
             self._shoot()
             if terminated or truncated:
                 trajectory = self._recorder.trajectory().frames
-                return Ending(_record(self._env, self._visible), self._frames, self._ends(), trajectory)
+                outcome = {**_record(self._env), **self._facts}
+                return Ending(outcome, self._frames, self._ends(), trajectory)
         return None
 
     def _ends(self) -> Ends | None:
@@ -123,7 +151,12 @@ class Stage:
         return error
 
 
-def _record(env: Act2AnswerEnv, tile_visibility: dict[str, float]) -> dict[str, Any]:
+def frame_sha256(frame: NDArray[np.uint8]) -> str:
+    """Hex sha256 of a frame (H, W, 3) as rendered, before it is resized for a model: its shape and every byte."""
+    return sha256(f"{frame.shape}".encode() + np.ascontiguousarray(frame).tobytes()).hexdigest()
+
+
+def _record(env: Act2AnswerEnv) -> dict[str, Any]:
     """The outcome as flat columns, beside those the plan already has."""
     outcome = env.outcome().to_json()
     x, y = outcome.pop("cube_xy")
@@ -132,7 +165,6 @@ def _record(env: Act2AnswerEnv, tile_visibility: dict[str, float]) -> dict[str, 
         "cube_x": x,
         "cube_y": y,
         **{key: value for key, value in outcome.items() if key not in ("layout", "side_correct")},
-        **{f"visible_{side}": share for side, share in tile_visibility.items()},
     }
 
 
@@ -140,7 +172,7 @@ class AskableStage(Protocol):
     """A stage somewhere: asked first, answered later, so that several can work at a time."""
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Start `Stage.begin` or `Stage.advance`."""
+        """Start `Stage.begin`, `Stage.advance` or `Stage.look`."""
 
     def answer(self) -> Answer:
         """What the last question gave; raises what it raised."""

@@ -2,7 +2,7 @@
 
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -13,13 +13,15 @@ from PIL import Image
 
 from probe_kit.env import save_gif
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.play.controllers import Controller
+from probe_kit.extract.play.ask_controller import AskController
+from probe_kit.extract.play.asking import Asking
+from probe_kit.extract.play.controllers import ActingController
 from probe_kit.extract.play.events import Done, Event, Failed
 from probe_kit.extract.play.rollout import Failure, Play, Rollout
 from probe_kit.extract.play.stage import AskableStage, LocalStage
 from probe_kit.extract.play.stage_process import ProcessStage
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.layout import VIDEOS
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.thumbnails import write_thumbnail
@@ -40,7 +42,7 @@ class Worker:
     """
 
     def __init__(
-        self, writer: RunWriter, settings: ExtractSettings, controller: Controller, episodes: int
+        self, writer: RunWriter, settings: RunSettings, controller: ActingController | AskController, episodes: int
     ) -> None:
         self._writer, self._settings, self._controller = writer, settings, controller
         self._episodes = episodes
@@ -71,7 +73,7 @@ class Worker:
     def _make_buffers(self) -> EpisodeBuffers:
         settings, controller = self._settings, self._controller
         with_tokens = settings.tokens == "all"
-        return EpisodeBuffers(controller.streams, settings.captured_calls, with_tokens, controller.on_gpu)
+        return EpisodeBuffers(controller.streams, settings.stored_calls, with_tokens, controller.on_gpu)
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
         """Play what `next_number` gives until it gives None; an event per episode, when it is committed."""
@@ -80,7 +82,13 @@ class Worker:
             number = next_number()
             return None if number is None else self._writer.plan.episodes[number]
 
-        for played in Play(self._stages, self._controller, self._ring, next_episode, self._is_filmed):
+        controller, stages, ring = self._controller, self._stages, self._ring
+        playing: Iterable[Rollout | Failure]
+        if isinstance(controller, AskController):
+            playing = Asking(stages, controller, ring, next_episode)
+        else:
+            playing = Play(stages, controller, ring, next_episode, self._is_filmed)
+        for played in playing:
             if isinstance(played, Failure):
                 yield Failed(played.planned.index, played.reason)
             else:
@@ -108,7 +116,7 @@ class Worker:
         return Done(rollout.planned.index, rollout.outcome)
 
     def _is_filmed(self, planned: PlannedEpisode) -> bool:
-        return self._settings.video == "all" or (self._settings.video == "first" and planned.index == 0)
+        return self._settings.films(planned.index)
 
 
 @contextmanager

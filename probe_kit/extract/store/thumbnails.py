@@ -18,8 +18,8 @@ HEIGHT = 120
 """Pixels; a pair of 4:3 frames is 320 wide and takes about 2 kB."""
 QUALITY = 85
 
-Ends = tuple[NDArray[np.uint8], NDArray[np.uint8]]
-"""First and last frame, (h, w, 3) uint8 each."""
+Ends = tuple[NDArray[np.uint8], ...]
+"""First and last frame, (h, w, 3) uint8 each; the first alone where nothing moved."""
 
 
 def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -30,7 +30,7 @@ def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def write_thumbnail(run: Path | Location, number: int, ends: Ends) -> None:
-    """Store both frames of episode `number` side by side as one WebP, whole or not at all."""
+    """Store the frames of episode `number` side by side as one WebP, whole or not at all."""
     encoded = BytesIO()
     Image.fromarray(np.hstack(ends)).save(encoded, "WEBP", quality=QUALITY, method=4)
     locate(run).write(thumbnail_key(number), encoded.getvalue())

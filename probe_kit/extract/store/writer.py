@@ -92,7 +92,7 @@ class RunWriter:
             self.settings["tokens"] == "all",
             self.settings["codec"],
         )
-        if "scene" in self.settings:
+        if "scene" in self.settings and "ask" not in self.settings:  # who is asked does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
         run = {
