@@ -17,6 +17,7 @@ from probe_kit.commands import demo, doctor
 from probe_kit.console import marked, out, say
 from probe_kit.endings import tell
 from probe_kit.errors import UsageError
+from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import MOVED, extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
@@ -28,7 +29,9 @@ from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import show, train
 from probe_kit.train.power_commands import power
 
-ORDER = ("demo", "doctor", "models", "suite", "extract", "run", "train", "power", "retention", "export", "verify")
+ORDER = (
+    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "export", "verify",
+)  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
@@ -129,7 +132,7 @@ def _before_commands(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)
-for command in (extract, export, demo, models, verify, train, power, retention, doctor):
+for command in (extract, ask, export, demo, models, verify, train, power, retention, doctor):
     app.command()(command)
 
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.extract.extraction import Extraction, extract_run, prepare
-    from probe_kit.extract.settings import ExtractSettings
+    from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
+    from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.extract.store.audit import Audit, verify_run
     from probe_kit.extract.store.export import export_run
     from probe_kit.extract.store.locate import locate
@@ -15,16 +15,19 @@ if TYPE_CHECKING:
     from probe_kit.extract.store.sealing import seal
 
 __all__ = [
+    "AskSettings",
     "Audit",
     "ExtractSettings",
     "Extraction",
     "Location",
     "Run",
+    "ask_run",
     "export_run",
     "extract_run",
     "locate",
     "open_run",
     "prepare",
+    "prepare_asks",
     "seal",
     "verify_run",
 ]
@@ -32,11 +35,14 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",
         "export_run": "store.export",
+        "ask_run": "extraction",
         "extract_run": "extraction",
         "prepare": "extraction",
+        "prepare_asks": "extraction",
         "Location": "store.location",
         "locate": "store.locate",
         "Run": "store.run",

@@ -133,7 +133,7 @@ def extract(
         "light_level": light_level,
         "rendering": rendering,
         "background": background,
-        "picture_size": _size(picture_size),
+        "picture_size": None if picture_size is None else read_size(picture_size),
         "epsilon": epsilon,
         "arm": arm,
         "arm_urdf": arm_urdf,
@@ -170,7 +170,7 @@ def extract(
     with err.status("loading suite and model"):
         extraction = prepare(settings, out_folder)
     location = locate(out_folder or Path("runs") / extraction.default_name())
-    _print_plan(extraction, location)
+    print_plan(extraction, location)
     if dry_run:
         return
     with progress() as bar:
@@ -178,17 +178,16 @@ def extract(
     _print_outcomes(run)
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
-    """WIDTHxHEIGHT in pixels."""
-    if text is None:
-        return None
+def read_size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT in pixels. Raises UsageError for another form."""
     width, separator, height = text.partition("x")
     if not (separator and width.isdigit() and height.isdigit()):
         raise UsageError(f"picture size {text!r} is not WIDTHxHEIGHT, such as 224x224")
     return int(width), int(height)
 
 
-def _print_plan(extraction: "Extraction", location: "Location") -> None:
+def print_plan(extraction: "Extraction", location: "Location") -> None:
+    """What is going to be run, how much it stores and where."""
     from rich.table import Table
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()

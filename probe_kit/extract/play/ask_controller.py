@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from probe_kit.errors import UsageError
 from probe_kit.extract.asking.parsing import Said, read_answer
 from probe_kit.extract.asking.phrases import Phrase, phrases
 from probe_kit.extract.asking.pictures import side_by_side
@@ -26,8 +27,18 @@ if TYPE_CHECKING:
     from probe_kit.extract.play.staging import EpisodeBuffers
     from probe_kit.hooks import Question, Reader, Reading, Roles
 
-BEGUN = "Yes,"
-"""How the answer has begun where a yes comes before the side."""
+
+@dataclass(frozen=True)
+class Form:
+    """How a choice in words is forced: how the answer has begun, and what it may go on with, by what that says."""
+
+    begun: str
+    options: Mapping[str, Said]
+
+    @classmethod
+    def after(cls, begun: str, lead: str) -> "Form":
+        """Left, right or center behind `begun`, with `lead` in front of each."""
+        return cls(begun, {f"{lead}left": "left", f"{lead}right": "right", f"{lead}center": "center"})
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,7 @@ class Forced:
 class AskController:
     """Asks a reader, and captures the first inference of every episode unless nothing is stored.
 
+    identity: `begun` is how the answer had begun where sides were forced in words.
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
@@ -74,7 +86,9 @@ class AskController:
             "dtype": card.dtype,
             **({"policy": dict(card.settings)} if card.settings else {}),
         }
-        self._rehearse(blank)
+        self._form = self._choose_form(blank)
+        if self._form is not None:
+            self.identity["begun"] = self._form.begun
 
     def certificate(self) -> dict[str, Any]:
         """The reader's card, fire counts of the last capture, and what the capture proved."""
@@ -126,12 +140,10 @@ class AskController:
     def _spoken_options(self, order: Order) -> dict[str, Said]:
         """What an answer may begin with, and what that says."""
         lead = self.reader.lead
-        if self.template.yes_or_no:
+        if not self.template.lettered:
             return {f"{lead}Yes": "yes", f"{lead}No": "no"}
         first, second = sides(order)
-        if self.template.lettered:
-            return {f"{lead}A": first, f"{lead}B": second}
-        return {f"{lead}{side}": side for side in (first, second)}
+        return {f"{lead}A": first, f"{lead}B": second}
 
     def _read(self, questions: Sequence["Question"], buffers: "Mapping[int, EpisodeBuffers]") -> "Reading":
         if not buffers:
@@ -144,12 +156,11 @@ class AskController:
         )
 
     def _forced(self, questions: Sequence["Question"], reading: "Reading", order: Order) -> list[Forced]:
-        """The choice between the admissible answers; behind a yes it takes a prefill of its own."""
-        meaning = self._spoken_options(order)
-        if self.template.yes_or_no and self._settings.asked != "absent":
-            meaning = {" left": "left", " right": "right", " center": "center"}
-            begun = f"{self.reader.lead}{BEGUN}"
-            asked = [replace(question, options=tuple(meaning), begun=begun) for question in questions]
+        """The choice between the admissible answers; one in words takes a prefill of its own."""
+        meaning: Mapping[str, Said] = self._spoken_options(order)
+        if self._form is not None:
+            meaning = self._form.options
+            asked = [replace(own, options=tuple(meaning), begun=self._form.begun) for own in questions]
             reading = self.reader.read(asked)
         ties = self.reader.near_ties(reading)
         return [
@@ -225,8 +236,25 @@ class AskController:
         }
         return stored_streams(self.reader, roles, names)
 
-    def _rehearse(self, blank: Observation) -> None:
-        """One question about a blank picture: what is wrong with prompt and options is said before any episode."""
+    def _choose_form(self, blank: Observation) -> Form | None:
+        """The first form in which the sides differ in their first token; None where options are letters or yes.
+
+        One question about a blank picture is asked: what is wrong with prompt and options is said before any
+        episode. Raises UsageError as `Reader.read` does.
+        """
         questions = self._blank_questions(blank)[:1]
-        reading = self.reader.read(questions)
-        self._forced(questions, reading, "original")
+        self.reader.read(questions)
+        if self.template.lettered or self._settings.asked == "absent":
+            return None
+        lead = self.reader.lead
+        begun = f"{lead}Yes," if self.template.yes_or_no else ""
+        forms = [Form.after(begun, " " if begun else lead), Form.after(f"{begun} " if begun else lead, "")]
+        for number, form in enumerate(forms):
+            try:
+                self.reader.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
+            except UsageError:
+                if number == len(forms) - 1:
+                    raise
+            else:
+                return form
+        return None

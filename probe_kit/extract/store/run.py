@@ -135,8 +135,9 @@ class Run:
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked: the first process's record, then what every process measured.
 
-        `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions with
-        and without capture have one hash, `mixed` what changes numbers and was not the same for all episodes.
+        `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions or
+        answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
+        episodes.
         """
         certificate: dict[str, Any] = json.loads(self.location.read(CERTIFICATE_FILE))
         processes = [json.loads(text) for text in self.location.read_all(CERTIFICATES, ".json").values()]
@@ -145,7 +146,10 @@ class Run:
         checks = [process["capture_check"] for process in processes if process.get("capture_check")]
         if checks:
             certificate["hooks_on_equals_hooks_off"] = all(
-                check["actions_with_hooks_sha256"] == check["actions_without_hooks_sha256"] for check in checks
+                value == check[name.replace("_with_", "_without_")]
+                for check in checks
+                for name, value in check.items()
+                if name.endswith("_with_hooks_sha256")
             )
         return {**certificate, "processes": processes, "mixed": list(self.mixed)}
 

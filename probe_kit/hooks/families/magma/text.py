@@ -141,14 +141,14 @@ class ChatText:
                 )
 
     def option(self, question: str, begun: str, option: str, pictured: bool = True) -> int:
-        """The id of an option behind a prompt. Raises UsageError unless it is one token there."""
+        """The first id of an option behind a prompt. Raises UsageError if it changes the prompt's own ids."""
         before, behind = (self.prompt(question, text, pictured).ids for text in (begun, begun + option))
-        if len(behind) != len(before) + 1 or behind[:-1] != before:
+        if len(behind) == len(before) or behind[: len(before)] != before:
             raise UsageError(
-                f"the option {option!r} is {len(behind) - len(before)} tokens behind this prompt; options are "
-                "compared by one token. Name the letters, not whole answers"
+                f"the option {option!r} melts into the end of the prompt: {list(behind[len(before) - 2 :])} "
+                f"instead of {list(before[-2:])} and more. Give it as it stands behind the prompt"
             )
-        return int(behind[-1])
+        return int(behind[len(before)])
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to the end of the turn, without special tokens."""

@@ -71,11 +71,12 @@ def test_a_question_with_a_marker_in_it_is_refused(folder: Path, marker: str) ->
         text(folder).prompt(f"Put it on {marker} now")
 
 
-def test_an_option_is_one_token_behind_the_prompt(folder: Path) -> None:
+def test_an_option_is_its_first_token_behind_the_prompt(folder: Path) -> None:
     spoken = text(folder)
     assert spoken.decode([spoken.option("A or B?", "", "B")]) == "B"
-    with pytest.raises(UsageError, match="2 tokens"):
-        spoken.option("A or B?", "", "AB")
+    assert spoken.option("A or B?", "", "Bad") == spoken.option("A or B?", "", "B")
+    with pytest.raises(UsageError, match="melts into the end of the prompt"):
+        spoken.option("A or B?", "", "")
 
 
 def test_text_ends_with_the_turn(folder: Path) -> None:

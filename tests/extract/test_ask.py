@@ -1,0 +1,279 @@
+"""Asked runs: what is stored, what controls say, that they resume, and that they see what policies see."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
+from probe_kit.extract import (
+    AskSettings,
+    ExtractSettings,
+    Run,
+    ask_run,
+    extract_run,
+    open_run,
+    prepare,
+    prepare_asks,
+    verify_run,
+)
+from probe_kit.extract.asking.templates import P1, P2, SEEN, Template
+from probe_kit.extract.plan import plan_episodes
+from probe_kit.extract.play.ask_controller import AskController, AskTurn
+from probe_kit.extract.play.examples import example_observations
+from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.extract.prepared import load_reader
+from probe_kit.hooks import Question, Reader, Reading, Site
+from probe_kit.retention import success_rate
+from probe_kit.suite import Suite, load_suite
+from tests.position_readers import PositionReader, always, likes
+from tests.prismatic_checkpoints import write_checkpoint
+
+NOWHERE = EpisodeBuffers([], 1, with_tokens=False, pinned=False)
+SMALL = SceneSpec(picture_size=(224, 224))
+COLUMNS = {
+    "outcome", "side_placed", "answer", "parse", "said", "answer_swapped", "side_placed_swapped", "parse_swapped",
+    "outcome_swapped", "logit_left", "logit_right", "option_mass", "margin", "margin_swapped", "content",
+    "letter_bias", "near_tie", "side_logits", "outcome_logits", "side_debiased", "outcome_debiased",
+    "prompt_tokens", "picture_tokens", "question", "side_word", "first_frame_sha256", "visible_left",
+    "visible_right",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> AskSettings:
+    """A tiny Prismatic with random weights, asked about two items."""
+    folder = write_checkpoint(tmp_path_factory.mktemp("vlm") / "tiny", model_type="prismatic")
+    return AskSettings(
+        "prismatic",
+        str(folder),
+        suite=small_suite.folder,
+        categories=("color",),
+        items=2,
+        scene=SMALL,
+        options={"tokenizer": "bytes"},
+        env_workers=0,
+    )
+
+
+@pytest.fixture(scope="module")
+def asked(settings: AskSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return ask_run(replace(settings, tokens="pooled"), tmp_path_factory.mktemp("asked") / "run")
+
+
+def files(run: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(run)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(run.rglob("*"))
+        if path.is_file() and path.parent.name != "certificates"
+    }
+
+
+# -- what is stored --------------------------------------------------------------------------------------
+
+
+def test_every_episode_has_its_answer_and_the_run_is_whole(asked: Run) -> None:
+    assert set(asked.episodes) >= COLUMNS
+    assert len(asked.episodes) == 4
+    assert asked.certificate["hooks_on_equals_hooks_off"]
+    assert verify_run(asked.path, deep=True).ok
+    question = asked.episodes["question"][0]
+    assert question.startswith('Do you see the gray shape? If yes, specify where: "left" or "right".')
+    ask = asked.settings["ask"]
+    assert (ask["prompt"], ask["picture_size"], ask["template_sha256"]) == ("p1", "224x224", P1.sha256)
+    assert asked.label == "prismatic · tiny · tokenizer=bytes · p1 · 224×224"
+
+
+def test_its_streams_are_those_of_the_question_as_it_was_asked(asked: Run) -> None:
+    assert list(asked.streams) == ["backbone", "answer"]
+    assert asked.views("backbone") == ("mean", "last", "mean:image.primary", "mean:language")
+    column = np.asarray(asked.column(Site("backbone", 2), "mean"))
+    assert np.isfinite(column).all()
+    assert column.std(axis=0).max() > 0
+    assert (asked.episodes["picture_tokens"] == 4).all()
+
+
+def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
+    settings: AskSettings, asked: Run, tmp_path: Path
+) -> None:
+    short = SceneSpec(max_steps=1)  # at full size: pictures are made smaller behind the frame that is hashed
+    acting = ExtractSettings("expert", suite=settings.suite, categories=("color",), items=2, scene=short)
+    acted = extract_run(acting, tmp_path / "run").episodes
+    for column in ("episode_id", "scene_seed", "first_frame_sha256", "visible_left"):
+        assert acted[column].tolist() == asked.episodes[column].tolist(), column
+    assert acted["first_frame_sha256"].nunique() == 2, "twins share their pictures, exchanged"
+
+
+def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
+    class CrashError(Exception):
+        pass
+
+    def crash(*_: object) -> None:
+        raise CrashError
+
+    pooled = replace(settings, tokens="pooled")
+    with pytest.raises(CrashError):
+        ask_run(pooled, tmp_path / "run", crash)
+    assert 1 <= len(open_run(tmp_path / "run", allow_partial=True).episodes) < 4
+    assert files(ask_run(pooled, tmp_path / "run").path) == files(asked.path)
+
+
+@pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"asked": "distractor"}, {"seed": 1}])
+def test_other_questions_are_another_run(settings: AskSettings, asked: Run, change: dict) -> None:
+    with pytest.raises(SettingsMismatchError):
+        prepare(replace(settings, tokens="pooled", **change), asked.path)
+
+
+def test_a_batch_answers_alike(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
+    run = ask_run(replace(settings, batch=3), tmp_path / "run")
+    np.testing.assert_allclose(run.episodes["margin"], asked.episodes["margin"], atol=1e-4)
+    assert run.episodes["answer"].tolist() == asked.episodes["answer"].tolist()
+    assert run.streams == {}
+
+
+@pytest.mark.slow
+def test_worker_processes_give_the_same_commits(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
+    run = ask_run(replace(settings, tokens="pooled", workers=2), tmp_path / "run")
+    for path in sorted(asked.path.glob("commits/*.json")):
+        assert (run.path / "commits" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
+    settings: AskSettings, tmp_path: Path
+) -> None:
+    class Choosy(PositionReader):
+        def read(self, questions: list[Question]) -> Reading:
+            if any("red" in own.text for own in questions) and any(own.seen.image.any() for own in questions):
+                raise InstructionError("no red, please")
+            return super().read(questions)
+
+    extraction = prepare(settings, None, Choosy(likes("A"), always("A")))
+    with pytest.raises(Exception, match="2 episodes failed twice"):
+        extraction.run(tmp_path / "run")
+    assert len(open_run(tmp_path / "run", allow_partial=True).episodes) == 2
+
+
+# -- controls --------------------------------------------------------------------------------------------
+
+
+def answers(settings: AskSettings, reader: Reader | None = None) -> pd.DataFrame:
+    """What the run's episodes would hold, their frames being noise: no scene is needed to see whom a reader is."""
+    assert settings.suite is not None
+    suite = load_suite(settings.suite).select(settings.categories, settings.items)
+    blank = example_observations(settings.scene, suite)[0]
+    controller = AskController(load_reader(settings) if reader is None else reader, settings, suite, blank)
+    noise = np.random.default_rng(0)
+    turns = [
+        AskTurn(one, replace(blank, image=noise.integers(0, 256, blank.image.shape, np.uint8)), NOWHERE)
+        for one in plan_episodes(suite, settings.seed)
+    ]
+    outcomes = [outcome for turn in turns for outcome in controller.ask([turn])]
+    return pd.DataFrame([turn.planned.to_json() | own for turn, own in zip(turns, outcomes, strict=True)])
+
+
+@pytest.mark.parametrize(("option", "side", "bias"), [("A", "left", 1.0), ("B", "right", -1.0)])
+def test_who_answers_by_letter_gives_as_many_right_as_wrong_and_a_letter_bias(
+    settings: AskSettings, option: str, side: str, bias: float
+) -> None:
+    episodes = answers(settings, PositionReader(likes(option), always(option)))
+    assert (episodes["side_placed"] == side).all()
+    assert (episodes["side_placed_swapped"] != side).all()
+    assert episodes["outcome"].value_counts().to_dict() == {"correct": 2, "wrong": 2}
+    assert episodes["outcome_logits"].value_counts().to_dict() == {"correct": 2, "wrong": 2}
+    assert (episodes["letter_bias"] == bias).all()
+    assert (episodes["content"] == 0).all()
+    assert (episodes["outcome_debiased"] == "oob").all(), "without a preference for a letter nothing is left"
+
+
+def test_who_answers_by_side_has_no_letter_bias_and_is_right_as_often_as_wrong(settings: AskSettings) -> None:
+    def left(text: str, option: str) -> float:
+        return float(f"{option} left" in text)
+
+    episodes = answers(settings, PositionReader(left, lambda text: "A" if "A left" in text else "B"))
+    for column in ("outcome", "outcome_swapped", "outcome_logits", "outcome_debiased"):
+        assert episodes[column].value_counts().to_dict() == {"correct": 2, "wrong": 2}
+    assert (episodes["letter_bias"] == 0).all()
+    assert (episodes["content"] == 1).all()
+
+
+@pytest.mark.parametrize("prompt", [P1, P2, SEEN], ids=["p1", "p2", "seen"])
+def test_without_a_picture_exactly_as_many_are_right_as_wrong(settings: AskSettings, prompt: Template) -> None:
+    episodes = answers(replace(settings, picture="none", prompt=prompt, items=6))
+    for column in ("outcome_logits", "outcome_debiased", "outcome"):
+        counts = episodes[column].value_counts()
+        assert counts.get("correct", 0) == counts.get("wrong", 0), column
+    assert success_rate(episodes.assign(outcome=episodes["outcome_logits"])).sr == 0.5
+    assert episodes.groupby("item_id")["margin"].nunique().eq(1).all(), "both layouts ask the same words"
+    assert (episodes["picture_tokens"] == 0).all()
+
+
+def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings) -> None:
+    seen = []
+
+    class Watching(PositionReader):
+        def read(self, questions: list[Question]) -> Reading:
+            seen.extend(own.seen.image for own in questions)
+            return super().read(questions)
+
+    answers(replace(settings, picture="side-by-side"), Watching(likes("A"), always("A")))
+    original, swapped = seen[1], seen[3]  # behind a blank one, each in two orders
+    assert original.shape == (224, 224, 3)
+    assert (original[0] == 128).all()
+    half = original.shape[1] // 2
+    np.testing.assert_array_equal(original[:, :half], swapped[:, half:])
+
+
+def test_the_distractor_lies_on_the_other_side(settings: AskSettings) -> None:
+    episodes = answers(replace(settings, asked="distractor"), PositionReader(likes("A"), always("A")))
+    assert episodes["question"][0].startswith("Do you see the red shape?")
+    right = episodes["side_correct"] == "right"
+    assert (episodes["outcome"] == np.where(right, "correct", "wrong")).all()
+
+
+def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
+    absent = replace(settings, asked="absent", prompt=SEEN, items=4)
+    honest = answers(absent, PositionReader(likes("No"), always("No.")))
+    assert (honest[["outcome", "outcome_logits", "outcome_debiased"]] == "correct").all().all()
+    eager = answers(absent, PositionReader(likes("Yes"), always("Yes, left.")))
+    assert (eager[["outcome", "outcome_logits"]] == "wrong").all().all()
+    assert (honest["question"] == eager["question"]).all()
+
+
+# -- refusals --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (
+            {"model": "pi0-tiny", "checkpoint": None, "options": {}},
+            "acts and does not answer questions; those that do",
+        ),
+        ({"model": "expert", "checkpoint": None, "options": {}}, "acts and does not answer"),
+        ({"asked": "absent"}, "p1 does not ask for yes or no"),
+        ({"picture": "video"}, "picture is 'video'; expected one of frame, side-by-side, none"),
+        ({"asked": "both"}, "asked is 'both'"),
+        ({"tokens": "some"}, "expected one of none, pooled, all"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_a_model_is_loaded(
+    settings: AskSettings, change: dict, match: str
+) -> None:
+    with pytest.raises(UsageError, match=match):
+        prepare(replace(settings, **change))
+
+
+def test_several_runs_of_one_model_are_checked_before_the_first_is_asked(
+    settings: AskSettings, asked: Run, tmp_path: Path
+) -> None:
+    wanted = [settings, replace(settings, prompt=P2)]
+    with pytest.raises(SettingsMismatchError):
+        next(prepare_asks(wanted, [tmp_path / "p1", asked.path]))
+    prepared = list(prepare_asks(wanted, [tmp_path / "p1", tmp_path / "p2"]))
+    assert prepared[0].controller.reader is prepared[1].controller.reader
+    names = [one.default_name().rpartition("-")[0] for one in prepared]
+    assert names == ["ask-prismatic-p1-224x224", "ask-prismatic-p2-224x224"]

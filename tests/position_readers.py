@@ -1,0 +1,46 @@
+"""Readers that look at nothing: they answer by the place of an option, or by the word for a side."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from torch import nn
+
+from probe_kit.hooks import Card, Observation, Question, Reader, Reading, Roles, Site, Stream, Tap
+
+Liking = Callable[[str, str], float]
+"""The logit of an option (without its lead) behind a question."""
+
+
+class PositionReader(Reader):
+    """Says what it likes best. liking: logit of every option. said: the text that is spoken, by question."""
+
+    def __init__(self, liking: Liking, said: Callable[[str], str]) -> None:
+        self.card = Card(
+            "stub", "none", "0" * 64, False, 1, "float32", "cpu", "none", ("primary",), 0, 0, settings={}
+        )
+        self.streams: Mapping[str, Stream] = {"backbone": Stream("backbone", 1, 1, quantities=("residual",))}
+        self.role_names = {"backbone": ("image.primary", "language")}
+        self._liking, self._said = liking, said
+
+    def read(self, questions: Sequence[Question]) -> Reading:
+        logits = [[self._liking(own.text, option.strip()) for option in own.options] for own in questions]
+        return Reading(np.array(logits, np.float32), np.full(len(logits), 0.9, np.float32), list(questions))
+
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        return [" ".join(self._said(own.text).split()[:tokens]) for own in reading.state]
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        return {"backbone": [Roles.from_labels(["image.primary", "language"])] * len(seen)}
+
+    def tap(self, site: Site) -> Tap:
+        self.stream_of(site)
+        return Tap(nn.Identity(), 1)
+
+
+def likes(option: str) -> Liking:
+    """One for this option, whatever the question, and zero for every other."""
+    return lambda _, other: float(other == option)
+
+
+def always(text: str) -> Callable[[str], str]:
+    return lambda _: text
