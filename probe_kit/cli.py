@@ -30,7 +30,8 @@ from probe_kit.train.commands import show, train
 from probe_kit.train.power_commands import power
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "export", "verify",
+    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "export",
+    "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 

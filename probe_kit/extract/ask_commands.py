@@ -195,6 +195,4 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         say(f"{run.label}: {counts}{reasons}; option mass {mass:.2f}")
         out.print(str(run.location), soft_wrap=True)
     places = " ".join(str(run.location) for run in runs)
-    err.print(
-        f"next: [bold]probe-kit retention {places}[/], with acting runs behind", highlight=False, soft_wrap=True
-    )
+    say(marked("next: [bold]probe-kit retention {}[/], with acting runs behind", places))

@@ -203,6 +203,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "run": str(location),
     }
     table = Table(show_header=False, title="plan", box=None)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")  # a path that is cut off is no path
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
