@@ -10,6 +10,7 @@ from torch import nn
 
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.internvl import build_internvl
+from probe_kit.models.ovis2_5 import OvisConfig, build_ovis2_5
 from probe_kit.models.paligemma import build_paligemma
 from probe_kit.models.qwen import build_qwen2_5_vl, build_qwen3_vl
 from tests.qwen_checkpoints import ID, SPECIAL, picture_settings, save_sharded, token_ids, write_tokenizer
@@ -114,6 +115,22 @@ def write_paligemma(folder: Path, seed: int = 1, **fields: Any) -> Path:
     settings = {**_SQUARE, "size": {"height": 28, "width": 28}}
     end = 256 + PALIGEMMA_SPECIAL.index("<eos>")
     return _write(folder, values, network, seed, _LANGUAGE_LAST, settings, end, PALIGEMMA_SPECIAL)
+
+
+def write_ovis2_5(folder: Path, seed: int = 1, vision: dict[str, Any] | None = None, **fields: Any) -> Path:
+    """A hundred visual words; pictures as large as the released ones, whose limits are in no file."""
+    tower = {
+        "hidden_size": 32, "intermediate_size": 44, "num_hidden_layers": 2, "num_attention_heads": 2,
+        "num_channels": 3, "patch_size": 32, "hidden_stride": 2, "image_size": 128, "window_size": 192,
+        "temporal_patch_size": 1, "layer_norm_eps": 1e-6, "hidden_act": "gelu_pytorch_tanh", "use_rope": True,
+        "preserve_original_pe": True, "fullatt_block_indexes": None, **(vision or {}),
+    }  # fmt: skip
+    text = {**_TEXT, "model_type": "qwen3", "head_dim": 8, "eos_token_id": ID["<|im_end|>"]}
+    values = {
+        "model_type": "ovis2_5", "llm_config": text, "vit_config": tower, "visual_vocab_size": 100, **fields,
+    }  # fmt: skip
+    network = build_ovis2_5(OvisConfig.from_values(values), torch.float32, "cpu")
+    return _write(folder, values, network, seed, (), {**_SQUARE, "resample": 2}, None)
 
 
 _LANGUAGE_LAST = (

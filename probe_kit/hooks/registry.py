@@ -30,6 +30,7 @@ FOLDERS = (
     "qwen2_5_vl",
     "qwen3_vl",
     "internvl",
+    "ovis2_5",
 )
 """In the order in which `probe-kit models` lists them."""
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.models.internvl import TiledPictures
+from probe_kit.models.ovis2_5 import OvisPictures, VisionConfig
 from probe_kit.models.paligemma import SquarePictures
 from probe_kit.models.qwen import QwenPictures, merged_tokens
 
@@ -26,6 +27,7 @@ FILES: dict[str, dict[str, Any]] = {
     "internvl": {"size": {"height": 448, "width": 448}, "crop_to_patches": False, "min_patches": 1,
                  "max_patches": 12, "resample": 3, **IMAGENET},
     "paligemma": {"size": {"height": 224, "width": 224}, "resample": 3, **HALF},
+    "ovis2_5": {"size": {"height": 512, "width": 512}, "resample": 2, "rescale_factor": 1 / 255, **HALF},
 }  # fmt: skip
 Prepared = tuple[NDArray[Any], int]
 
@@ -47,7 +49,14 @@ def _paligemma(folder: Path, picture: NDArray[np.uint8]) -> Prepared:
     return SquarePictures.from_folder(folder, 224).pixels([picture]).numpy(), 256
 
 
-PREPARE = {"qwen2_5_vl": _qwen(14), "qwen3_vl": _qwen(16), "internvl": _internvl, "paligemma": _paligemma}
+def _ovis(folder: Path, picture: NDArray[np.uint8]) -> Prepared:
+    vision = VisionConfig(1152, 27, 16, 4304, patch=16, stride=2, table=32, window=112, epsilon=1e-6)
+    pictures = OvisPictures.from_folder(folder, vision)
+    return pictures.patches([picture])[0].numpy(), pictures.tokens(*picture.shape[:2]) + 2
+
+
+PREPARE = {"qwen2_5_vl": _qwen(14), "qwen3_vl": _qwen(16), "internvl": _internvl, "paligemma": _paligemma,
+           "ovis2_5": _ovis}  # fmt: skip
 
 
 @pytest.mark.parametrize("size", ["224x224", "560x480"])

@@ -5,6 +5,7 @@ whole prompts; the adapter is given what stands between their frames.
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -32,6 +33,8 @@ PIXELS, STREAMS, LOGITS = 1e-6, 3e-5, 2e-5
 LETTERS = ("A", "B")
 _INPUTS = ("pixel_values_index",)
 _DIMS = "dims.json"
+# How the templates that references were recorded with mark a picture's place.
+_PLACEHOLDER = re.compile(r"<\|vision_end\|>|<IMG_CONTEXT>|<image>")
 
 
 def verify_vlm(
@@ -80,13 +83,10 @@ def _letters(model: VisionLanguageModel) -> tuple[str, ...]:
 
 
 def _between(text: str, model: VisionLanguageModel) -> str:
-    """The question in a whole prompt: behind the picture's placeholder and frame, before the frame's end."""
-    frame = model.frame
-    body = text.removesuffix(frame.end) if frame.end.strip() else text
-    for mark in (frame.behind, "<image>", "<IMG_CONTEXT>\n"):
-        if mark and mark in body:
-            body = body.rpartition(mark)[2]
-    return body.lstrip("\n")
+    """The question in a whole prompt: behind the picture's placeholder, before the frame's end."""
+    end = model.frame.end
+    body = text.removesuffix(end) if end.strip() else text
+    return _PLACEHOLDER.split(body)[-1].lstrip("\n")
 
 
 class Reference:
@@ -167,10 +167,11 @@ class Reference:
                 torch.stack([joined(layer, "residual") for layer in range(layers)])
             ),
             "backbone_final_norm": lambda: numpy_of(joined(layers - 1, "final_norm")),
-            "vision_resid_row0": self._vision,
+            "vision_resid_row0": self.vision,
         }
 
-    def _vision(self) -> NDArray[Any]:
+    def vision(self) -> NDArray[Any]:
+        """What enters every block of the tower for the first row's picture."""
         sites = self.model.further_streams["vision"].sites()[:-1]
         with capture(self.model, sites) as tape:
             self.model.prefill(self.questions[:1])

@@ -13,7 +13,7 @@ from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks import Question, load_model
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
-from tests.vlm_checkpoints import write_internvl, write_paligemma, write_qwen2_5_vl, write_qwen3_vl
+from tests.vlm_checkpoints import write_internvl, write_ovis2_5, write_paligemma, write_qwen2_5_vl, write_qwen3_vl
 
 
 def test_files_under_the_names_of_todays_transformers_load_too(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_files_under_the_names_of_todays_transformers_load_too(tmp_path: Path) -
 def test_nothing_stays_on_the_meta_device(tmp_path: Path) -> None:
     for family, write in (
         ("qwen2.5-vl", write_qwen2_5_vl), ("qwen3-vl", write_qwen3_vl), ("internvl", write_internvl),
-        ("paligemma", write_paligemma),
+        ("paligemma", write_paligemma), ("ovis2.5", write_ovis2_5),
     ):  # fmt: skip
         network = load_model(family, str(write(tmp_path / family)), dtype="bfloat16").network
         assert not any(tensor.is_meta for tensor in (*network.parameters(), *network.buffers()))
@@ -100,3 +100,15 @@ def test_two_pictures_of_different_size_go_together(tmp_path: Path) -> None:
     alone = [reader.read([question]).option_logits[0] for question in asked]
     np.testing.assert_allclose(together.option_logits, alone, atol=1e-5)
     assert reader.speak(together, 5) == [reader.speak(reader.read([question]), 5)[0] for question in asked]
+
+
+@pytest.mark.parametrize(
+    "vision", [{"fullatt_block_indexes": [1]}, {"use_rope": False}, {"hidden_act": "gelu"}, {"hidden_size": 36}]
+)
+def test_towers_that_no_released_ovis_has_are_refused(vision: dict[str, object], tmp_path: Path) -> None:
+    folder = write_ovis2_5(tmp_path)
+    values = json.loads((folder / "config.json").read_text())
+    values["vit_config"] |= vision
+    (folder / "config.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match="the vision tower has"):
+        load_model("ovis2.5", str(folder))

@@ -16,6 +16,7 @@ FOLDERS = {
     "qwen2.5-vl": "qwen2_5_vl",
     "qwen3-vl": "qwen3_vl",
     "internvl": "internvl",
+    "ovis2.5": "ovis2_5",
 }
 COMMON = {
     "input_ids", "attention_mask", "pixel_values_shape", "pixel_values_at", "pixel_values_sum", "backbone_resid",
@@ -68,6 +69,7 @@ def _lists(golden: Path) -> list[tuple[str, Path]]:
         ("paligemma", "paligemma/hub_keys.3B-pt-224.json.gz", "603 keys"),
         ("qwen2.5-vl", "qwen2_5_vl/hub_keys.3B.json.gz", "824 keys of 3B"),
         ("internvl", "internvl/hub_keys.8B.json.gz", "841 keys of 8B"),
+        ("ovis2.5", "ovis2_5/real_keys.9B.json.gz", "840 keys"),
     ],
 )
 def test_full_size_keys_are_equal_through_the_renames(family: str, file: str, keys: str, golden_vlm: Path) -> None:

@@ -1,0 +1,22 @@
+"""Ovis2.5, native."""
+
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.options import Option
+
+FAMILIES = (
+    Family(
+        "ovis2.5",
+        "Ovis2.5 (SigLIP 2 at any resolution, visual words, Qwen3 decoder), native",
+        "AIDC-AI/Ovis2.5-9B",
+        "probe_kit.hooks.families.ovis2_5.adapter:load_ovis2_5",
+        streams="backbone 37 layers, answer 37 layers",
+        embodiment="none: answers, does not act",
+        notes="asked without its thought; 18 GB in bfloat16",
+        verifier="probe_kit.hooks.families.ovis2_5.adapter:verify_ovis2_5",
+        config_types=("ovis2_5",),
+        full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        acts=False,
+        reads=True,
+    ),
+)

@@ -1,0 +1,128 @@
+"""The adapter for Ovis2.5: Qwen's chat without a system turn, the answer begun with an empty thought."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.hooks.families.qwen_reader import ASSISTANT, USER
+from probe_kit.hooks.families.recording import numpy_of
+from probe_kit.hooks.families.vlm import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
+from probe_kit.hooks.families.vlm_text import Frame
+from probe_kit.hooks.families.vlm_verify import Reference, questions_of, verify_vlm
+from probe_kit.hooks.model import Tap
+from probe_kit.hooks.verify import Comparison, Produce
+from probe_kit.models.ovis2_5 import (
+    PICTURE,
+    PICTURE_BEGINS,
+    PICTURE_ENDS,
+    OvisConfig,
+    OvisPictures,
+    build_ovis2_5,
+)
+
+STREAMS = 1e-4
+"""Tolerance of activations, which enter through a softmax over visual words."""
+_RECIPE = Recipe(OvisConfig.from_values, build_ovis2_5)
+
+
+class Ovis25(VisionLanguageModel):
+    """A loaded Ovis2.5."""
+
+    family: ClassVar[str] = "ovis2.5"
+    frame: ClassVar[Frame] = Frame(USER, "\n", USER, f"{ASSISTANT}<think>\n\n</think>\n\n")
+    marks: ClassVar[int] = 1
+    _grid: Tensor | None = None
+    """Of the pictures under way: the tower runs over the patches of all rows at once."""
+
+    @property
+    def language(self) -> Any:
+        """The decoder."""
+        return self.network.llm.model
+
+    @property
+    def text_config(self) -> Any:
+        """The language model's configuration."""
+        return self.network.config.text
+
+    @property
+    def vision_size(self) -> tuple[int, int]:
+        """Blocks and width of the vision tower."""
+        vision = self.network.config.vision
+        return vision.blocks, vision.width
+
+    def vision_tap(self, layer: int) -> Tap:
+        """The first norm of a block; the last site is what the last block puts out. Patches word by word."""
+        blocks = self.network.visual_tokenizer.vit.vision_model.encoder.layers
+        if layer == len(blocks):
+            return Tap(blocks[-1], 1, "output", view=self._by_picture)
+        return Tap(blocks[layer].layer_norm1, 1, view=self._by_picture)
+
+    def _by_picture(self, patches: Tensor) -> Tensor:
+        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
+        count = 1 if self._grid is None or bool((self._grid != self._grid[0]).any()) else len(self._grid)
+        return patches.view(count, -1, patches.shape[-1])
+
+    @cached_property
+    def pictures(self) -> OvisPictures:
+        """How pictures become patches. Raises CheckpointError naming the missing file."""
+        return OvisPictures.from_folder(self.loaded.folder, self.network.config.vision)
+
+    def picture_ids(self, height: int, width: int) -> list[int]:
+        """As many as the picture's size demands, between the marks of its beginning and end."""
+        return [PICTURE_BEGINS, *[PICTURE] * self.pictures.tokens(height, width), PICTURE_ENDS]
+
+    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+        """pixel_values (N, 3 x patch x patch) and image_grid_thw (B, 3)."""
+        pixels, self._grid = self.pictures.patches(pictures)
+        device = self.loaded.device
+        return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
+
+
+def load_ovis2_5(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    tokenizer: str | None = None,
+    weights_seed: int = 0,
+) -> Ovis25:
+    """Load Ovis2.5 from a folder or hub id; see `load_vlm`. tokenizer: folder of another one."""
+    return Ovis25(load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed), tokenizer)
+
+
+def verify_ovis2_5(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
+    """Compare a reference."""
+    model = load_ovis2_5(str(folder / "checkpoint"), dtype="float32")
+    reference = Reference(model, questions_of(folder, recorded, model), recorded)
+
+    def vision() -> NDArray[Any]:
+        return reference.vision()[:, _windows_first(model)]
+
+    @torch.inference_mode()
+    def words() -> NDArray[Any]:
+        shown = model.shown([reference.questions[0].seen.image])
+        probabilities = model.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
+        return np.pad(numpy_of(probabilities), ((0, 0), (0, model.network.config.words - probabilities.shape[1])))
+
+    further: dict[str, Produce] = {"vision_resid_row0": vision, "visual_probabilities_row0": words}
+    return verify_vlm(model, folder, recorded, further, STREAMS)
+
+
+def _windows_first(model: Ovis25) -> NDArray[np.intp]:
+    """Where the patches of the pictures under way stand in the order of the authors' code, window by window."""
+    vision = model.network.config.vision
+    side = vision.window // vision.stride // vision.patch
+    assert model._grid is not None
+    _, rows, columns = (model._grid[0] // torch.tensor([1, vision.stride, vision.stride])).tolist()
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    order = np.lexsort((column % side, row % side, column // side, row // side))
+    joined = vision.stride**2
+    return np.asarray((order[:, None] * joined + np.arange(joined)).ravel())
