@@ -27,7 +27,7 @@ def blocks(page: str) -> list[str]:
 
 def trained_table(data: Mapping[str, Any]) -> str:
     """What the demo prints of the trained policy, a row per category."""
-    delta = _percent(data["delta"])
+    delta = _span(_of(data, TRAINED), "delta_regime")
     heading = ("demo", f"SR % (Δ {delta})", "backbone %, family-wise p", "action %", "bounded retention [95 %]")
     return _table(heading, [_cells(row, "n/a (no backbone signal)") for row in _of(data, TRAINED)])
 
@@ -47,8 +47,8 @@ def organisms_table(data: Mapping[str, Any]) -> str:
             lines += [_with_verdict(row) for row in rows]
     true = sum(row["expected"] == row["measured"] for row in data["organisms"])
     note = (
-        f"{data['episodes']} episodes per category, Δ = {_percent(data['delta'])} points, {data['permutations']} "
-        f"permutations: {true} of {len(data['organisms'])} verdicts are true."
+        f"{data['episodes']} episodes per category, Δ of {_span(data['organisms'], 'delta_regime')} points by items, "
+        f"{data['permutations']} permutations: {true} of {len(data['organisms'])} verdicts are true."
     )
     return f"{_table(heading, lines)}\n\n{note}"
 

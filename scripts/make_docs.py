@@ -53,7 +53,6 @@ def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
         "probes": rows[0].probe_settings,
         "permutations": PERMUTATIONS,
         "episodes": rows[0].n_episodes,
-        "delta": rows[0].delta,
         "organisms": findings,
     }
     DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
@@ -71,6 +70,7 @@ def _finding(finding: Finding) -> dict[str, object]:
         "expected": finding.expected,
         "measured": finding.measured,
         "sr": row.sr,
+        "delta_regime": row.delta_regime,
         "backbone": row.prefix_accuracy,
         "p": row.prefix_p_fwe,
         "action": row.action_accuracy,
