@@ -87,8 +87,8 @@ class BackbonePeak:
 class ActionPeak:
     """The best site where the action is made; fields as of `BackbonePeak`.
 
-    action_first_accuracy, action_first_layer: the best layer at the first iteration, which sees pure noise; None
-    where the stream runs once.
+    action_first_accuracy, action_first_layer: the best layer at the first iteration, which has seen no
+    action; None where the stream runs once.
     """
 
     action_accuracy: float | None = None

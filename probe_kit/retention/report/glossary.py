@@ -20,8 +20,8 @@ GLOSSARY = MappingProxyType(
             "policy that reaches for the cube first may not need the answer yet."
         ),
         "first iteration": (
-            "Best layer at the first iteration, which sees pure noise. Late iterations hold the decision itself, "
-            "as a noisy action."
+            "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the "
+            "decision itself, as a noisy action or as the tokens before."
         ),
         "wrong": "Share of episodes that ended on the other picture.",
         "outside": "Share of episodes that ended on neither picture.",
