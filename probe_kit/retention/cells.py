@@ -207,6 +207,7 @@ DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
     ),
     ("area [95 %]", lambda row: with_limits(number(row.retention_area), row.retention_area_ci, number)),
     ("debiased [95 %]", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
+    ("call", lambda row: "–" if row.call is None else str(row.call)),
 ]
 """Beside the category."""
 

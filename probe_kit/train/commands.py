@@ -228,12 +228,14 @@ def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
+    from probe_kit.train.summary import SITE_HEADINGS, best_sites
+
     mark = ", RANDOM WEIGHTS" if random_weights else ""
     mark += f", call {results.settings.call}"
-    peaks = results.scores.sort_values("accuracy", ascending=False, kind="stable")
-    for view, of_view in peaks.groupby("view", sort=False):
-        best = [_first_of_ties(rows) for _, rows in of_view.groupby(["category", "stream"])]
-        headings = ("best site", "accuracy % [95 %]", "family-wise p", "beats", "n")
+    peaks = best_sites(results.scores).sort_values(["category", "stream"], kind="stable")
+    for view in results.settings.views:
+        best = [row for _, row in peaks[peaks["view"] == view].iterrows()]
+        headings = (*SITE_HEADINGS, "beats", "n")
         table = FittingTable(
             title=f"Best site per stream, view {view}{mark}",
             caption="+: as many other sites tie with it",
@@ -245,18 +247,10 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
         out.print(table)
 
 
-def _first_of_ties(rows: "pd.DataFrame") -> "pd.Series[Any]":
-    """The best of a stream's sites, in order of accuracy, with the number of others that are as good."""
-    best = rows.iloc[0].copy()
-    best["ties"] = int((rows["accuracy"] == best["accuracy"]).sum()) - 1
-    return best
-
-
 def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
-    accuracy, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
-    p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
-    site = f"{row['site']} +{row['ties']}" if row["ties"] else str(row["site"])
-    return tuple(map(Cell, (site, f"{accuracy} [{low}, {high}]", p, _beats(row), str(row["n"]))))
+    from probe_kit.train.summary import site_cells
+
+    return tuple(map(Cell, (*site_cells(row), _beats(row), str(row["n"]))))
 
 
 def _beats(best: "pd.Series[Any]") -> str:
