@@ -46,9 +46,10 @@ def organisms_table(data: Mapping[str, Any]) -> str:
         else:
             lines += [_with_verdict(row) for row in rows]
     true = sum(row["expected"] == row["measured"] for row in data["organisms"])
+    margin = _span(data["organisms"], "delta_regime")
     note = (
-        f"{data['episodes']} episodes per category, Δ of {_span(data['organisms'], 'delta_regime')} points by items, "
-        f"{data['permutations']} permutations: {true} of {len(data['organisms'])} verdicts are true."
+        f"{data['episodes']} episodes per category, Δ of {margin} points by items, {data['permutations']} "
+        f"permutations: {true} of {len(data['organisms'])} verdicts are true."
     )
     return f"{_table(heading, lines)}\n\n{note}"
 

@@ -15,7 +15,8 @@ def scores() -> pd.DataFrame:
     rows = [
         {
             "category": "color", "view": "mean", "stream": stream, "iteration": step, "accuracy": accuracy,
-            "n": 40, "site": f"{stream}.{layer:02d}", "ci_low": accuracy - 0.1, "ci_high": accuracy + 0.1, "p_fwe": 0.005,
+            "n": 40, "site": f"{stream}.{layer:02d}", "ci_low": accuracy - 0.1,
+            "ci_high": accuracy + 0.1, "p_fwe": 0.005,
         }
         for stream, layer, step, accuracy in sites
     ]  # fmt: skip
