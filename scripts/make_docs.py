@@ -7,6 +7,7 @@ cores). The numbers go to `docs/demo.json`, and from there, by `docs_tables`, in
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,9 @@ from probe_kit.organisms import TRAINED, Finding, NamedProgress, verdict
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.rows import MEAN
 
+SHOWN = {"report.html": "sample-report.html", "episode.gif": "episode.gif"}
+"""What the docs show as the demo made it."""
+
 
 def main() -> None:
     """Run what has to be run, then write numbers, tables and figures."""
@@ -32,6 +36,8 @@ def main() -> None:
     for page in (README, *PAGES):
         page.write_text(filled(page.read_text(), json.loads(DATA.read_text())))
     draw_picture(asked.folder, json.loads(DATA.read_text())["probes"])
+    for made, shown in SHOWN.items():
+        shutil.copyfile(asked.folder / made, ROOT / "docs" / shown)
     sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]
     subprocess.run(sheet, check=True)
 

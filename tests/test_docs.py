@@ -92,7 +92,7 @@ def test_the_page_of_errors_names_no_error_that_is_none() -> None:
 def test_every_public_name_is_described_in_the_reference() -> None:
     import probe_kit
 
-    reference = re.findall(r"^::: (.+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    reference = _reference()
     described = {_resolved(path) for path in reference}
     missing = [name for name in probe_kit.__all__ if getattr(probe_kit, name) not in described]
     assert missing == ["ProbeKitError"]  # described, with all of its children, on the page of errors
@@ -100,10 +100,17 @@ def test_every_public_name_is_described_in_the_reference() -> None:
 
 def test_the_reference_knows_names_of_packages_only() -> None:
     """In which file of a package something lies is nobody's business."""
-    reference = re.findall(r"^::: (.+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    reference = _reference()
     modules = [import_module(path.rpartition(".")[0]) for path in reference]
     assert len(reference) > 40
     assert [module.__name__ for module in modules if not hasattr(module, "__path__")] == []
+
+
+def _reference() -> list[str]:
+    """What the pages of the reference describe, by its full name."""
+    pages = sorted((DOCS / "api").glob("*.md"))
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    return re.findall(r"^::: (.+)$", text, re.MULTILINE)
 
 
 def _resolved(path: str) -> object:
