@@ -1,5 +1,6 @@
 """`probe-kit extract`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ from probe_kit.errors import UsageError
 if TYPE_CHECKING:
     from probe_kit.extract import Extraction, Run
     from probe_kit.extract.store.location import Location
+    from probe_kit.suite.ladder import Wording
 
 SCENE = "Scene (recorded with the run)"
 MOVED = {
@@ -51,6 +53,13 @@ def extract(
     suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
     items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
+    wordings: Annotated[
+        str | None,
+        typer.Option(
+            help="Comma-separated: knowledge, named, side, neutral. Every item in each of them, on the same "
+            "seeds; default its own words (knowledge)."
+        ),
+    ] = None,
     scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal, vl-think or act2answer.")] = "bridge",
     max_steps: Annotated[
         int | None, typer.Option(help="Actions per episode, at 5 Hz.", rich_help_panel=SCENE)
@@ -126,6 +135,7 @@ def extract(
     from probe_kit.extract import ExtractSettings, prepare
     from probe_kit.extract.store.locate import locate
     from probe_kit.hooks.options import read_pairs
+    from probe_kit.suite.ladder import check_wordings
 
     asked = {
         "max_steps": max_steps,
@@ -151,6 +161,7 @@ def extract(
         suite=suite,
         categories=split(categories),
         items=items,
+        wordings=None if wordings is None else check_wordings(split(wordings) or ()),
         scene=SceneSpec.preset(scene, **changes),
         seed=seed,
         tokens=tokens,
@@ -197,6 +208,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "suite": plan.suite.identity,
         "categories": ", ".join(plan.suite.categories),
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": "no bound" if free is None else f"{free / 1e9:,.1f} GB free",
@@ -208,6 +220,13 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+
+
+def _describe_wordings(skipped: "Mapping[Wording, int]") -> str:
+    """Their names, and how many items are left out of each."""
+    return ", ".join(
+        f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()
+    )
 
 
 def _describe(stored: Any) -> str:

@@ -1,19 +1,21 @@
 """The plan: which episodes in which order, and what they will cost, before anything is written."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from probe_kit.errors import UsageError
 from probe_kit.extract.store.layout import StoredStream
-from probe_kit.identity import derive_seed
+from probe_kit.identity import derive_seed, sha256_json
 from probe_kit.suite import Episode, Suite
+from probe_kit.suite.ladder import Wording, in_words
 
 
 @dataclass(frozen=True)
 class PlannedEpisode:
     """One row of the plan. Seeds depend on the run's seed and the episode alone.
 
-    Both layouts of an item start from the same scene.
+    Both layouts of an item start from the same scene, and all wordings of an episode from the same seeds.
     """
 
     index: int
@@ -23,7 +25,7 @@ class PlannedEpisode:
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `plan.json`."""
-        item = self.episode.item
+        item, wording = self.episode.item, self.episode.wording
         return {
             "episode": self.index,
             "episode_id": self.episode.episode_id,
@@ -38,17 +40,30 @@ class PlannedEpisode:
             "distractor_concept": item.distractor_concept,
             "scene_seed": self.scene_seed,
             "policy_seed": self.policy_seed,
+            **({} if wording is None else {"wording": wording}),
         }
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All episodes of a run, and the size of what they leave."""
+    """All episodes of a run, and the size of what they leave.
+
+    skipped: by wording, how many items have none and are not asked in it; None for items in their own words.
+    """
 
     suite: Suite
     episodes: tuple[PlannedEpisode, ...]
     streams: tuple[StoredStream, ...]
     bytes: int
+    skipped: dict[Wording, int] | None = None
+
+    @property
+    def wordings(self) -> dict[str, Any] | None:
+        """What names the wordings of a run beside its suite, None for items in their own words."""
+        if self.skipped is None:
+            return None
+        texts = [[e.episode.episode_id, e.episode.item.instruction] for e in self.episodes]
+        return {"names": list(self.skipped), "skipped": self.skipped, "texts_sha256": sha256_json(texts)}
 
     @property
     def sites(self) -> int:
@@ -56,19 +71,53 @@ class Plan:
         return sum(len(stream.stream.sites()) for stream in self.streams)
 
 
-def plan_episodes(suite: Suite, seed: int) -> Iterator[PlannedEpisode]:
-    """Every episode of `suite` in order, with its seeds."""
-    for index, episode in enumerate(suite.episodes()):
+def plan_episodes(suite: Suite, seed: int, wordings: Sequence[Wording] | None = None) -> Iterator[PlannedEpisode]:
+    """Every episode of `suite` in order, with its seeds, in each of `wordings` that its item has.
+
+    Raises SuiteError if an item's own words for a wording are none.
+    """
+    worded = suite.episodes() if wordings is None else _in_every_wording(suite, wordings)
+    for index, episode in enumerate(worded):
         yield PlannedEpisode(
             index,
             episode,
             scene_seed=derive_seed(seed, "scene", episode.item.item_id),
-            policy_seed=derive_seed(seed, "policy", episode.episode_id),
+            policy_seed=derive_seed(seed, "policy", episode.seed_id),
         )
 
 
-def make_plan(suite: Suite, streams: list[StoredStream], seed: int, calls: int, with_tokens: bool) -> Plan:
-    """Plan every episode of `suite`."""
-    episodes = tuple(plan_episodes(suite, seed))
+def _in_every_wording(suite: Suite, wordings: Sequence[Wording]) -> Iterator[Episode]:
+    for episode in suite.episodes():
+        yield from filter(None, (in_words(episode, wording) for wording in wordings))
+
+
+def instructions_of(episodes: Iterable[PlannedEpisode]) -> tuple[str, ...]:
+    """Every instruction once, in the order of their letters."""
+    return tuple(sorted({planned.episode.item.instruction for planned in episodes}))
+
+
+def make_plan(
+    suite: Suite, streams: list[StoredStream], seed: int, calls: int, with_tokens: bool,
+    wordings: Sequence[Wording] | None = None,
+) -> Plan:  # fmt: skip
+    """Plan every episode of `suite`. Raises UsageError for a wording that no item has."""
+    episodes = tuple(plan_episodes(suite, seed, wordings))
     per_call = sum(stream.raw_bytes(with_tokens) for stream in streams)
-    return Plan(suite, episodes, tuple(streams), per_call * calls * len(episodes))
+    skipped = None if wordings is None else skipped_items(suite, episodes, wordings)
+    return Plan(suite, episodes, tuple(streams), per_call * calls * len(episodes), skipped)
+
+
+def skipped_items(
+    suite: Suite, episodes: Sequence[PlannedEpisode], wordings: Sequence[Wording]
+) -> dict[Wording, int]:
+    """By wording, how many items of `suite` have none. Raises UsageError for a wording that no item has."""
+    skipped = {}
+    for wording in wordings:
+        asked = {planned.episode.item.item_id for planned in episodes if planned.episode.wording == wording}
+        if not asked:
+            raise UsageError(
+                f"no item of {suite.identity} has the wording {wording!r}. Leave it out of --wordings, or "
+                "write it into the suite's metadata (field `wordings`)"
+            )
+        skipped[wording] = len(suite.items) - len(asked)
+    return skipped

@@ -1,12 +1,13 @@
 """Preparing an extraction: find the suite, load the model, plan the episodes. Nothing is written."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.asking.phrases import phrases
 from probe_kit.extract.early import check_model, check_place
-from probe_kit.extract.plan import Plan, make_plan, plan_episodes
+from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.play.ask_controller import AskController
 from probe_kit.extract.play.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
@@ -46,6 +47,7 @@ class Prepared:
             "categories": list(suite.categories),
             "items": len(suite.items),
             "scene": self.settings.scene.to_json(),
+            **({} if self.plan.wordings is None else {"wordings": self.plan.wordings}),
         }
 
     def provenance(self) -> dict[str, Any]:
@@ -83,12 +85,16 @@ def load(
     suite = check_run(settings, location)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
+    wordings = settings.asked_wordings
+    asked = list(plan_episodes(suite, settings.seed, wordings))
+    if wordings is not None:
+        skipped_items(suite, asked, wordings)
     if isinstance(settings, AskSettings):
         controller: ActingController | AskController = _asking(settings, suite, reader)
     else:
-        controller = _acting(settings, suite)
+        controller = _acting(settings, instructions_of(asked))
     with_tokens = settings.tokens == "all"
-    plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens)
+    plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings)
     return Prepared(settings, plan, controller.identity, controller)
 
 
@@ -111,7 +117,7 @@ def _suite(settings: RunSettings) -> Suite:
 
 
 def _asking(settings: AskSettings, suite: Suite, reader: "Reader | None") -> AskController:
-    blank = example_observations(settings.scene, suite)[0]
+    blank = example_observations(settings.scene, [min(item.instruction for item in suite.items)])[0]
     model = load_reader(settings) if reader is None else reader
     refuse_unfit(model.card, settings.batch, blank)
     return AskController(model, settings, suite, blank)
@@ -135,7 +141,7 @@ def load_reader(settings: AskSettings) -> "Reader":
     return model
 
 
-def _acting(settings: RunSettings, suite: Suite) -> ActingController:
+def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingController:
     assert isinstance(settings, ExtractSettings)
     if settings.model in SCRIPTED:
         return ScriptedController(settings.model)
@@ -150,7 +156,7 @@ def _acting(settings: RunSettings, suite: Suite) -> ActingController:
         settings.weights_seed,
         **settings.options,
     )
-    examples = example_observations(settings.scene, suite)
+    examples = example_observations(settings.scene, instructions)
     refuse_unfit(policy.card, settings.batch, examples[0])
     refuse_unreachable(settings, policy.card)
     return PolicyController(

@@ -12,6 +12,7 @@ from probe_kit.extract.asking.templates import P1, Template
 from probe_kit.extract.store.layout import CODECS
 from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.identity import sha256_json
+from probe_kit.suite.ladder import Wording, check_wordings
 
 TOKENS = ("pooled", "all")
 VIDEOS = ("none", "first", "all")
@@ -26,6 +27,7 @@ _ELSEWHERE = {
     "suite",
     "categories",
     "items",
+    "wordings",
     "scene",
     "edits",
     "vectors",
@@ -105,6 +107,11 @@ class RunSettings:
         """Inferences captured per episode, from the first on."""
         return 1
 
+    @property
+    def asked_wordings(self) -> tuple[Wording, ...] | None:
+        """The wordings that every item is asked in, None for its own words alone."""
+        return None
+
     def films(self, number: int) -> bool:
         """Whether episode `number` of the plan is filmed."""
         del number
@@ -120,12 +127,14 @@ class ExtractSettings(RunSettings):
     """Everything `probe-kit extract` can be told; model may also be scripted: `expert`, `expert-mirrored`,
     `idle`.
 
+    wordings: names of `suite.ladder`, each a condition of the run; None for the items' own words alone.
     captured_calls: policy inferences captured per episode, from the first on.
     execute: actions executed per inference; None for the policy's own.
     edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
     """
 
+    wordings: tuple[Wording, ...] | None = None
     captured_calls: int = 1
     execute: int | None = None
     edits: tuple[Edit, ...] = ()
@@ -137,6 +146,8 @@ class ExtractSettings(RunSettings):
         self._check_one_of("video", VIDEOS)
         self._check_at_least("captured_calls", 1)
         self._check_at_least("execute", 1)
+        if self.wordings is not None:
+            check_wordings(self.wordings)
 
     def choices(self) -> dict[str, Any]:
         """As of every run, and the edits."""
@@ -146,6 +157,11 @@ class ExtractSettings(RunSettings):
     def stored_calls(self) -> int:
         """As many as were asked for."""
         return self.captured_calls
+
+    @property
+    def asked_wordings(self) -> tuple[Wording, ...] | None:
+        """Those that were asked for."""
+        return self.wordings
 
     def films(self, number: int) -> bool:
         """All episodes, the first one, or none."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.estimates import Limits
 from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.wordings import WordingPair
 
 Column = tuple[str, Callable[[RetentionRow], str]]
 """Heading, and what a row shows under it."""
@@ -215,3 +216,22 @@ DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
 def difference_title(row: Difference) -> str:
     """Which groups are compared, and whether item by item."""
     return f"Difference: {row.group} − {row.minus} ({'the same items' if row.paired else 'other items'})"
+
+
+# -- wordings ------------------------------------------------------------------------------------------------
+
+WORDING_COLUMNS: list[tuple[str, Callable[[WordingPair], str]]] = [
+    ("wordings", lambda row: f"{row.wording} / {row.other}"),
+    ("n", lambda row: str(row.n_episodes)),
+    ("SR %", lambda row: f"{percent(row.sr)} / {percent(row.other_sr)}"),
+    ("only one", lambda row: f"{row.only} / {row.only_other}"),
+    ("p", lambda row: number(row.p, 3)),
+    ("p by group", lambda row: number(row.p_groups, 3)),
+    ("Holm", lambda row: number(row.p_holm, 3)),
+]
+"""Beside the category."""
+
+
+def wording_title(row: WordingPair) -> str:
+    """Whose wordings are compared."""
+    return f"Wordings, {row.label}"

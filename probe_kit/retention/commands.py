@@ -39,6 +39,9 @@ def retention(
     epsilons: Annotated[
         str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
     ] = None,
+    wording: Annotated[
+        str | None, typer.Option(help="Of runs with several wordings: the one tables are of; default their first.")
+    ] = None,
     html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
@@ -57,7 +60,10 @@ def retention(
     steps = _iterations(iterations)
     radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
     _check_places(html, figures)
-    opened = {name: [open_run(p, allow_partial=partial) for p in paths] for name, paths in grouped.items()}
+    opened = {
+        name: [open_run(p, allow_partial=partial).in_wording(wording) for p in paths]
+        for name, paths in grouped.items()
+    }
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
     table = make_table(opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii)

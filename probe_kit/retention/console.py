@@ -11,6 +11,7 @@ from probe_kit.retention.cells import (
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
     FURTHER_RETENTION,
+    WORDING_COLUMNS,
     Column,
     action_place,
     beats,
@@ -28,10 +29,12 @@ from probe_kit.retention.cells import (
     prefix_place,
     probed,
     with_limits,
+    wording_title,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
+from probe_kit.retention.wordings import WordingPair
 from probe_kit.statistics.significance import detectable
 
 if TYPE_CHECKING:
@@ -45,9 +48,12 @@ _REGIMES: dict[str | None, str] = {
 
 
 def rich_tables(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference] = (),
+    notes: Sequence[str] = (),
+    wordings: Sequence[WordingPair] = (),
 ) -> "Group":
-    """Success rates of every run, its retention and controls per view, differences between groups, notes."""
+    """Success rates of every run, its retention and controls per view, differences, wordings, notes."""
     from rich.console import Group
     from rich.text import Text
 
@@ -64,6 +70,8 @@ def rich_tables(
                 tables.append(_of_run(f"Controls, view {view}", shown, _CONTROLS, [_control_legend(shown)]))
     for title, of_pair in groupby(differences, key=difference_title):
         tables.append(_fitting(title, "", list(of_pair), {"Difference": DIFFERENCE_COLUMNS}))
+    for title, of_ladder in groupby(wordings, key=wording_title):
+        tables.append(_fitting(title, _LADDER_LEGEND, list(of_ladder), _LADDER))
     return Group(*tables, *(Text(note, style="yellow") for note in notes))
 
 
@@ -91,6 +99,15 @@ _SITE_LEGEND = (
     "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
     "of which the first sees no action yet; p family-wise"
 )
+
+_LADDER_LEGEND = (
+    "only one: episodes right in the first wording alone, and in the second alone; p: McNemar, exact; by group: "
+    "items that share pictures count once; Holm: that, for all pairs of the category"
+)
+
+_LADDER: dict[str, Sequence[tuple[str, Callable[[WordingPair], str]]]] = {
+    "Same items, same seeds": WORDING_COLUMNS
+}
 
 _SUCCESS: dict[str, Sequence[Column]] = {
     "Does it act on the answer?": [
@@ -135,7 +152,7 @@ def _of_run(
     return _fitting(title, "; ".join([_sizes(rows), *notes]), rows, parts)
 
 
-def _fitting[Row: (RetentionRow, Difference)](
+def _fitting[Row: (RetentionRow, Difference, WordingPair)](
     title: str,
     caption: str,
     rows: Sequence[Row],

@@ -8,6 +8,7 @@ from probe_kit.retention.cells import (
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
     FURTHER_RETENTION,
+    WORDING_COLUMNS,
     Column,
     action_place,
     beats,
@@ -27,9 +28,11 @@ from probe_kit.retention.cells import (
     success_interval,
     title,
     with_limits,
+    wording_title,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.wordings import WordingPair
 
 SUCCESS_COLUMNS: list[Column] = [
     ("model", model_name),
@@ -69,9 +72,12 @@ RETENTION_COLUMNS: list[Column] = [
 
 
 def markdown(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference] = (),
+    notes: Sequence[str] = (),
+    wordings: Sequence[WordingPair] = (),
 ) -> str:
-    """Success rates and, where there are any, retention, controls, differences between groups and notes."""
+    """Success rates and, where there are any, retention, controls, differences, wordings and notes."""
     parts = [_rows_table("Success rate", once_per_category(rows), SUCCESS_COLUMNS)]
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
@@ -82,6 +88,9 @@ def markdown(
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
         parts.append(_markdown_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
+    for heading, of_run in groupby(wordings, key=wording_title):
+        ladder = [[row.category, *(cell(row) for _, cell in WORDING_COLUMNS)] for row in of_run]
+        parts.append(_markdown_table(heading, ["category", *(name for name, _ in WORDING_COLUMNS)], ladder))
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 

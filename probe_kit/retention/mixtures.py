@@ -29,6 +29,16 @@ def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
     ]
 
 
+def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
+    """A sentence for every run that was asked in several wordings: which one its rows are of."""
+    return [
+        f"Rows of {run.location} are of the wording {run.episodes['wording'].iloc[0]!r}; it was asked in "
+        f"{', '.join(names)} (--wording)."
+        for run in runs
+        if (names := getattr(run, "wordings", ()))
+    ]
+
+
 def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | None = None) -> list[str]:
     """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
 

@@ -11,6 +11,7 @@ from probe_kit.env.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.significance import chance_margin
+from probe_kit.train.reader import refuse_several_wordings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -102,8 +103,10 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
     episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
-    and `group_id` where items share pictures. Raises UsageError for an empty table.
+    and `group_id` where items share pictures. Raises UsageError for a table that is empty or of several
+    wordings.
     """
+    refuse_several_wordings(episodes)
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
     correct = episodes["outcome"] == "correct"

@@ -12,9 +12,10 @@ from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.frames import frame_of
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
-from probe_kit.retention.mixtures import mixed_episodes, mixed_settings
+from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_settings
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
+from probe_kit.retention.wordings import WordingPair, wording_pairs
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 from probe_kit.train.store import is_current, load_results
@@ -30,6 +31,7 @@ class RetentionTable:
 
     Runs are never averaged with each other, so no mean mixes suites. differences: between groups of runs, if any.
     results: the probes that the rows were made of, by `row.run`; figures and reports of the table draw these.
+    wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
     which runs have no probes, and which settings the rows mix.
     """
@@ -40,6 +42,7 @@ class RetentionTable:
     results: Mapping[str, ProbeResults] = field(default_factory=dict, repr=False)
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
+    wordings: list[WordingPair] = field(default_factory=list)
 
     def __repr__(self) -> str:
         from probe_kit.retention.notebook import table_text
@@ -79,11 +82,13 @@ class RetentionTable:
     def to_json(self) -> str:
         """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
 
-        With groups, an object with the lists `rows` and `differences`.
+        With groups, or runs in several wordings, an object with the lists `rows`, `differences` and `wordings`.
         """
         rows = [asdict(row) for row in self.all_rows]
-        differences = [asdict(row) for row in self.differences]
-        content = {"rows": rows, "differences": differences} if differences else rows
+        differences, wordings = [asdict(row) for row in self.differences], [asdict(row) for row in self.wordings]
+        beside = {"differences": differences} if differences else {}
+        beside |= {"wordings": wordings} if wordings else {}
+        content = {"rows": rows, **beside} if beside else rows
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
 
     def to_csv(self) -> str:
@@ -94,7 +99,7 @@ class RetentionTable:
         """Success rates, retention, controls and differences as Markdown tables."""
         from probe_kit.retention.markdown import markdown
 
-        return markdown(self.all_rows, self.differences, self.notes)
+        return markdown(self.all_rows, self.differences, self.notes, self.wordings)
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
@@ -106,7 +111,7 @@ class RetentionTable:
         """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.console import rich_tables
 
-        return rich_tables(self.all_rows, self.differences, self.notes)
+        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings)
 
 
 def retention(
@@ -144,11 +149,22 @@ def retention(
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
     differences = group_differences(by_group)
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
+    notes += chosen_wordings([run for _, run in listed])
     names = _distinct_labels([run for _, run in listed])
     rows, means = (
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
-    return RetentionTable(rows, means, differences, results, iterations, tuple(notes))
+    pairs = [pair for _, run in listed for pair in _wordings(run, names[str(run.location)])]
+    return RetentionTable(rows, means, differences, results, iterations, tuple(notes), pairs)
+
+
+def _wordings(run: RunReader, label: str) -> list[WordingPair]:
+    """The wordings of a run against each other; none for a run in its items' own words."""
+    names: Sequence[str] = getattr(run, "wordings", ())
+    if len(names) < 2:
+        return []
+    whole: RunReader = getattr(run, "whole", run)
+    return wording_pairs(whole.episodes, names, str(run.location), label)
 
 
 def _distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:

@@ -124,6 +124,7 @@ def _cache_key(options: Mapping[str, Any]) -> str:
         "categories",
         "grouping",
         "items",
+        "ladder",
         "making",
         "manifest",
         "pictures",

@@ -20,6 +20,7 @@ class Item:
 
     `left` and `right` speak of the *original* layout; the swapped layout is derived, never stored.
     `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
+    `wordings`: what else the item can be asked in, by name, see `suite.ladder`; no part of the item's identity.
     `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
     """
 
@@ -56,6 +57,7 @@ class Item:
     gen: dict[str, Any]
     schema_version: str = "1.0"
     side_word: bool = False
+    wordings: dict[str, str] = field(default_factory=dict)
     folder: Path = field(default=Path(), compare=False)
 
     def file_name(self, side: Side) -> str:
@@ -77,20 +79,31 @@ class Item:
         return cls(**{name: value for name, value in record.items() if name in names}, folder=folder)
 
     def to_json(self) -> dict[str, Any]:
-        """The item as one line of `metadata.jsonl`."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "folder"}
+        """The item as one line of `metadata.jsonl`; without other wordings it has no field for them."""
+        left_out = {"folder"} if self.wordings else {"folder", "wordings"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One rollout of an item in one layout."""
+    """One rollout of an item in one layout.
+
+    wording: the name of the wording that `item.instruction` is in, None where only its own was asked for.
+    """
 
     item: Item
     layout: Layout
+    wording: str | None = None
 
     @property
     def episode_id(self) -> str:
-        """`<item_id>:o` or `<item_id>:s`."""
+        """`<item_id>:o` or `<item_id>:s`, and `:<wording>` behind it for all but the item's own words."""
+        own = self.wording in (None, "knowledge")
+        return f"{self.item.item_id}:{self.layout[0]}" + ("" if own else f":{self.wording}")
+
+    @property
+    def seed_id(self) -> str:
+        """What seeds are derived from: the same in all wordings."""
         return f"{self.item.item_id}:{self.layout[0]}"
 
     @property

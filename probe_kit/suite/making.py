@@ -46,6 +46,7 @@ class Question(TypedDict):
     source: dict[str, Any]
     gen: dict[str, Any]
     side_word: NotRequired[bool]
+    wordings: NotRequired[dict[str, str]]
 
 
 def make_item(

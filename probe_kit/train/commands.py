@@ -57,6 +57,9 @@ def train(
             "--captured-calls."
         ),
     ] = "0",
+    wording: Annotated[
+        str | None, typer.Option(help="Of a run with several wordings: the one to probe; default its first.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[
         int | None,
@@ -76,8 +79,8 @@ def train(
     asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
     units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
     rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
-    opened = open_run(run, allow_partial=partial)
-    beside = None if twin is None else open_run(twin, allow_partial=partial)
+    opened = open_run(run, allow_partial=partial).in_wording(wording)
+    beside = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
     pictures = suite or _embedded_suite(opened)
     for number in _calls(call, opened):
         with progress() as bar:
@@ -136,6 +139,7 @@ def _facts(found: "Inventory") -> "Table":
         "suite": found.suite,
         "settings": found.settings_sha256[:12],
         "episodes": f"{found.episodes} of {found.planned}" * (missing > 0) or str(found.episodes),
+        "wordings": ", ".join(f"{name} {count}" for name, count in found.wordings.items()),
         "failed": str(found.failed or ""),
         "outcomes": outcomes,
         "categories": ", ".join(found.categories),

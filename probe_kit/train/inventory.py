@@ -1,7 +1,7 @@
 """What a run holds: `probe-kit run show`."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from probe_kit.errors import NoProbesError
@@ -39,7 +39,8 @@ class Inventory:
     """A run and what is stored with it.
 
     episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
-    in words. probes: oldest first. unfinished: finished sites of interrupted sweeps, by key.
+    in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone. probes:
+    oldest first. unfinished: finished sites of interrupted sweeps, by key.
     """
 
     run: str
@@ -56,10 +57,11 @@ class Inventory:
     streams: Mapping[str, str]
     probes: tuple[StoredProbes, ...]
     unfinished: Mapping[str, int]
+    wordings: Mapping[str, int] = field(default_factory=dict)
 
 
-def inventory(run: RunReader) -> Inventory:
-    """List what `run` holds; runs that were not made by probe_kit say less."""
+def inventory(run: Any) -> Inventory:
+    """List what `run`, a RunReader, holds; runs that were not made by probe_kit say less."""
     episodes = run.episodes
     return Inventory(
         run=str(run.location),
@@ -76,13 +78,20 @@ def inventory(run: RunReader) -> Inventory:
         streams={name: _words(run, name) for name in run.streams},
         probes=tuple(stored_probes(run)),
         unfinished=unfinished_sweeps(run.location),
+        wordings={name: len(run.in_wording(name).episodes) for name in getattr(run, "wordings", ())},
     )
 
 
-def stored_probes(run: RunReader) -> list[StoredProbes]:
+def _in_wordings(run: Any) -> list[Any]:
+    """The run in each of its wordings, which is what probes are fitted on; itself if it has none."""
+    return [run.in_wording(name) for name in getattr(run, "wordings", ())] or [run]
+
+
+def stored_probes(run: Any) -> list[StoredProbes]:
     """Every set of probe results of a run, oldest first."""
-    used = _used(run)
-    found = [_probes(run, key, header, used) for key, header in read_headers(run.location).items()]
+    readers = _in_wordings(run)
+    used = {_used(one) for one in readers}
+    found = [_probes(readers, key, header, used) for key, header in read_headers(run.location).items()]
     return sorted(found, key=lambda probes: (probes.created, probes.key))
 
 
@@ -93,12 +102,15 @@ def _used(run: RunReader) -> str | None:
         return None
 
 
-def _probes(run: RunReader, key: str, header: Mapping[str, Any], used: str | None) -> StoredProbes:
+def _probes(
+    readers: Sequence[RunReader], key: str, header: Mapping[str, Any], used: Collection[str | None]
+) -> StoredProbes:
     created = str(header.get("created", ""))
     if not _readable(header):
         return StoredProbes(key, "other version", created)
     settings = settings_of(header)
-    state = "used" if key == used else "other" if is_current(settings, run) else "other episodes"
+    current = any(is_current(settings, run) for run in readers)
+    state = "used" if key in used else "other" if current else "other episodes"
     return StoredProbes(
         key=key,
         state=state,
@@ -110,7 +122,7 @@ def _probes(run: RunReader, key: str, header: Mapping[str, Any], used: str | Non
         token_permutations=settings.token_permutations,
         seed=settings.seed,
         call=settings.call,
-        controls=_controls(run.location, key),
+        controls=_controls(readers[0].location, key),
     )
 
 

@@ -6,11 +6,22 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import UsageError
 from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+def refuse_several_wordings(episodes: "pd.DataFrame") -> None:
+    """Raise UsageError for episodes of several wordings: probes and success rates are of one."""
+    if "wording" in episodes and episodes["wording"].nunique() > 1:
+        there = ", ".join(dict.fromkeys(episodes["wording"].astype(str)))
+        raise UsageError(
+            f"the episodes were asked in several wordings ({there}); probes and success rates take one. Choose it "
+            "with --wording NAME, or `run.in_wording(NAME)` in Python"
+        )
 
 
 class Tokens(Protocol):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.identity import derive_seed
 from probe_kit.train.permutation import flip_items
+from probe_kit.train.reader import refuse_several_wordings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,8 +29,9 @@ TARGETS: dict[str, str] = {
 def target_labels(episodes: "pd.DataFrame", target: Target, seed: int) -> NDArray[np.int8]:
     """Label of every episode, (E,): 1 left, 0 right, −1 where the target is not defined.
 
-    Raises UsageError for an unknown target.
+    Raises UsageError for an unknown target, and for episodes of several wordings.
     """
+    refuse_several_wordings(episodes)
     if target == "chosen":
         return _left_is_one(episodes["side_placed"])
     labels = _left_is_one(episodes["side_correct"])

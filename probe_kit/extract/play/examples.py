@@ -1,19 +1,19 @@
 """What a model will be shown, before anything is played: token counts and requirements are known from it."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.observation import Observation
-from probe_kit.suite import Suite
 
 
-def example_observations(scene: SceneSpec, suite: Suite) -> list[Observation]:
-    """Per instruction of the suite one observation with a blank picture of the scene's size, in text order."""
+def example_observations(scene: SceneSpec, instructions: Iterable[str]) -> list[Observation]:
+    """Per instruction one observation with a blank picture of the scene's size."""
     blank, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
-    texts = sorted({item.instruction for item in suite.items})
-    return [Observation(blank, state, text, scene.intrinsics) for text in texts]
+    return [Observation(blank, state, text, scene.intrinsics) for text in instructions]
 
 
 def refuse_unfit(card: Card, batch: int, example: Observation) -> None:

@@ -80,10 +80,13 @@ def read_card(location: Location) -> dict[str, Any]:
 
 
 class Run:
-    """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order."""
+    """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
-    def __init__(self, location: Location) -> None:
-        self.location = location
+    wording: the only one whose episodes are shown, None for all; see `in_wording`.
+    """
+
+    def __init__(self, location: Location, wording: str | None = None) -> None:
+        self.location, self.wording = location, wording
         card = read_card(location)
         if card["schema_version"] not in READABLE:
             raise RunDamagedError(
@@ -173,6 +176,32 @@ class Run:
         """What changes numbers and is not the same for all episodes, such as `versions.torch`; mostly nothing."""
         return differences(self.provenances.values())
 
+    # -- wordings --------------------------------------------------------------------------------------
+
+    @property
+    def wordings(self) -> tuple[str, ...]:
+        """The wordings that items were asked in, as `--wordings` named them; empty for their own words alone."""
+        return tuple(self.settings.get("wordings", {}).get("names", ()))
+
+    def in_wording(self, wording: str | None = None) -> "Run":
+        """The same run with the episodes of one wording only, as probes and success rates take it.
+
+        wording: None for the first; a run in the items' own words is returned as it is. Raises UsageError for a
+        wording that was not asked.
+        """
+        if wording is None and not self.wordings:
+            return self
+        chosen = self.wordings[0] if wording is None else wording
+        if chosen not in self.wordings:
+            there = ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
+            raise UsageError(f"{self.location} has no wording {chosen!r}; it has {there}")
+        return Run(self.location, chosen)
+
+    @property
+    def whole(self) -> "Run":
+        """The same run with the episodes of all wordings."""
+        return self if self.wording is None else Run(self.location)
+
     @cached_property
     def _commits(self) -> dict[int, Commit]:
         return read_commits(self.location)
@@ -202,8 +231,20 @@ class Run:
 
     @cached_property
     def _plan(self) -> list[dict[str, Any]]:
+        return [e for e in self._whole_plan if self.wording is None or e["wording"] == self.wording]
+
+    @cached_property
+    def _whole_plan(self) -> list[dict[str, Any]]:
         episodes: list[dict[str, Any]] = json.loads(self.location.read(PLAN_FILE))["episodes"]
         return episodes
+
+    @cached_property
+    def _columns_rows(self) -> NDArray[np.intp] | slice:
+        """Which rows of the columns, which hold every committed episode, are those of `episodes`."""
+        if self.wording is None:
+            return slice(None)
+        sealed = [planned["episode"] for planned in self._whole_plan if planned["episode"] in self._commits]
+        return np.flatnonzero(np.isin(sealed, self._numbers))
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
@@ -316,7 +357,7 @@ class Run:
             self._note_slow_reading()
             index: tuple[Any, ...] = (slice(None), call, *stored.at(site), stored.views.index(view))
             return np.asarray(self._pooled(site.stream)[index])
-        return self._columns.column(stored, site, view, call)
+        return self._columns.column(stored, site, view, call)[self._columns_rows]
 
     @property
     def sealed(self) -> bool:
@@ -363,7 +404,7 @@ class Run:
                 dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
                 array = xr.DataArray(self._pooled(name), dims=dimensions)
             else:
-                array = self._columns.xarray(name)
+                array = self._columns.xarray(name).isel(episode=self._columns_rows)
             own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
             old = {"step": "call"} if "step" in array.dims else {}  # its name in runs of schema 1
             array = array.rename({**old, **own}).transpose("episode", "call", *own.values())

@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
-from probe_kit.suite.generators.figure import Figure, random_figure
+from probe_kit.suite.generators.figure import Figure, colored_outline, random_figure
 from probe_kit.suite.generators.generator import Concept, Generator
 from probe_kit.suite.generators.outlines import OUTLINES
 from probe_kit.suite.generators.palette import COLORS
@@ -24,4 +24,5 @@ COLOR = Generator(
     category="color",
     pairs=tuple(combinations([Concept(name, f"{name} shape") for name in COLORS], 2)),
     tiles=_tiles,
+    named=colored_outline,
 )

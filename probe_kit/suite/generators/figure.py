@@ -44,6 +44,11 @@ class Figure:
         return canvas.picture()
 
 
+def colored_outline(figure: Figure) -> str:
+    """The figure in words, such as "red circle"."""
+    return f"{figure.color} {figure.outline}"
+
+
 def random_figure(color: str, outline: str, style: Style, rng: np.random.Generator) -> Figure:
     """A figure of this colour and outline with everything else drawn from `rng`."""
     ink = jittered(COLORS[color], rng)

@@ -33,8 +33,11 @@ class Generator[C: Concept]:
     pairs: every two concepts that may lie side by side, each couple once.
     tiles: draws the two tiles of a couple. Whatever does not show the concepts must be drawn for both from
         the same distribution, because which of the two is asked for is decided elsewhere.
+    named: what a tile literally shows, in words that need no knowledge, for the wording `named`; empty where there
+        are none that say more than the concept does. None if the category has no such words.
     """
 
     category: str
     pairs: tuple[tuple[C, C], ...]
     tiles: Callable[[C, C, np.random.Generator], tuple[Tile, Tile]]
+    named: Callable[[Any], str] | None = None

@@ -24,6 +24,7 @@ _RING = 0.13
 _CONTRAST = 90  # a bare pictogram is thin
 _SERVICE_PAIRS_EACH = 6  # steps around the circle of services: each meets twelve others
 _PICTOGRAM_OF = {pictogram.name: pictogram for pictogram in PICTOGRAMS}
+_SHOWS = {pictogram.icon: pictogram.shows for pictogram in PICTOGRAMS}
 
 
 @dataclass(frozen=True)
@@ -98,4 +99,9 @@ def _pairs() -> tuple[tuple[Concept, Concept], ...]:
     return among_services + among_forbidden + mixed
 
 
-PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles)
+def _shown(board: Board) -> str:
+    shows = _SHOWS[board.icon]
+    return f"picture of the {shows}" if shows else ""
+
+
+PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles, named=_shown)

@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
-from probe_kit.suite.generators.figure import Figure, random_figure
+from probe_kit.suite.generators.figure import Figure, colored_outline, random_figure
 from probe_kit.suite.generators.generator import Concept, Generator
 from probe_kit.suite.generators.outlines import OUTLINES
 from probe_kit.suite.generators.palette import COLORS
@@ -42,4 +42,5 @@ SHAPE = Generator(
         if _distinct(one, other)
     ),
     tiles=_tiles,
+    named=colored_outline,
 )

@@ -13,11 +13,11 @@ from probe_kit.identity import sha256_json
 from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.generators import generators_of
 from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUITE_VERSIONS, Couple, draw_couples
-from probe_kit.suite.generators.generator import Tile
+from probe_kit.suite.generators.generator import Generator, Tile
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.making import Picture, make_item
 from probe_kit.suite.pictures import encode_png, pixels_sha256
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.wording import instruction_for, side_words
 
 ATTRIBUTION = "probe_kit"
 LICENSE = "Apache-2.0"
@@ -40,7 +40,8 @@ class Twins:
 
 def draw_twins(category: str, count: int, seed: int, version: int = DEFAULT_VERSION) -> Iterator[Twins]:
     """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
-    for number, couple in enumerate(islice(draw_couples(generators_of(version)[category], seed), count)):
+    generator = generators_of(version)[category]
+    for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
         pictures = _draw(category, couple.left_tile), _draw(category, couple.right_tile)
         gen = {
             "generator": category,
@@ -51,7 +52,7 @@ def draw_twins(category: str, count: int, seed: int, version: int = DEFAULT_VERS
             "right": pictures[1].tile,
         }
         sides: tuple[Side, Side] = ("left", "right") if couple.left_asked_first else ("right", "left")
-        first, second = (_item(couple, pictures, side, gen) for side in sides)
+        first, second = (_item(couple, pictures, side, gen, generator) for side in sides)
         yield Twins((first, second), pictures)
 
 
@@ -66,12 +67,19 @@ def _draw(category: str, tile: Tile) -> DrawnPicture:
     )
 
 
-def _item(couple: Couple, pictures: tuple[DrawnPicture, DrawnPicture], side: Side, gen: dict[str, Any]) -> Item:
+def _item(
+    couple: Couple,
+    pictures: tuple[DrawnPicture, DrawnPicture],
+    side: Side,
+    gen: dict[str, Any],
+    generator: Generator[Any],
+) -> Item:
     """The item that asks for what lies on `side`; its group is not known yet."""
     category = CATEGORIES[gen["generator"]]
     target, distractor = (couple.left, couple.right) if side == "left" else (couple.right, couple.left)
     pair_id = f"{SUITE_NAME}-{category.slug}-s{gen['seed']}-{gen['couple']:04d}"
     instruction = instruction_for(target.phrase, "the")
+    tiles = (couple.left_tile, couple.right_tile) if side == "left" else (couple.right_tile, couple.left_tile)
     return make_item(
         SUITE_NAME,
         category.slug,
@@ -101,4 +109,12 @@ def _item(couple: Couple, pictures: tuple[DrawnPicture, DrawnPicture], side: Sid
             "url": "",
         },
         gen=gen,
+        wordings=_wordings(generator, *tiles),
     )
+
+
+def _wordings(generator: Generator[Any], target: Tile, distractor: Tile) -> dict[str, str]:
+    """What else the item can be asked in; nothing if the words would fit both tiles or name a side."""
+    shown, beside = (generator.named(tile) if generator.named else "" for tile in (target, distractor))
+    tells = shown and shown != beside and not side_words(shown)
+    return {"named": instruction_for(shown, "the")} if tells else {}

@@ -7,6 +7,7 @@ from typing import Any
 
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
+from probe_kit.suite.ladder import WORDINGS
 from probe_kit.suite.validation.findings import Finding, error
 
 SCHEMA_MAJOR = "1"
@@ -23,7 +24,7 @@ _ENUMS: dict[str, tuple[str, ...]] = {
 }
 _TYPES: dict[str, type] = {"source": dict, "gen": dict, "redistributable": bool, "contains_real_face": bool}
 _CARD_TYPES: dict[str, type] = {"name": str, "version": str, "counts": dict, "content_sha256": str}
-_REQUIRED = [field.name for field in fields(Item) if field.default is MISSING]
+_REQUIRED = [f.name for f in fields(Item) if f.default is MISSING and f.default_factory is MISSING]
 
 
 def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
@@ -59,6 +60,19 @@ def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
             yield error("E02", where, f"field {name!r} is {record[name]!r}; expected one of {allowed}")
         elif name == "category" and not is_slug(record[name]):
             yield error("E02", where, f"field 'category' is {record[name]!r}; expected one like 'ripe-fruit'")
+    yield from _check_wordings(record.get("wordings", {}), where)
+
+
+def _check_wordings(wordings: object, where: str) -> Iterator[Finding]:
+    expected = f"texts by name: {', '.join(WORDINGS[1:])}"
+    if not isinstance(wordings, dict):
+        yield error("E02", where, f"field 'wordings' is {wordings!r}; expected {expected}")
+        return
+    for name, text in wordings.items():
+        if name not in WORDINGS[1:] or not isinstance(text, str) or not text.strip():
+            yield error("E02", where, f"wording {name!r} is {text!r}; expected {expected}")
+        elif (name == "side") != ("{side}" in text):
+            yield error("E02", where, f"wording {name!r} is {text!r}; 'side' alone contains '{{side}}', and must")
 
 
 def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:
