@@ -6,7 +6,7 @@ whole prompts; the adapter is given what stands between their frames.
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +32,7 @@ PIXELS, STREAMS, LOGITS = 1e-6, 3e-5, 2e-5
 """Tolerances, absolute."""
 LETTERS = ("A", "B")
 _INPUTS = ("pixel_values_index",)
-_DIMS = "dims.json"
+DIMS_FILE = "dims.json"
 # How the templates that references were recorded with mark a picture's place.
 _PLACEHOLDER = re.compile(r"<\|vision_end\|>|<IMG_CONTEXT>|<image>")
 
@@ -46,16 +46,21 @@ def verify_vlm(
 ) -> tuple[Comparison, ...]:
     """Compare a reference. further: outputs that only this family has. streams: tolerance of its activations."""
     reference = Reference(model, questions_of(folder, recorded, model), recorded)
-    produced = {**reference.produced(), **(further or {})}
+    return compare_all(recorded, {**reference.produced(), **(further or {})}, streams)
+
+
+def compare_all(
+    recorded: Arrays, produced: Mapping[str, Produce], streams: float = STREAMS
+) -> tuple[Comparison, ...]:
+    """Every recorded output with the tolerance of its kind; streams where `attention_mask` says so."""
     mask = dict.fromkeys(("backbone_resid", "backbone_final_norm"), recorded["attention_mask"].astype(bool))
     comparisons: list[Comparison] = []
     for name in sorted(recorded):
         if name.startswith("in_") or name in _INPUTS:
             continue
-        kind = _tolerance(name, streams)
-        valid = {name: mask[name]} if name in mask and len(mask[name].shape) < recorded[name].ndim else {}
-        relative = name.endswith("_sum")
-        comparisons += compare({name: recorded[name]}, produced, kind, valid, absolute=not relative)
+        valid = {name: mask[name]} if name in mask else {}
+        absolute = not name.endswith("_sum")
+        comparisons += compare({name: recorded[name]}, produced, _tolerance(name, streams), valid, absolute)
     return tuple(comparisons)
 
 
@@ -67,7 +72,7 @@ def _tolerance(name: str, streams: float) -> float:
 
 def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Question]:
     """The recorded questions with their pictures. Raises UsageError where they do not lie beside the reference."""
-    file = folder / _DIMS
+    file = folder / DIMS_FILE
     if not file.is_file():
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
     rows = json.loads(file.read_text())["rows"]
@@ -200,9 +205,16 @@ class Reference:
         length = self.recorded["greedy_ids"].shape[1]
         with torch.inference_mode():
             said = self.heard[1].speak(length, self.model.text.ends).numpy()
-        padded = np.full((len(said), length), self.model.text.padding)
-        for row, ids in enumerate(said):
-            over = np.isin(ids, list(self.model.text.ends))
-            stop = int(over.argmax()) + 1 if over.any() else len(ids)
-            padded[row, :stop] = ids[:stop]
-        return padded
+        return padded_answers(said, length, self.model.text.ends, self.model.text.padding)
+
+
+def padded_answers(
+    said: Sequence[NDArray[np.int64]] | NDArray[np.int64], length: int, ends: Collection[int], padding: int
+) -> NDArray[np.int64]:
+    """(B, length) ids, each row up to and with its end, padded behind it."""
+    padded = np.full((len(said), length), padding)
+    for row, ids in enumerate(said):
+        over = np.isin(ids, list(ends))
+        stop = int(over.argmax()) + 1 if over.any() else len(ids)
+        padded[row, :stop] = ids[:stop]
+    return padded

@@ -58,9 +58,10 @@ class OvisPictures:
     def _cut(self, picture: NDArray[np.uint8], grid: tuple[int, int]) -> NDArray[np.float32]:
         tall, wide = grid[0] * self.patch, grid[1] * self.patch
         resampling = Image.Resampling(int(self.settings["resample"]))
-        pixels = np.asarray(Image.fromarray(picture).resize((wide, tall), resampling), np.float32)
+        pixels = np.asarray(Image.fromarray(picture).resize((wide, tall), resampling), np.float64)
         mean, deviation = (np.asarray(self.settings[name], np.float32) for name in ("image_mean", "image_std"))
-        normalised = (pixels * np.float32(self.settings["rescale_factor"]) - mean) / deviation
+        scaled = (pixels * float(self.settings["rescale_factor"])).astype(np.float32)
+        normalised = (scaled - mean) / deviation
         side = self.stride
         cut = normalised.reshape(
             grid[0] // side, side, self.patch, grid[1] // side, side, self.patch, 3

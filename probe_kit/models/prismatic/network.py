@@ -33,10 +33,16 @@ class Projector(nn.Module):
 
 @dataclass(frozen=True)
 class Decoded:
-    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them."""
+    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them.
+
+    Before the last of them is fed: mask (B, S + N - 1), positions (B, 1) of the last tokens, keys and values.
+    """
 
     ids: Tensor
     logits: Tensor
+    mask: Tensor
+    last: Tensor
+    cache: Any
 
 
 class PrismaticNetwork(nn.Module):
@@ -89,7 +95,7 @@ class PrismaticNetwork(nn.Module):
         positions = _positions(mask)
         chosen: list[Tensor] = []
         logits: list[Tensor] = []
-        for _ in range(steps):
+        while True:
             output = self.language_model(
                 inputs_embeds=embeddings,
                 position_ids=positions,
@@ -100,10 +106,12 @@ class PrismaticNetwork(nn.Module):
             )
             logits.append(output.logits[:, -1])
             chosen.append(logits[-1].argmax(dim=-1))
+            if len(chosen) == steps:
+                break
             embeddings = self.language_model.get_input_embeddings()(chosen[-1][:, None])
             positions = positions[:, -1:] + 1
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1))
+        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1), mask, positions[:, -1:], cache)
 
 
 def _positions(mask: Tensor) -> Tensor:

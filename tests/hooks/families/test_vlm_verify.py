@@ -23,6 +23,11 @@ COMMON = {
     "backbone_final_norm", "logits_last", "single_logits_last", "option_ids", "option_logits", "greedy_ids",
     "textonly_input_ids", "textonly_logits_last", "vision_resid_row0",
 }  # fmt: skip
+ASKED_PRISMATIC = {
+    "input_ids", "input_mask", "attention_mask", "pixel_values", "projector_features", "backbone_resid",
+    "backbone_final_norm", "logits_last", "batch_logits_last", "option_ids", "option_logits", "greedy_ids",
+    "textonly_input_ids", "textonly_logits_last",
+}  # fmt: skip
 UNSAID = {"greedy_ids_hub_settings"}
 """What is said with the penalties of a file that the tool does not follow."""
 
@@ -34,6 +39,13 @@ def test_every_recorded_output_is_reproduced(family: str, golden_vlm: Path) -> N
     assert verification.passed
     assert {name for name, found in status.items() if found == "ok"} >= COMMON
     assert {name for name, found in status.items() if found != "ok"} == UNSAID
+
+
+def test_prismatic_is_reproduced_answering_too(golden_vlm: Path) -> None:
+    """Its other reference, of one prompt, has other names."""
+    verification = verify_reference("prismatic", golden_vlm / "prismatic")
+    assert {c.output for c in verification.comparisons if c.status == "ok"} == ASKED_PRISMATIC
+    assert len(verification.comparisons) == len(ASKED_PRISMATIC)
 
 
 def test_one_wrong_number_or_id_in_the_reference_is_noticed(golden_vlm: Path, tmp_path: Path) -> None:

@@ -20,7 +20,9 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
+from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.families.vlm_decoding import Prefill
 from probe_kit.hooks.model import Model, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
@@ -30,8 +32,6 @@ from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
 
 CAMERA = "primary"
-# The frame around a question that prism-dinosiglip-224px+7b and its siblings without a chat were trained with.
-_FRAME = "In: {}\nOut:"
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
@@ -140,10 +140,8 @@ class PrismaticModel(Model):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
-        return self._roles([self.prompt(observation.instruction) for observation in seen], self.network.patches)
-
-    def _roles(self, rows: Sequence[Sequence[int]], patches: int) -> dict[str, list[Roles]]:
-        longest, special = max(map(len, rows)), self.tokenizer.special
+        rows = [self.prompt(observation.instruction) for observation in seen]
+        longest, special, patches = max(map(len, rows)), self.tokenizer.special, self.network.patches
         image = [f"image.{CAMERA}"] * patches
         backbone = []
         for first, *text, _ in rows:
@@ -194,12 +192,20 @@ class Prismatic(PrismaticModel, Reader):
 
     @property
     def lead(self) -> str:
-        """A space, as behind "Out:" words begin with one; none for bytes, where it would be a token of its own."""
+        """A space, as words begin with one behind every frame; none for bytes, where it is a token of its own."""
         return "" if isinstance(self.tokenizer, ByteTokenizer) else " "
+
+    def _settings(self, tokenizer: str | None) -> dict[str, str]:
+        return {**super()._settings(tokenizer), "frame": self.frame.around("[question]")}
+
+    @cached_property
+    def frame(self) -> TextFrame:
+        """What the language model was trained to find around a question."""
+        return frame_of(self.config.language_id)
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of a question in the frame around it."""
-        return self.tokenizer.encode(_FRAME.format(instruction))
+        return self.tokenizer.encode(self.frame.around(instruction))
 
     def read(self, questions: Sequence[Question]) -> Reading:
         """One prefill; see the contract. Raises UsageError if the model was loaded for more than one step."""
@@ -207,39 +213,59 @@ class Prismatic(PrismaticModel, Reader):
             raise UsageError(
                 f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
             )
-        self.check([question.seen for question in questions])
-        texts = _asked(questions)
-        rows = [self.tokenizer.encode(text) for text in texts]
+        texts = [self._asked(question) for question in questions]
         options = [
             [id_behind(self.tokenizer, text, option) for option in question.options]
             for text, question in zip(texts, questions, strict=True)
         ]
+        prefill = self.prefill(questions)
+        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+
+    def prefill(self, questions: Sequence[Question]) -> Prefill:
+        """One pass over all questions."""
+        self.check([question.seen for question in questions])
         pixels = None
         if self.shows_pictures(questions):
             pixels = self.pixel_values(question.seen.image for question in questions)
-        logits = self.generate(pixels, rows).logits[:, 0].float().cpu()
-        return Reading.of(logits.numpy(), options, (pixels, rows))
+        decoded = self.generate(pixels, [self.tokenizer.encode(self._asked(question)) for question in questions])
+        return Prefill(
+            self.network.language_model, decoded.mask.long(), decoded.last, decoded.logits[:, 0], decoded.cache
+        )
+
+    def _asked(self, question: Question) -> str:
+        return self.frame.around(question.text) + question.begun
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Of the observations' instructions as questions."""
+        return self.asked_roles([Question(one, one.instruction) for one in seen])
 
     def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
-        """As `roles`; how an answer has begun is language too."""
-        rows = [self.tokenizer.encode(text) for text in _asked(questions)]
-        return self._roles(rows, self.network.patches if self.shows_pictures(questions) else 0)
+        """Everything around picture and question is `special`, how an answer has begun too."""
+        shown = self.network.patches if self.shows_pictures(questions) else 0
+        image = [f"image.{CAMERA}"] * shown
+        rows = []
+        for question in questions:
+            inside = self.tokenizer.inside(self._asked(question), *self.frame.place(question.text))
+            labels = ["language" if asked else "special" for asked in inside]
+            rows.append([*labels[:1], *image, *labels[1:-1]])
+        longest = max(map(len, rows))
+        backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
+        return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Greedy text behind every prompt, up to its end-of-sequence token; see the contract."""
-        pixels, rows = reading.state
-        if tokens < 1:
-            return [""] * len(rows)
-        packed, device = self.pack(rows), self.loaded.device
+        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
+        if not isinstance(reading.state, Prefill) or reading.state.network is not self.network.language_model:
+            raise UsageError("this reading does not come from this model; pass what its read() returned")
         with torch.inference_mode():
-            decoded = self.network.decode(packed.ids.to(device), packed.mask.to(device), pixels, tokens)
+            ids = reading.state.speak(tokens, self.ends)
+        said = [list(takewhile(lambda number: number not in self.ends, row)) for row in ids.tolist()]
+        return [self.tokenizer.decode(row) for row in said]
+
+    @cached_property
+    def ends(self) -> frozenset[int]:
+        """Ids that end an answer."""
         end = self.config.text.eos_token_id
-        spoken = [list(takewhile(lambda number: number != end, row)) for row in decoded.ids.tolist()]
-        return [self.tokenizer.decode(row) for row in spoken]
-
-
-def _asked(questions: Sequence[Question]) -> list[str]:
-    return [_FRAME.format(question.text) + question.begun for question in questions]
+        return frozenset(int(number) for number in (end if isinstance(end, list) else [end]) if number is not None)
 
 
 def load_prismatic(

@@ -29,6 +29,9 @@ class TextTokenizer(Protocol):
     def encode(self, text: str) -> list[int]:
         """Ids, the beginning-of-sequence token first. Raises InstructionError for a word it does not know."""
 
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id of `encode(text)` whether it holds any of the characters from `start` to `stop`."""
+
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids that the model put out, without special tokens."""
 
@@ -90,6 +93,15 @@ class FileTokenizer:
             )
         return ids
 
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
+        encoding = self._tokenizer.encode(text)
+        found = [
+            first < stop and last > start and not special
+            for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
+        ]
+        return [False] * (len(self.encode(text)) - len(found)) + found
+
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids, without special tokens."""
         return str(self._tokenizer.decode(list(ids), skip_special_tokens=True)).strip()
@@ -112,6 +124,11 @@ class ByteTokenizer:
     def encode(self, text: str) -> list[int]:
         """Ids, the beginning-of-sequence token first."""
         return [self.beginning, *(3 + byte for byte in text.encode())]
+
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id whether it is a byte of these characters."""
+        before, held = (len(part.encode()) for part in (text[:start], text[start:stop]))
+        return [False] + [before <= place < before + held for place in range(len(text.encode()))]
 
     def decode(self, ids: Sequence[int]) -> str:
         """The bytes among the ids as text."""

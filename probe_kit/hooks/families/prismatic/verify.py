@@ -18,6 +18,7 @@ from probe_kit.hooks.capture_context import Tape, capture
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.openvla.adapter import OpenVLA, load_openvla
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, load_prismatic
+from probe_kit.hooks.families.prismatic.verify_asked import verify_asked
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.verify import Comparison, Produce, compare
 from probe_kit.models.prismatic import PrismaticConfig, prepare_picture
@@ -32,7 +33,9 @@ _ACTION = "action_"
 
 
 def verify_prismatic(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a reference of a vision-language model."""
+    """Compare a reference of a vision-language model: of one prompt, or of several questions."""
+    if "in_rows_picture" in recorded:
+        return verify_asked(load_prismatic(str(folder / "checkpoint"), dtype="float32"), folder, recorded)
     steps = recorded["generated_ids"].size if "generated_ids" in recorded else 1
     model = load_prismatic(str(folder / "checkpoint"), steps=steps)
     return _compare(model, recorded, _Reference(model, recorded).produced())

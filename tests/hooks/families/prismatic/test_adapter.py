@@ -9,6 +9,7 @@ import torch
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Question, Site, capture, load_model, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
+from probe_kit.hooks.families.prismatic.frames import frame_of
 from probe_kit.hooks.testing import ReaderContract
 from probe_kit.hooks.verify import verify_reference
 from tests.prismatic_checkpoints import write_checkpoint, write_tokenizer
@@ -64,18 +65,56 @@ def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, 
 
 
 def test_roles_name_what_every_position_is(model: Prismatic, observation: Observation) -> None:
-    """Beginning, patches, then a byte per letter; the last one belongs to the other stream."""
+    """Beginning, patches, then a byte per letter; the last one belongs to the other stream. The frame is Phi's."""
     asked = replace(observation, instruction="Why?")
     longer = replace(observation, instruction="Why not?")
     short, long = model.roles([asked, longer])["backbone"]
-    patches, prompt = model.network.patches, len("In: Why?\nOut:")
+    patches, prompt, start = model.network.patches, len("Input: Why?\nOutput:"), len("Input: ")
     assert short.spans == (
         ("special", 0, 1),
         ("image.primary", 1, 1 + patches),
-        ("language", 1 + patches, patches + prompt),
+        ("special", 1 + patches, 1 + patches + start),
+        ("language", 1 + patches + start, 1 + patches + start + 4),
+        ("special", 1 + patches + start + 4, patches + prompt),
         ("padding", patches + prompt, 4 + patches + prompt),
     )
     assert len(short) == len(long)
+
+
+@pytest.mark.parametrize(
+    ("language", "text"),
+    [
+        ("llama2-7b-pure", "In: Why?\nOut:"),
+        ("mistral-v0.1-7b-pure", "In: Why?\nOut:"),
+        ("mistral-v0.1-7b-instruct", "[INST] Why? [/INST]"),
+        ("phi-2-3b", "Input: Why?\nOutput:"),
+    ],
+)
+def test_a_question_stands_in_the_frame_of_the_language_model(language: str, text: str) -> None:
+    frame = frame_of(language)
+    assert frame.around(" Why? ") == text
+    start, stop = frame.place(" Why? ")
+    assert text[start:stop] == "Why?"
+
+
+@pytest.mark.parametrize("language", ["vicuna-v15-7b", "llama2-7b-chat"])
+def test_chats_begin_with_their_system_prompt(language: str) -> None:
+    text = frame_of(language).around("Why?")
+    assert "assistant" in text
+    assert text.endswith(("USER: Why? ASSISTANT:", "\n<</SYS>>\n\nWhy? [/INST]"))
+
+
+def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Observation) -> None:
+    """Against as many steps of one decoding, and without the towers being run once more."""
+    folder = str(write_checkpoint(tmp_path, model_type="prismatic"))
+    reader, whole = (load_prismatic(folder, tokenizer="bytes", steps=steps) for steps in (1, 6))
+    reading = reader.read([Question(observation, "Which?", ("A", "B"))])
+    decoded = whole.generate(whole.pixel_values([observation.image]), [whole.prompt("Which?")])
+    with torch.inference_mode():
+        said = reading.state.speak(6, frozenset())
+    assert said.tolist() == decoded.ids.tolist()
+    with pytest.raises(UsageError, match="does not come from this model"):
+        whole.speak(reading, 3)
 
 
 class TestPrismatic(ReaderContract):

@@ -1,0 +1,134 @@
+"""What Prismatic can be compared in when it was recorded answering questions.
+
+B rows, T text tokens, P patches, L blocks, D width. Recorded rows were read alone and are padded in front; ids are
+recorded without the picture's positions and padded behind.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.families.prismatic.adapter import Prismatic
+from probe_kit.hooks.families.prismatic.tokenizer import id_behind
+from probe_kit.hooks.families.recording import numpy_of
+from probe_kit.hooks.families.vlm_decoding import Prefill
+from probe_kit.hooks.families.vlm_verify import DIMS_FILE, LETTERS, compare_all, padded_answers
+from probe_kit.hooks.model import Question
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.sites import Site
+from probe_kit.hooks.verify import Comparison, Produce
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
+    """Compare a reference. Raises UsageError where its questions do not lie beside it."""
+    file = folder / DIMS_FILE
+    if not file.is_file():
+        raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
+    frame = model.frame
+    questions = [
+        Question(
+            Observation(recorded[f"in_picture_{int(number)}"], np.zeros(8, np.float32), ""),
+            row["text"].removeprefix(frame.before).removesuffix(frame.behind),
+            tuple(model.lead + letter for letter in LETTERS),
+        )
+        for row, number in zip(json.loads(file.read_text())["rows"], recorded["in_rows_picture"], strict=True)
+    ]
+    return compare_all(recorded, _Asked(model, questions, recorded).produced())
+
+
+class _Asked:
+    """The recorded questions, run through the adapter when something asks for what comes of them."""
+
+    def __init__(self, model: Prismatic, questions: Sequence[Question], recorded: Arrays) -> None:
+        self.model, self.questions, self.recorded = model, questions, recorded
+
+    @cached_property
+    def heard(self) -> list[tuple[Tape, Prefill]]:
+        """Every row alone, with everything that is stored of it."""
+        rows = []
+        for question in self.questions:
+            with capture(self.model, [*self.model.sites(), *self.model.sites("final_norm")]) as tape:
+                prefill = self.model.prefill([question])
+            rows.append((tape, prefill))
+        return rows
+
+    @property
+    def prompts(self) -> list[list[int]]:
+        """Ids of every row."""
+        return [self.model.prompt(question.text) for question in self.questions]
+
+    @cached_property
+    def pixels(self) -> torch.Tensor:
+        """The pictures of all rows."""
+        return self.model.pixel_values(question.seen.image for question in self.questions)
+
+    def produced(self) -> dict[str, Produce]:
+        """How to make every output the adapter can make."""
+        model, padding = self.model, int(self.model.config.text.pad_token_id or 0)
+        lengths = [len(row) for row in self.prompts]
+        bare = replace(self.questions[0], pictured=False)
+
+        def behind(rows: Sequence[Sequence[int]], value: int) -> NDArray[np.int64]:
+            return np.array([[*row, *[value] * (max(lengths) - len(row))] for row in rows])
+
+        def options() -> NDArray[Any]:
+            text = model.frame.around(self.questions[0].text)
+            return np.array([id_behind(model.tokenizer, text, option) for option in self.questions[0].options])
+
+        return {
+            "input_ids": lambda: behind(self.prompts, padding),
+            "input_mask": lambda: behind([[1] * length for length in lengths], 0),
+            "attention_mask": lambda: self._in_front([np.ones(n + model.network.patches, int) for n in lengths]),
+            "pixel_values": lambda: numpy_of(self.pixels),
+            "projector_features": self._projected,
+            "backbone_resid": lambda: self._streams(range(model.streams["backbone"].layers), "residual"),
+            "backbone_final_norm": lambda: self._streams([model.streams["backbone"].layers - 1], "final_norm")[0],
+            "logits_last": lambda: numpy_of(torch.cat([prefill.logits for _, prefill in self.heard])),
+            "batch_logits_last": lambda: numpy_of(model.prefill(self.questions).logits),
+            "option_ids": options,
+            "option_logits": lambda: model.read(self.questions).option_logits,
+            "textonly_input_ids": lambda: np.array([self.prompts[0]]),
+            "textonly_logits_last": lambda: numpy_of(model.prefill([bare]).logits),
+            "greedy_ids": self._greedy,
+        }
+
+    @torch.inference_mode()
+    def _projected(self) -> NDArray[Any]:
+        network = self.model.network
+        return numpy_of(network.projector(network.vision_backbone(self.pixels)))
+
+    def _streams(self, layers: Sequence[int], quantity: str) -> NDArray[Any]:
+        """(layers, B, P + T, D)."""
+        rows = []
+        for tape, _ in self.heard:
+            parts = [
+                torch.stack([tape[Site(stream, layer, quantity, step)][0] for layer in layers])
+                for stream, step in (("backbone", None), (self.model.output, 0))
+            ]
+            rows.append(numpy_of(torch.cat(parts, dim=1)).transpose(1, 0, 2))
+        return self._in_front(rows).transpose(2, 0, 1, 3)
+
+    @staticmethod
+    def _in_front(rows: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """(B, longest, …) with zeros in front of shorter rows."""
+        longest = max(map(len, rows))
+        return np.stack([
+            np.concatenate([np.zeros((longest - len(row), *row.shape[1:]), row.dtype), row]) for row in rows
+        ])  # fmt: skip
+
+    def _greedy(self) -> NDArray[np.int64]:
+        length, text = self.recorded["greedy_ids"].shape[1], self.model.config.text
+        with torch.inference_mode():
+            said = [prefill.speak(length, self.model.ends)[0].numpy() for _, prefill in self.heard]
+        return padded_answers(said, length, self.model.ends, int(text.pad_token_id or 0))
