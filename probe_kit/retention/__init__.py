@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.retention.call_curves import event_calls
     from probe_kit.retention.differences import Difference
     from probe_kit.retention.displays import (
+        CallCurveDisplay,
         FinalPositionsDisplay,
         IterationMapDisplay,
         KnowledgeActionDisplay,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from probe_kit.statistics.significance import chance_margin
 
 __all__ = [
+    "CallCurveDisplay",
     "Difference",
     "FinalPositionsDisplay",
     "IterationMapDisplay",
@@ -56,6 +59,7 @@ __all__ = [
     "SuccessTableDisplay",
     "best_site",
     "chance_margin",
+    "event_calls",
     "layer_curve",
     "measure_retention",
     "normalised_score",
@@ -68,6 +72,8 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "CallCurveDisplay": "displays",
+        "event_calls": "call_curves",
         "Difference": "differences",
         "FinalPositionsDisplay": "displays",
         "IterationMapDisplay": "displays",

@@ -13,10 +13,11 @@ from probe_kit.retention.measure import best_site
 from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
 from probe_kit.train.controls import signal
 from probe_kit.train.curve import Curve
-from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 
 Shares = NDArray[np.float64]
+EventCalls = Mapping[str, Mapping[str, int]]
+"""Per event, by episode id, the captured inference before it."""
 _ENOUGH = 20  # relabellings, fewer than which have no 95 % point
 
 
@@ -74,20 +75,19 @@ FEWEST = 10
 class CallCurves:
     """One category in one view over the captured inferences of a run.
 
-    results: the probes by call. calls_of: per event, by episode id, the inference before it; empty for runs that
-    keep no trajectories.
+    results: the probes by call. events: when they fell due, as `event_calls` says; empty without trajectories.
     """
 
     results: Mapping[int, ProbeResults]
     category: str
     view: str
-    calls_of: Mapping[str, Mapping[str, int]]
+    events: EventCalls
 
     @classmethod
     def of(
-        cls, results: Mapping[int, ProbeResults], category: str, view: str, run: RunReader | None = None
+        cls, results: Mapping[int, ProbeResults], category: str, view: str, events: EventCalls | None = None
     ) -> Self:
-        """From probes by call, as `load_calls` gives them. run: for its trajectories, if it keeps any.
+        """From probes by call, as `load_calls` gives them. events: as `event_calls` gives them.
 
         Raises UsageError for probes of a single call, or without that category and view.
         """
@@ -98,7 +98,7 @@ class CallCurves:
             )
         if lacking := [call for call, one in results.items() if (category, view) not in one.curves]:
             raise UsageError(f"call {lacking[0]} has no probes of category {category!r} in view {view!r}")
-        return cls(results, category, view, {} if run is None else event_calls(run, category))
+        return cls(results, category, view, events or {})
 
     @property
     def chance(self) -> float:
@@ -125,7 +125,7 @@ class CallCurves:
         for call, curve in self._curves.items():
             right = curve.correct[curve.best(stream)]
             for episode, group, hit in zip(curve.episodes, curve.groups, right, strict=True):
-                due = self.calls_of.get(event, {}).get(str(episode))
+                due = self.events.get(event, {}).get(str(episode))
                 if due is not None:
                     pools.setdefault(call - due, []).append((str(group), bool(hit)))
         kept = {offset: pools[offset] for offset in sorted(pools) if len(pools[offset]) >= FEWEST}
@@ -141,12 +141,13 @@ class CallCurves:
 
     def event_times(self) -> list[EventTimes]:
         """When the events of this category's episodes fell due; those that no episode has are left out."""
-        n = len(self._curves[min(self._curves)].episodes)
+        own = self._curves[min(self._curves)].episodes
         found = []
-        for event, calls in self.calls_of.items():
-            if calls:
-                low, median, high = np.percentile(list(calls.values()), [25, 50, 75])
-                found.append(EventTimes(event, float(median), float(low), float(high), len(calls) / n))
+        for event, calls in self.events.items():
+            due = [calls[str(episode)] for episode in own if str(episode) in calls]
+            if due:
+                low, median, high = np.percentile(due, [25, 50, 75])
+                found.append(EventTimes(event, float(median), float(low), float(high), len(due) / len(own)))
         return found
 
     @property
@@ -178,7 +179,7 @@ class CallCurves:
         )
 
 
-def event_calls(run: Any, category: str) -> dict[str, dict[str, int]]:
+def event_calls(run: Any) -> EventCalls:
     """Per event, by episode id, the last inference before the action that brought it about.
 
     Nothing for a run without trajectories. Inference c decides actions c · k + 1 to (c + 1) · k, with k actions
@@ -188,12 +189,8 @@ def event_calls(run: Any, category: str) -> dict[str, dict[str, int]]:
         return {}
     executed = int(run.settings["execute"])
     found: dict[str, dict[str, int]] = {event: {} for event in EVENTS}
-    for position, (episode, own) in enumerate(
-        zip(run.episodes["episode_id"], run.episodes["category"], strict=True)
-    ):
-        if own != category:
-            continue
-        events = Events.of(run.trajectories[position])
+    for episode, trajectory in zip(run.episodes["episode_id"], run.trajectories, strict=True):
+        events = Events.of(trajectory)
         for event in EVENTS:
             frame = events.frame(event)
             if frame is not None and frame > 0:

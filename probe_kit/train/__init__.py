@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.array_run import ArrayRun
     from probe_kit.train.baselines import BASELINES, Baseline
+    from probe_kit.train.calls import load_calls
     from probe_kit.train.controls import BaselineScore, Controls, Excess, TwinScore
     from probe_kit.train.curve import Curve
     from probe_kit.train.directions import Direction
@@ -41,6 +42,7 @@ __all__ = [
     "RunReader",
     "Target",
     "TwinScore",
+    "load_calls",
     "load_results",
     "save_results",
     "train_probes",
@@ -69,6 +71,7 @@ __getattr__ = lazy_names(
         "TARGETS": "targets",
         "Target": "targets",
         "TwinScore": "controls",
+        "load_calls": "calls",
         "load_results": "store",
         "save_results": "store",
         "train_probes": "sweep",

@@ -17,6 +17,7 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.retention.call_curves import CallCurves
+from probe_kit.retention.displays import gallery
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.calls import load_calls
@@ -125,6 +126,8 @@ def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     line = CallCurves.of(calls, "all", "mean").line("backbone")
     assert line.episodes.tolist() == [int(run.reached(call).sum()) for call in range(CALLS)]
     assert line.accuracy[1] > 0.85 > line.accuracy[0]
+    exhibits = gallery([run], retention([run], keys=[first.key]))
+    assert f"{run.location.name}-calls" in [exhibit.name for exhibit in exhibits]
 
 
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")

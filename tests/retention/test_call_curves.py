@@ -82,20 +82,19 @@ def test_a_line_has_the_best_site_of_every_call_filled_where_it_is_evidence(
 
 
 def test_an_event_falls_to_the_inference_before_the_action_that_brought_it_about(watched: Any) -> None:
-    calls = event_calls(watched, "color")
+    calls = event_calls(watched)
     assert set(calls) == set(EVENTS)
     assert sorted(set(calls["grasp"].values())) == [0, 2]
     assert calls["release"] == {}
-    assert event_calls(watched, "shape")["grasp"] == {}
     for action, call in ((1, 0), (4, 0), (5, 1), (8, 1), (9, 2)):
         watched.trajectories = [still(action)] * len(watched.episodes)
-        assert set(event_calls(watched, "color")["grasp"].values()) == {call}, action
+        assert set(event_calls(watched)["grasp"].values()) == {call}, action
 
 
 def test_aligned_accuracies_pool_the_calls_at_one_distance_from_the_event(
     by_call: dict[int, ProbeResults], watched: Any
 ) -> None:
-    curves = CallCurves.of(by_call, "color", "mean", watched)
+    curves = CallCurves.of(by_call, "color", "mean", event_calls(watched))
     line = curves.aligned("backbone", "grasp")
     assert line is not None
     assert line.offsets.tolist() == [-2, -1, 0, 1, 2, 3]
@@ -116,7 +115,9 @@ def test_aligned_accuracies_pool_the_calls_at_one_distance_from_the_event(
 def test_a_run_without_trajectories_has_curves_and_no_events(
     by_call: dict[int, ProbeResults], tmp_path: Path
 ) -> None:
-    display = CallCurveDisplay.from_results(by_call, "color", run=SimpleNamespace(has_trajectories=False))
+    display = CallCurveDisplay.from_results(
+        by_call, "color", events=event_calls(SimpleNamespace(has_trajectories=False))
+    )
     assert display.events == ()
     with pytest.raises(UsageError, match="event 'grasp', or no trajectories; there are: none"):
         display.plot_aligned("grasp")
@@ -124,15 +125,15 @@ def test_a_run_without_trajectories_has_curves_and_no_events(
 
 
 def test_figures_name_events_and_what_they_are_of(by_call: dict[int, ProbeResults], watched: Any) -> None:
-    figure = call_curves(by_call, run=watched)
+    figure = call_curves(by_call, events=event_calls(watched))
     axes = figure.axes[0]
     assert "grasp" in {text.get_text() for text in axes.texts}
     assert axes.get_xlabel().startswith("call (captured inference")
-    around = aligned_curves(by_call, "grasp", run=watched)
+    around = aligned_curves(by_call, "grasp", events=event_calls(watched))
     assert around.axes[0].get_title(loc="left") == "color: grasp"
     assert "pi0" in around.caption  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="'release'"):
-        aligned_curves(by_call, "release", run=watched)
+        aligned_curves(by_call, "release", events=event_calls(watched))
 
 
 def test_one_call_is_no_curve(by_call: dict[int, ProbeResults]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import label_of
-from probe_kit.retention.call_curves import AlignedLine, CallCurves, CallLine, EventTimes
+from probe_kit.retention.call_curves import AlignedLine, CallCurves, CallLine, EventCalls, EventTimes
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import known_view
 from probe_kit.retention.displays.showing import Shown
@@ -21,7 +21,6 @@ from probe_kit.retention.displays.style import (
     significance_handles,
     spell,
 )
-from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
@@ -54,14 +53,14 @@ class CallCurveDisplay(Shown):
         results: Mapping[int, ProbeResults],
         category: str,
         view: str | None = None,
-        run: RunReader | None = None,
+        events: EventCalls | None = None,
     ) -> Self:
-        """From probes by call (`load_calls`); run: for its trajectories, without which there are no events.
+        """From probes by call (`load_calls`). events: what `event_calls` reads from a run's trajectories.
 
         Raises UnknownSiteError for a view that was not probed, UsageError for fewer than two calls.
         """
         first = next(iter(results.values()))
-        curves = CallCurves.of(results, category, known_view(first, view), run)
+        curves = CallCurves.of(results, category, known_view(first, view), events)
         aligned = {
             event: tuple(line for name in curves.streams if (line := curves.aligned(name, event)) is not None)
             for event in EVENTS
@@ -114,19 +113,19 @@ class CallCurveDisplay(Shown):
 
 
 def call_curves(
-    results: Mapping[int, ProbeResults], view: str | None = None, run: RunReader | None = None
+    results: Mapping[int, ProbeResults], view: str | None = None, events: EventCalls | None = None
 ) -> "Figure":
     """Accuracy over captured calls for every category; arguments and errors as of `CallCurveDisplay`."""
     names = next(iter(results.values())).settings.categories
-    return _figure([CallCurveDisplay.from_results(results, name, view, run) for name in names], None)
+    return _figure([CallCurveDisplay.from_results(results, name, view, events) for name in names], None)
 
 
 def aligned_curves(
-    results: Mapping[int, ProbeResults], event: str, view: str | None = None, run: RunReader | None = None
+    results: Mapping[int, ProbeResults], event: str, view: str | None = None, events: EventCalls | None = None
 ) -> "Figure":
     """The same counted from an event, for every category in which enough episodes have it."""
     names = next(iter(results.values())).settings.categories
-    displays = [CallCurveDisplay.from_results(results, name, view, run) for name in names]
+    displays = [CallCurveDisplay.from_results(results, name, view, events) for name in names]
     shown = [display for display in displays if event in display.aligned]
     if not shown:
         raise UsageError(f"too few episodes of any category have the event {event!r}, or no trajectories")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
-from probe_kit.retention.call_curves import CallCurves
+from probe_kit.retention.call_curves import CallCurves, event_calls
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -217,7 +217,7 @@ def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -
     calls = load_calls(run, results)
     if len(calls) < 2:
         return []
-    views = results.settings.views
+    views, events = results.settings.views, event_calls(run)
     exhibits = [
         Exhibit(
             f"{name}-calls{_suffix(view, views)}", "Over the episode" + (f", view {view}" * (len(views) > 1)),
@@ -225,19 +225,19 @@ def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -
             "The best site of each part at every inference that was captured, counted from 0. Filled markers are "
             "evidence; dotted: what the best site of relabelled data stays below. An answer that is not there at "
             "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
-            position, partial(call_curves, calls, view, run),
+            position, partial(call_curves, calls, view, events),
         )
         for view in views
     ]  # fmt: skip
-    curves = [CallCurves.of(calls, category, views[0], run) for category in results.settings.categories]
-    events = [event for event in EVENTS if any(_aligned(one, event) for one in curves)]
+    curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
+    shown = [event for event in EVENTS if any(_aligned(one, event) for one in curves)]
     return exhibits + [
         Exhibit(
             f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
             "The same, with every episode's inferences counted from its own event: 0 is the last one before it.",
-            position, partial(aligned_curves, calls, event, views[0], run),
+            position, partial(aligned_curves, calls, event, views[0], events),
         )
-        for event in events
+        for event in shown
     ]  # fmt: skip
 
 
