@@ -22,7 +22,7 @@ from probe_kit.extract.commands import MOVED, extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
-from probe_kit.hooks.commands import verify
+from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
 from probe_kit.suite.commands import app as suite_app
@@ -133,7 +133,7 @@ def _before_commands(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)
-for command in (extract, ask, export, demo, models, verify, train, power, retention, doctor):
+for command in (extract, ask, export, demo, models, verify, new_adapter, train, power, retention, doctor):
     app.command()(command)
 
 

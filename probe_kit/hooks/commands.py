@@ -1,11 +1,11 @@
-"""`probe-kit verify`."""
+"""`probe-kit verify` and `probe-kit new-adapter`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit.console import marked, out, print_json
+from probe_kit.console import err, marked, out, print_json
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -38,6 +38,22 @@ def verify(
     else:
         _print_verification(verification)
     raise typer.Exit(0 if verification.passed else 1)
+
+
+def new_adapter(
+    name: Annotated[str, typer.Argument(help="Of your family of models, such as my-vla.")],
+    out_folder: Annotated[Path | None, typer.Option("--out", help="New folder; default one of that name.")] = None,
+) -> None:
+    """Write a package with an adapter of your own, its entry point and its contract test.
+
+    It passes the contract as it is, with a small network in the place of yours; its README says what to change.
+    """
+    from probe_kit.hooks.new_adapter import write_adapter
+
+    for path in write_adapter(name, out_folder):
+        out.print(str(path), highlight=False, markup=False, soft_wrap=True)
+    folder = out_folder or Path(name)
+    err.print(f"next: read {folder / 'README.md'}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _print_verification(verification: "Verification") -> None:

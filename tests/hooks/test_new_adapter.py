@@ -1,0 +1,66 @@
+"""`probe-kit new-adapter`: what it writes is a family that keeps the contract and can be extracted from."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.new_adapter import write_adapter
+from probe_kit.suite import Suite
+
+ENTRY = "[probe_kit.policies]\nmy-vla = my_vla:FAMILY\n"
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The package, with the two files beside it that pip would write."""
+    write_adapter("my-vla", tmp_path / "mine")
+    info = tmp_path / "mine" / "my_vla-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-vla\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text(ENTRY)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "mine"))
+    return tmp_path / "mine"
+
+
+def ran(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=folder, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_it_keeps_the_contract_as_it_is(installed: Path) -> None:
+    assert (
+        ENTRY.splitlines()[1].replace("my_vla:FAMILY", '"my_vla:FAMILY"')
+        in (installed / "pyproject.toml").read_text()
+    )
+    tested = ran(installed, "pytest", "-q", "-p", "no:cacheprovider", "tests")
+    assert "failed" not in tested
+    assert int(tested.rpartition("\n")[0].rpartition("\n")[2].split()[0]) > 20, tested
+
+
+@pytest.mark.slow
+def test_a_run_is_made_with_it_as_its_readme_says(installed: Path, small_suite: Suite) -> None:
+    ran(installed, "my_vla.checkpoint", "checkpoint")
+    suite = ("--suite", str(small_suite.folder), "--items", "2")
+    arguments = ("--model", "my-vla", "--checkpoint", "checkpoint", *suite)
+    run = ran(installed, "probe_kit", "extract", *arguments, "--max-steps", "4", "--out", "run")
+    assert run.strip().endswith("run")
+
+
+@pytest.mark.parametrize("name", ["My-VLA", "1vla", "my_vla", "-", "class", ""])
+def test_an_impossible_name_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot name a family"):
+        write_adapter(name, tmp_path / "mine")
+
+
+def test_a_name_that_is_taken_and_a_folder_that_is_full_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="already"):
+        write_adapter("pi0", tmp_path / "mine")
+    (tmp_path / "note").touch()
+    with pytest.raises(UsageError, match="holds something"):
+        write_adapter("my-vla", tmp_path)
