@@ -4,11 +4,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from probe_kit.env.camera import Camera, Picture
 from probe_kit.env.rotations import Array
 from probe_kit.errors import SceneError
+from probe_kit.suite.pictures import LARGEST_PICTURE
 
 PLANK_WIDTH = 0.14
 TABLE_END = 0.92
@@ -23,8 +24,10 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
     """The photo at `path`, squeezed to (height, width, 3). Raises SceneError if it cannot be read."""
     try:
         with Image.open(path) as image:
+            if max(image.size) > LARGEST_PICTURE:
+                raise ValueError(f"{image.width}×{image.height} pixels; at most {LARGEST_PICTURE} are read")
             return np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS))
-    except (OSError, SyntaxError, UnidentifiedImageError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise SceneError(
             f"background {path}: not a picture that Pillow can decode ({error}). Give another file, or leave "
             "`background` out for our own wooden table."

@@ -9,6 +9,8 @@ from PIL import Image
 from probe_kit.errors import SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
 
+_SIDES: tuple[Side, Side] = ("left", "right")
+
 
 @dataclass(frozen=True)
 class Question:
@@ -25,11 +27,14 @@ class Question:
 
     @classmethod
     def from_item(cls, item: Item, layout: Layout) -> Self:
-        """The question of an item. Raises SuiteError if a picture is missing or broken."""
+        """The question of an item. An item without hashes is taken as it is.
+
+        Raises SuiteError if a picture is missing or broken, or has other pixels than the item says.
+        """
         from probe_kit.suite.pictures import load_picture
 
         episode = Episode(item, _checked(layout))
-        left, right = load_picture(episode.picture("left")), load_picture(episode.picture("right"))
+        left, right = (load_picture(episode.picture(side), episode.pixels_sha256(side) or None) for side in _SIDES)
         return cls(
             episode.episode_id, item.instruction, {"left": left, "right": right}, episode.side_correct, layout
         )

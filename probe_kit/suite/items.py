@@ -68,6 +68,10 @@ class Item:
         """Hex sha256 of the bytes of that file."""
         return self.left_sha256 if side == "left" else self.right_sha256
 
+    def pixels_sha256(self, side: Side) -> str:
+        """Hash of the pixels of that picture, see `pictures.pixels_sha256`."""
+        return self.left_pixels_sha256 if side == "left" else self.right_pixels_sha256
+
     def picture(self, side: Side) -> Path:
         """Absolute path of the picture that lies on `side` in the original layout."""
         return self.folder / self.file_name(side)
@@ -114,4 +118,11 @@ class Episode:
 
     def picture(self, side: Side) -> Path:
         """Absolute path of the picture that lies on `side` in this layout."""
-        return self.item.picture(side if self.layout == "original" else other_side(side))
+        return self.item.picture(self._original(side))
+
+    def pixels_sha256(self, side: Side) -> str:
+        """Hash of the pixels of that picture, see `pictures.pixels_sha256`."""
+        return self.item.pixels_sha256(self._original(side))
+
+    def _original(self, side: Side) -> Side:
+        return side if self.layout == "original" else other_side(side)

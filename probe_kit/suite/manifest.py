@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from probe_kit.errors import SuiteError, UsageError
+from probe_kit.foreign_json import MOST_BYTES
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.validation.findings import Finding, error, listing
@@ -27,6 +28,8 @@ from probe_kit.suite.validation.rules import LOADING_RULES
 CARD = "suite.json"
 ITEMS = "items"
 METADATA = "metadata.jsonl"
+MOST_ITEMS = 100_000
+"""Of a suite that is read; the largest there is has a twentieth of it."""
 
 
 # -- writing -----------------------------------------------------------------------------------------
@@ -171,6 +174,8 @@ def _read_card(folder: Path) -> dict[str, Any] | list[Finding]:
     path = folder / CARD
     if not path.is_file():
         raise UsageError(f"{folder} is not a suite: it holds no {CARD}. Name the folder a suite was written to.")
+    if (size := path.stat().st_size) > MOST_BYTES:
+        return [error("E01", CARD, f"has {size / 1e6:,.0f} MB; expected at most {MOST_BYTES / 1e6:,.0f}")]
     card = parse_line(path.read_bytes(), CARD)
     if isinstance(card, Finding):
         return [card]
@@ -181,10 +186,15 @@ def _read_items(folder: Path) -> tuple[tuple[Item, ...], list[Finding]]:
     path = folder / METADATA
     if not path.is_file():
         return (), [error("E01", METADATA, "the file is missing")]
+    if (size := path.stat().st_size) > MOST_BYTES:
+        return (), [error("E01", METADATA, f"has {size / 1e6:,.0f} MB; expected at most {MOST_BYTES / 1e6:,.0f}")]
     items, findings = [], []
     lines_of: dict[str, list[int]] = {}
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         where = f"{METADATA}:{number}"
+        if number > MOST_ITEMS:
+            findings.append(error("E01", where, f"more than {MOST_ITEMS:,} items; split the suite"))
+            break
         record = parse_line(line, where)
         if isinstance(record, Finding):
             findings.append(record)

@@ -1,6 +1,9 @@
 """Pictures: their identity, how they are written, and how a foreign file becomes a square RGB tile."""
 
 import hashlib
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
@@ -9,6 +12,8 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from probe_kit.errors import SuiteError
 
 WHITE = (255, 255, 255)
+LARGEST_PICTURE = 8192
+"""Pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
 
 # What Pillow raises for bytes that are no picture or only part of one; PNG reports bad chunks as SyntaxError.
 _DECODING_ERRORS = (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError)
@@ -39,30 +44,37 @@ def encode_png(image: Image.Image) -> bytes:
 def picture_size(encoded: bytes) -> tuple[int, int] | None:
     """Width and height in pixels as the file's header states them, None if it is not a picture."""
     try:
-        with Image.open(BytesIO(encoded)) as image:
+        with _headers_of_bombs(), Image.open(BytesIO(encoded)) as image:
             return image.size
     except _DECODING_ERRORS:
         return None
 
 
-def load_picture(path: Path) -> Image.Image:
+def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
     """A square RGB picture, upright, on white; the shorter side is padded with white.
 
-    Raises SuiteError as `decode_picture` does.
+    pixels: the hash its pixels must have. Raises SuiteError as `decode_picture` does, and for other pixels.
     """
-    return letterboxed(decode_picture(path))
+    picture = decode_picture(path)
+    if pixels is not None and (found := pixels_sha256(picture)) != pixels:
+        raise SuiteError(
+            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {found[:12]}). "
+            "Restore the suite's files or build it again."
+        )
+    return letterboxed(picture)
 
 
 def decode_picture(path: Path) -> Image.Image:
     """An RGB picture in its own size: EXIF rotation is applied and transparency is laid over white.
 
-    Raises SuiteError naming the file if it is missing, is not a picture, is damaged, or has more than 8 bits per
-    channel.
+    Raises SuiteError naming the file if it is missing, is not a picture, is damaged, is larger than
+    `LARGEST_PICTURE`, or has more than 8 bits per channel.
     """
     if not path.is_file():
         raise SuiteError(f"{path}: there is no such picture. Restore the suite's files or build it again.")
     try:
-        with Image.open(path) as image:
+        with _headers_of_bombs(), Image.open(path) as image:
+            _refuse_huge(image, path)
             image.verify()  # decoding alone does not compare the checksums
         with Image.open(path) as image:
             _refuse_deep(image, path)
@@ -71,6 +83,22 @@ def decode_picture(path: Path) -> Image.Image:
         raise SuiteError(
             f"{path}: not a picture that Pillow can decode ({error}). Restore the suite's files or build it again."
         ) from error
+
+
+@contextmanager
+def _headers_of_bombs() -> Iterator[None]:
+    """Pillow warns of a huge picture when it is opened; we refuse it, and need its size to say so."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        yield
+
+
+def _refuse_huge(image: Image.Image, path: Path) -> None:
+    if max(image.size) > LARGEST_PICTURE:
+        width, height = image.size
+        raise SuiteError(
+            f"{path}: claims to be {width}×{height} pixels; at most {LARGEST_PICTURE} are read. Make it smaller."
+        )
 
 
 def _refuse_deep(image: Image.Image, path: Path) -> None:

@@ -69,3 +69,11 @@ def test_the_built_in_question_swaps_too():
     assert Question.built_in("original").side_correct == "left"
     assert Question.built_in("swapped").side_correct == "right"
     assert color(Question.built_in("swapped"), "right") == color(Question.built_in("original"), "left")
+
+
+def test_a_picture_with_other_pixels_than_the_item_says_is_refused(item):
+    """A suite is named after its pixels: a file exchanged together with its own hash would keep that name."""
+    with pytest.raises(SuiteError, match=r"red\.png: has other pixels than its suite says"):
+        Question.from_item(replace(item, left_pixels_sha256="ab" * 32), "original")
+    with pytest.raises(SuiteError, match=r"red\.png: has other pixels"):
+        Question.from_item(replace(item, left_pixels_sha256="ab" * 32), "swapped")

@@ -12,6 +12,7 @@ from typing import Any
 from PIL import Image
 
 from probe_kit.errors import SuiteError
+from probe_kit.foreign_json import parse_json
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
 from probe_kit.suite.wording import instruction_for
@@ -165,7 +166,7 @@ def _from_lines(text: str, path: Path) -> list[dict[str, Any]]:
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError as problem:
             raise SuiteError(f"{path}:{number}: not valid JSON ({problem}). Restore the line.") from problem
         if not isinstance(row, dict):

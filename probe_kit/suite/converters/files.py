@@ -1,6 +1,5 @@
 """Reading a source's tree: annotation files, and pictures that may lie in one of several places."""
 
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.errors import SuiteError
+from probe_kit.foreign_json import parse_json
 from probe_kit.suite.pictures import WHITE, decode_picture
 
 MARGIN = 0.08  # of the longer side, around trimmed art
@@ -21,7 +21,7 @@ def read_json(path: Path, source: str, remedy: str) -> Any:
     if not path.is_file():
         raise SuiteError(f"{source}: {path} not found. {remedy}")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes())
     except ValueError as problem:
         raise SuiteError(f"{source}: {path} is not valid JSON ({problem}). {remedy}") from problem
 

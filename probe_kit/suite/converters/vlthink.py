@@ -1,6 +1,5 @@
 """VL-Think: boards with signs and coloured shapes, for Color, Public Info and Traffic."""
 
-import json
 import struct
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -12,6 +11,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from probe_kit.errors import SuiteError
+from probe_kit.foreign_json import parse_json
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.files import read_json, trimmed
 from probe_kit.suite.converters.options import VlThinkOptions
@@ -145,17 +145,23 @@ def upright_board(path: Path) -> Image.Image:
     return art
 
 
+_UNREADABLE = (
+    AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error,
+    UnidentifiedImageError, Image.DecompressionBombError, OSError,
+)  # fmt: skip
+
+
 def _texture(path: Path) -> Image.Image:
     """The first embedded picture of a GLB: a JSON chunk says which bytes of the binary chunk it is."""
     try:
         chunks = dict(_chunks(path.read_bytes()))
-        scene = json.loads(chunks[_JSON_CHUNK])
+        scene = parse_json(chunks[_JSON_CHUNK])
         view = scene["bufferViews"][scene["images"][0]["bufferView"]]
         start = view.get("byteOffset", 0)
         with Image.open(BytesIO(chunks[_BINARY_CHUNK][start : start + view["byteLength"]])) as image:
             image.load()
             return image
-    except (KeyError, IndexError, TypeError, ValueError, struct.error, UnidentifiedImageError, OSError) as problem:
+    except _UNREADABLE as problem:
         raise SuiteError(
             f"{SOURCE}: {path} is no glTF with an embedded picture ({problem!r}). Check out the assets again."
         ) from problem

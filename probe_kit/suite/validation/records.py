@@ -1,16 +1,22 @@
 """E01 to E04: the lines of `metadata.jsonl` and the card, before they can become items."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
+from probe_kit.foreign_json import parse_json
+from probe_kit.plain_text import visible
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
 from probe_kit.suite.ladder import WORDINGS
 from probe_kit.suite.validation.findings import Finding, error
 
 SCHEMA_MAJOR = "1"
+LONGEST_FIELD = 4096
+"""Characters of any text in a record; only an attribution comes anywhere near."""
+LONGEST_NAME = 255
+"""Bytes of a file name or id, as file systems have it."""
+_NAMES = ("item_id", "left_file_name", "right_file_name", "group_id", "pair_id")
 
 _ENUMS: dict[str, tuple[str, ...]] = {
     "domain": (*dict.fromkeys(category.domain for category in CATEGORIES.values()), OWN_DOMAIN),
@@ -30,8 +36,8 @@ _REQUIRED = [f.name for f in fields(Item) if f.default is MISSING and f.default_
 def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
     """E01: the JSON object on one line, or why it is none."""
     try:
-        record = json.loads(line)
-    except ValueError as problem:  # JSONDecodeError or UnicodeDecodeError
+        record = parse_json(line)
+    except ValueError as problem:
         return error("E01", where, f"not valid JSON ({problem})")
     if not isinstance(record, dict):
         return error("E01", where, f"a JSON {type(record).__name__}; expected an object")
@@ -45,6 +51,8 @@ def check_card(card: dict[str, Any]) -> Iterator[Finding]:
             yield error(
                 "E02", "suite.json", f"field {name!r} is {card.get(name)!r}; expected a {expected.__name__}"
             )
+        elif expected is str:
+            yield from _check_text("item_id", card[name], "suite.json")
 
 
 def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
@@ -60,6 +68,8 @@ def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
             yield error("E02", where, f"field {name!r} is {record[name]!r}; expected one of {allowed}")
         elif name == "category" and not is_slug(record[name]):
             yield error("E02", where, f"field 'category' is {record[name]!r}; expected one like 'ripe-fruit'")
+        elif isinstance(record[name], str):
+            yield from _check_text(name, record[name], where)
     yield from _check_wordings(record.get("wordings", {}), where)
 
 
@@ -73,6 +83,18 @@ def _check_wordings(wordings: object, where: str) -> Iterator[Finding]:
             yield error("E02", where, f"wording {name!r} is {text!r}; expected {expected}")
         elif (name == "side") != ("{side}" in text):
             yield error("E02", where, f"wording {name!r} is {text!r}; 'side' alone contains '{{side}}', and must")
+        else:
+            yield from _check_text(f"wordings.{name}", text, where)
+
+
+def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
+    """E02: no text is endless, and none holds what a terminal would obey."""
+    longest = LONGEST_NAME if name in _NAMES else LONGEST_FIELD
+    if len(text.encode(errors="replace")) > longest:
+        yield error("E02", where, f"field {name!r} has {len(text)} characters; expected at most {longest}")
+    elif visible(text) != text or (name in _NAMES and not text.isprintable()):
+        shown = visible(text[:80])
+        yield error("E02", where, f"field {name!r} holds characters that cannot be printed ({shown!r})")
 
 
 def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:

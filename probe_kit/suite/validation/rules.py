@@ -11,12 +11,14 @@ from pathlib import PurePosixPath
 from probe_kit.errors import SuiteError
 from probe_kit.suite.grouping import ties
 from probe_kit.suite.items import Item, Side
-from probe_kit.suite.pictures import decode_picture, picture_size, pixels_sha256
+from probe_kit.suite.pictures import LARGEST_PICTURE, decode_picture, picture_size, pixels_sha256
 from probe_kit.suite.suite import Suite, count_by_category
 from probe_kit.suite.validation.findings import Finding, error
 from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, VERBATIM, side_words
 
 SMALLEST_PICTURE = 64
+MOST_PICTURE_BYTES = 64 << 20
+"""Of a picture's file; a photograph of the largest size has a tenth of it."""
 SIGN_CATEGORIES = ("traffic", "public-info")  # a sign may be named after a side
 SIDES: tuple[Side, Side] = ("left", "right")
 
@@ -37,6 +39,11 @@ def _check_file(item: Item, side: Side) -> Iterator[Finding]:
         yield error("E05", where, f"the path {name!r} leaves the suite folder")
     elif not path.is_file():
         yield error("E05", where, f"picture {name!r} not found")
+    elif not path.resolve().is_relative_to(item.folder.resolve()):
+        yield error("E05", where, f"picture {name!r} is a link that leaves the suite folder; copy the file there")
+    elif (size := path.stat().st_size) > MOST_PICTURE_BYTES:
+        most = f"expected at most {MOST_PICTURE_BYTES >> 20} MiB"
+        yield error("E07", where, f"picture {name!r} has {size / 1e6:,.0f} MB; {most}")
     else:
         encoded = path.read_bytes()
         yield from _check_bytes(encoded, item, side)
@@ -56,6 +63,9 @@ def _check_size(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
         yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded")
     elif min(size) < SMALLEST_PICTURE:
         message = f"{side} picture is {size[0]}×{size[1]}; needs at least {SMALLEST_PICTURE}"
+        yield error("E07", f"item {item.item_id}", message)
+    elif max(size) > LARGEST_PICTURE:
+        message = f"{side} picture is {size[0]}×{size[1]}; at most {LARGEST_PICTURE} are read"
         yield error("E07", f"item {item.item_id}", message)
 
 

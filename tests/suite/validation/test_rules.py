@@ -1,10 +1,16 @@
+import json
+import struct
+import zlib
 from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from probe_kit.errors import SuiteError
 from probe_kit.suite import load_suite
+from probe_kit.suite.pictures import decode_picture
 from probe_kit.suite.validation.findings import Finding, listing
 
 Record = dict[str, Any]
@@ -110,3 +116,65 @@ def test_a_report_holds_at_most_twenty_findings_of_a_rule() -> None:
     assert lines[0] == "E05 item x: not found"
     assert len(lines) == 1 + 20 + 1
     assert lines[-1] == "E06: and 3 more"
+
+
+def test_a_picture_may_not_be_a_link_that_leaves_the_suite(edit_records: EditRecords, tmp_path: Path) -> None:
+    folder = edit_records(lambda _: None)
+    picture = next(folder.glob("items/images/*/*.png"))
+    picture.rename(tmp_path / "elsewhere.png")
+    picture.symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(SuiteError, match=r"E05 item .* is a link that leaves the suite folder"):
+        load_suite(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "finding"),
+    [
+        (
+            set_field("item_id", "a\x1b[31m"),
+            r"E02 .*'item_id' holds characters that cannot be printed \('a␛\[31m'\)",
+        ),
+        (set_field("item_id", "two\nlines"), r"E02 .*'item_id' holds characters"),
+        (set_field("attribution", "user\u202egnp"), r"E02 .*'attribution' holds characters"),
+        (set_field("attribution", "x" * 5000), r"E02 .*'attribution' has 5000 characters; expected at most 4096"),
+        (set_field("left_file_name", "images/" + "a" * 5000), r"E02 .*'left_file_name' has 5007 characters"),
+        (set_field("instruction", "half \ud800"), r"E01 .*half a surrogate pair"),
+    ],
+)
+def test_text_that_no_terminal_or_file_system_should_meet_is_refused(
+    edit_records: EditRecords, change: Any, finding: str
+) -> None:
+    with pytest.raises(SuiteError, match=finding):
+        load_suite(edit_records(change))
+
+
+@pytest.mark.parametrize("name", ["suite.json", "items/metadata.jsonl"])
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b'{"a":' * 100_000, b"\xed\xa0\x80", b"9" * 5000, b"\xff\xfe"]
+)
+def test_json_that_is_none_is_a_finding(edit_records: EditRecords, name: str, content: bytes) -> None:
+    folder = edit_records(lambda _: None)
+    (folder / name).write_bytes(content)
+    with pytest.raises(SuiteError, match="E01"):
+        load_suite(folder)
+
+
+def test_a_picture_that_fills_all_memory_once_decoded_is_refused(edit_records: EditRecords) -> None:
+    bomb = png_bomb(12_000)
+    folder = edit_records(set_field("left_sha256", sha256(bomb).hexdigest()))
+    record = json.loads((folder / "items/metadata.jsonl").read_text().splitlines()[0])
+    (folder / "items" / record["left_file_name"]).write_bytes(bomb)
+    with pytest.raises(SuiteError, match=r"E07 item .*left picture is 12000×12000; at most 8192 are read"):
+        load_suite(folder)
+    with pytest.raises(SuiteError, match="claims to be 12000×12000"):
+        decode_picture(folder / "items" / record["left_file_name"])
+
+
+def png_bomb(side: int) -> bytes:
+    """A PNG of a few bytes that claims a size."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(b""))]
+    chunks = [
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in parts
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
