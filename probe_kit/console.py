@@ -78,8 +78,13 @@ err = SafeConsole(stderr=True)
 
 
 def split(text: str | None) -> tuple[str, ...] | None:
-    """The parts of a comma-separated option; None stays None."""
-    return None if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
+    """The parts of a comma-separated option, each once; None stays None."""
+    return None if text is None else tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
+
+
+def whole_number(text: str) -> int | None:
+    """What a text of up to nine digits says, None for any other."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else None
 
 
 def print_json(value: Any) -> None:

@@ -49,7 +49,9 @@ def check_action(action: ArrayLike) -> Array:
             "Pass one action of a chunk at a time."
         )
     if not np.isfinite(values).all():
-        raise ActionError(f"action {values.tolist()} is not finite; the environment did not move.")
+        raise ActionError(
+            f"action {values.tolist()} is not finite (NaN or infinity); the environment did not move."
+        )
     return values
 
 

@@ -28,6 +28,12 @@ EPSILON_MARGIN = 0.01
 """What the default outcome radius adds to half a tile side, metres (the rule of VL-Think)."""
 
 
+LARGEST = 10.0
+"""Metres, kilograms, or times the default light: what a table top can hold, and the camera can see."""
+LARGEST_PICTURE = 8192
+_MOST = {"max_steps": 10_000}
+
+
 @dataclass(frozen=True)
 class CameraSpec:
     """A pinhole camera without distortion; the default is the Bridge third-person view of SimplerEnv.
@@ -264,8 +270,14 @@ class SceneSpec:
             "scoring_side": self.scoring_side,
         }
         for name, value in positive.items():
-            if not value > 0:
-                raise SceneError(f"{name} is {value}; expected a positive number.")
+            if not 0 < value <= _MOST.get(name, LARGEST):
+                raise SceneError(
+                    f"{name} is {value}; expected a positive number of at most {_MOST.get(name, LARGEST):g}."
+                )
+        if self.picture_size is not None and not all(1 <= side <= LARGEST_PICTURE for side in self.picture_size):
+            raise SceneError(
+                f"picture_size is {self.picture_size}; expected 1 to {LARGEST_PICTURE} pixels a side."
+            )
         for name in ("closing_steps", "forced_closed", "tile_mass", "box_margin", "box_height"):
             if not getattr(self, name) >= 0:
                 raise SceneError(f"{name} is {getattr(self, name)}; expected zero or a positive number.")

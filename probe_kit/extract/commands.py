@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, err, marked, out, progress, say, split
+from probe_kit.console import counter, err, marked, out, progress, say, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -191,10 +191,10 @@ def extract(
 
 def read_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels. Raises UsageError for another form."""
-    width, separator, height = text.partition("x")
-    if not (separator and width.isdigit() and height.isdigit()):
+    width, height = map(whole_number, text.partition("x")[::2])
+    if width is None or height is None:
         raise UsageError(f"picture size {text!r} is not WIDTHxHEIGHT, such as 224x224")
-    return int(width), int(height)
+    return width, height
 
 
 def print_plan(extraction: "Extraction", location: "Location") -> None:

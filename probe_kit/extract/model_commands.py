@@ -1,10 +1,13 @@
 """`probe-kit models`: what `probe-kit extract --model` takes."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from probe_kit.console import marked, out, print_json
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.family import Family
 
 
 def models(
@@ -33,6 +36,15 @@ def models(
             out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
 
 
+def _ready(family: "Family") -> str:
+    """Whether it can be run here. A third party's family may be wrong about itself, and only about itself."""
+    try:
+        lacking = family.missing()
+    except (ImportError, ValueError, TypeError, AttributeError, OSError) as error:
+        return f"cannot be told: {type(error).__name__}: {error}"
+    return f"needs {lacking}" if lacking else "yes"
+
+
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
     from probe_kit.extract.play.controllers import SCRIPTED
     from probe_kit.hooks.registry import find_family, known_families
@@ -47,7 +59,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else "embedded"),
             "streams": family.streams,
             "embodiment": family.embodiment,
-            "ready": f"needs {family.missing()}" if family.missing() else "yes",
+            "ready": _ready(family),
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
             "options": [

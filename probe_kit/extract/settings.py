@@ -32,6 +32,16 @@ _ELSEWHERE = {
     "edits",
     "vectors",
 }
+_MOST = {
+    "captured_calls": 10_000,
+    "execute": 10_000,
+    "items": 1_000_000,
+    "batch": 4096,
+    "workers": 1024,
+    "env_workers": 1024,
+}
+LONGEST_LABEL = 200
+LARGEST = 1_000_000
 _MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", "workers", "ray"}
 
 
@@ -88,15 +98,19 @@ class RunSettings:
         self._check_one_of("frames", FRAMES)
         for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
             self._check_at_least(name, bound)
+        if self.label is not None and not (self.label.isprintable() and 0 < len(self.label) <= LONGEST_LABEL):
+            raise UsageError(
+                f"label is {self.label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters"
+            )
 
     def _check_one_of(self, name: str, allowed: Iterable[str]) -> None:
         if getattr(self, name) not in allowed:
             raise UsageError(f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}")
 
     def _check_at_least(self, name: str, bound: int) -> None:
-        value = getattr(self, name)
-        if value is not None and value < bound:
-            raise UsageError(f"{name} is {value}; expected at least {bound}")
+        value, most = getattr(self, name), _MOST.get(name, LARGEST)
+        if value is not None and not bound <= value <= most:
+            raise UsageError(f"{name} is {value}; expected at least {bound} and at most {most}")
 
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""

@@ -1,11 +1,12 @@
 """Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first. Imports no torch."""
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.foreign_json import parse_json, read_json
+from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
 WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
@@ -73,16 +74,21 @@ def check_files(
     file = folder / CONFIG_FILE
     if not file.is_file():
         raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
-    try:
-        config = json.loads(file.read_text())
-    except ValueError as error:
-        raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
+    config = read_json(file, CheckpointError, "Download the checkpoint again")
     found = config.get("type") or config.get("model_type") if isinstance(config, dict) else None
-    if found not in types:
+    if not isinstance(found, str) or found not in types:
         way_out = dict(instead).get(str(found), "Pass the right --model")
         raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
+    check_sizes(config, str(file))
     if weights and (lacking := missing_weights(folder)):
         raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
+
+
+def shard_name(name: object) -> str:
+    """A file's name as an index gives it. Raises ValueError for a path: shards lie beside their index."""
+    if not isinstance(name, str) or name in ("", ".", "..") or Path(name).name != name or "\\" in name:
+        raise ValueError(f"{name!r} is no name of a file beside it")
+    return name
 
 
 def missing_weights(folder: Path) -> str:
@@ -92,9 +98,9 @@ def missing_weights(folder: Path) -> str:
         return ""
     if index.is_file():
         try:
-            shards = sorted(set(json.loads(index.read_text())["weight_map"].values()))
-        except (ValueError, KeyError, AttributeError):
-            return f"{INDEX_FILE} is damaged"
+            shards = sorted({shard_name(name) for name in parse_json(index.read_bytes())["weight_map"].values()})
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            return f"{INDEX_FILE} is damaged ({error})"
         absent = [name for name in shards if not (folder / name).is_file()]
         return f"{', '.join(absent)} of {INDEX_FILE} are missing" if absent else ""
     return (

@@ -9,10 +9,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit.errors import MissingExtraError, UsageError
+from probe_kit.errors import CheckpointError, MissingExtraError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
+from probe_kit.hooks.foreign_code import loading
 from probe_kit.hooks.options import Option, check_options
 from probe_kit.machine import check_device_name, what_is_here
+from probe_kit.models.bounds import MOST_STEPS
 
 if TYPE_CHECKING:
     from probe_kit.hooks.model import Model
@@ -97,12 +99,15 @@ class Family:
         chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         place = self.place(checkpoint, chosen.pop(SIZE, None))
         check_machine(device, dtype)
-        load = imported(self.loader)
+        with loading(self.name, self.loader):
+            load = imported(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
-        model: Model = load(place, device, dtype, random_weights, **chosen)
+        with loading(self.name, str(place or "what it brings")):
+            model: Model = load(place, device, dtype, random_weights, **chosen)
+            _check_streams(model, str(place))
         # What an adapter does not say of its options itself is part of the identity all the same.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
         model.card = replace(model.card, settings={**said, **model.card.settings})
@@ -155,7 +160,8 @@ class Family:
         path = getattr(self, purpose)
         if path is None:
             raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
-        found: Callable[..., Any] = imported(path)
+        with loading(self.name, path):
+            found: Callable[..., Any] = imported(path)
         return found
 
     def renames(self) -> tuple[tuple[str, str], ...]:
@@ -185,6 +191,16 @@ class Family:
 
     def _missing_packages(self) -> list[tuple[str, str]]:
         return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+
+
+def _check_streams(model: "Model", place: str) -> None:
+    """Raise CheckpointError for a model that would loop without end: its counts come from files and options."""
+    for name, stream in model.streams.items():
+        if (most := max(stream.layers, stream.iterations or 0)) > MOST_STEPS:
+            raise CheckpointError(
+                f"{place}: the stream {name} has {most} layers or iterations; expected at most {MOST_STEPS}. Take "
+                "the original file, or fewer steps"
+            )
 
 
 def check_machine(device: str, dtype: str | None) -> None:

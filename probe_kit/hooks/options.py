@@ -10,6 +10,9 @@ from probe_kit.errors import UsageError
 _WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
+LARGEST = 1 << 31
+"""Of a number that is an option; larger ones, and NaN, are mistakes."""
+
 Kind = type[bool] | type[int] | type[float] | type[str]
 
 
@@ -43,8 +46,11 @@ class Option:
         try:
             if not isinstance(given, str):
                 raise ValueError
-            return _WORDS[given.lower()] if self.kind is bool else self.kind(given)
-        except (ValueError, KeyError):
+            value = _WORDS[given.lower()] if self.kind is bool else self.kind(given)
+            if self.kind in (int, float) and not abs(value) <= LARGEST:
+                raise ValueError
+            return value
+        except (ValueError, KeyError, OverflowError):
             raise UsageError(f"model option {self.name} is {given!r}; expected {_EXPECTED[self.kind]}") from None
 
 

@@ -1,17 +1,20 @@
 """`probe-kit verify`: the ordinary adapter against outputs recorded from a model's original implementation."""
 
 import gzip
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import BadZipFile
+from zlib import error
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import UsageError
+from probe_kit.foreign_json import parse_json
+from probe_kit.hooks.foreign_code import in_words, loading
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.naming import renamed
 
@@ -109,9 +112,24 @@ def verify_reference(family: str, folder: Path) -> Verification:
     file = folder / "reference.npz"
     if not file.is_file():
         raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
-    with np.load(file) as arrays:
-        recorded = {name: arrays[name] for name in arrays.files}
-    return Verification(family, str(folder), run(folder, recorded))
+    recorded = _read_arrays(file)
+    with loading(family, str(folder)):
+        return Verification(family, str(folder), run(folder, recorded))
+
+
+_DAMAGED = (OSError, ValueError, EOFError, KeyError, AttributeError, NotImplementedError, BadZipFile, error)
+"""What numpy raises for an .npz file that is none, or no longer."""
+
+
+def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
+    """What an .npz file holds. Raises UsageError if it is damaged or holds something else than numbers."""
+    try:
+        with np.load(file) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except _DAMAGED as why:
+        raise UsageError(
+            f"{file} cannot be read as arrays ({in_words(why)}). Record it again, or copy it again from its source"
+        ) from why
 
 
 def verify_keys(family: str, file: Path) -> Verification:
@@ -122,10 +140,7 @@ def verify_keys(family: str, file: Path) -> Verification:
     as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
     several released sizes the one that the list differs least from is meant.
     """
-    if not file.is_file():
-        raise UsageError(f"key list {file} does not exist")
-    raw = file.read_bytes()
-    recorded = json.loads(gzip.decompress(raw) if file.suffix == ".gz" else raw)["keys"]
+    recorded = _read_key_list(file)
     known = find_family(family)
     build, renames = known.function("full_size"), known.renames()
     theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
@@ -164,6 +179,23 @@ def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[
         if ours[name] != theirs[name]
     ]
     return wrong
+
+
+def _read_key_list(file: Path) -> dict[str, Any]:
+    """The `keys` of a list, each with shape and dtype. Raises UsageError for anything else."""
+    if not file.is_file():
+        raise UsageError(f"key list {file} does not exist")
+    try:
+        raw = file.read_bytes()
+        content = parse_json(gzip.decompress(raw) if file.suffix == ".gz" else raw)
+        keys: dict[str, Any] = dict(content["keys"].items())
+        for entry in keys.values():
+            tuple(entry["shape"]), str(entry["dtype"])
+    except (OSError, EOFError, error, ValueError, KeyError, TypeError, AttributeError) as why:
+        raise UsageError(
+            f"{file} is no key list ({in_words(why)}); expected JSON with `keys`: name, then shape and dtype"
+        ) from why
+    return keys
 
 
 def _is_declared(name: str, declared: tuple[str, ...]) -> bool:

@@ -13,6 +13,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from probe_kit.errors import WeightsError
+from probe_kit.foreign_json import parse_json
+from probe_kit.hooks.checkpoint import shard_name
 
 SINGLE_FILE = "model.safetensors"
 INDEX_FILE = "model.safetensors.index.json"
@@ -83,10 +85,14 @@ def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
 
 def _shards(index: Path) -> dict[str, set[str] | None]:
     shards: dict[str, set[str] | None] = {}
-    for tensor, shard in json.loads(index.read_text())["weight_map"].items():
-        names = shards.setdefault(shard, set())
-        assert names is not None
-        names.add(tensor)
+    try:
+        listed = parse_json(index.read_bytes())["weight_map"].items()
+        for tensor, shard in listed:
+            names = shards.setdefault(shard_name(shard), set())
+            assert names is not None
+            names.add(tensor)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise WeightsError(f"{index} is damaged ({error}); download the checkpoint again") from error
     return shards
 
 
@@ -95,16 +101,35 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path} is missing; download the checkpoint again")
     try:
         with safe_open(path, "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except SafetensorError as error:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError, ValueError, AttributeError) as error:
         raise WeightsError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+    _check_kinds(tensors, path)
+    return tensors, metadata
+
+
+_KINDS = (
+    torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool
+)  # fmt: skip
+"""What weights, and buffers such as positions and masks, are made of."""
+
+
+def _check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Quantised weights would be read as if they were the numbers they stand for."""
+    strange = [f"{name} ({tensor.dtype})" for name, tensor in tensors.items() if tensor.dtype not in _KINDS]
+    if strange:
+        raise WeightsError(
+            f"{path} holds {len(strange)} tensors of a kind that no model declares: {_names(strange)}. Take the "
+            "checkpoint that is not quantised"
+        )
 
 
 def read_pickle(path: Path) -> Weights:
     """Read one `.pt` file with `weights_only=True`: it cannot run code. Raises WeightsError if it is none."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (UnpicklingError, RuntimeError, EOFError) as error:
+    except (UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
         raise WeightsError(
             f"{path} cannot be read as plain tensors ({error}); it may be damaged or unsafe"
         ) from error
@@ -112,6 +137,7 @@ def read_pickle(path: Path) -> Weights:
         raise WeightsError(
             f"{path} holds {type(content).__name__} of something else than tensors; expected a state dict"
         )
+    _check_kinds(content, path)
     return Weights(content, str(path), random=False)
 
 
@@ -139,6 +165,12 @@ def load_weights(
         if tensor.shape != state[name].shape
     ]
     _refuse(weights.source, "of another shape", shapes)
+    kinds = [
+        f"{name} {tensor.dtype} instead of {state[name].dtype}"
+        for name, tensor in tensors.items()
+        if tensor.is_floating_point() != state[name].is_floating_point()
+    ]
+    _refuse(weights.source, "of another kind of number", kinds)
     damaged = [n for n, t in tensors.items() if t.is_floating_point() and not torch.isfinite(t).all()]
     _refuse(weights.source, "NaN or infinite", damaged)
     module.load_state_dict(dict(tensors), strict=not allowed, assign=assign)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit.console import err, marked, out, print_json_text, print_text, say, split
+from probe_kit.console import err, marked, out, print_json_text, print_text, say, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
             raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
         if name in groups:
             raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
-        groups[name] = split(paths) or ()
+        groups[name] = tuple(filter(None, map(str.strip, paths.split(","))))  # a run given twice is refused
     return groups
 
 
@@ -145,8 +145,8 @@ def _radius(text: str) -> float:
 
 
 def _iterations(text: str) -> "Iterations":
-    if text.isdigit():
-        return int(text)
+    if (number := whole_number(text)) is not None:
+        return number
     if text not in ("all", "best", "last"):
         raise UsageError(f"iterations {text!r}; expected all, best, last or a number")
     return cast("Iterations", text)

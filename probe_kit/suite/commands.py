@@ -1,6 +1,5 @@
 """`probe-kit suite`: build, convert, check and look at suites."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -8,6 +7,7 @@ import typer
 
 from probe_kit.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import UsageError
+from probe_kit.foreign_json import parse_json
 
 app = typer.Typer(help="Build, convert, check and look at suites of questions.", no_args_is_help=True)
 
@@ -16,7 +16,9 @@ app = typer.Typer(help="Build, convert, check and look at suites of questions.",
 def build(
     folder: Annotated[Path, typer.Argument(help="New folder for the suite.")],
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all embedded ones.")] = None,
-    n: Annotated[int, typer.Option("--n", help="Items per category, even: items come as twins.")] = 150,
+    n: Annotated[
+        int, typer.Option("--n", help="Items per category, even: items come as twins.", max=100_000)
+    ] = 150,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
     suite_version: Annotated[
         int,
@@ -59,9 +61,9 @@ def from_csv(
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
     out.print(
-        f"{suite.identity}: {count} items in {groups} groups in {out_folder}", highlight=False, soft_wrap=True
+        f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True
     )
-    err.print(f"next: probe-kit suite validate {out_folder} --baselines", highlight=False, soft_wrap=True)
+    err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
 
 
 @app.command("show")
@@ -150,7 +152,7 @@ def convert(
     root: Annotated[Path, typer.Option(help="Folder the benchmark was unpacked to.")],
     out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the source.")] = None,
-    n: Annotated[int, typer.Option("--n", help="Most items per category.")] = 150,
+    n: Annotated[int, typer.Option("--n", help="Most items per category.", max=1_000_000)] = 150,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
     curation: Annotated[Path | None, typer.Option(help="Reviewed file; only what it accepts is emitted.")] = None,
     emit_curation: Annotated[Path | None, typer.Option(help="Write a file to review, with an HTML page.")] = None,
@@ -184,8 +186,11 @@ def _options(pairs: list[str]) -> dict[str, Any]:
         name, separator, value = pair.partition("=")
         if not separator:
             raise UsageError(f"--option {pair!r} has no value; write NAME=VALUE, such as min_side=64")
+        key = name.replace("-", "_")
+        if key in options:
+            raise UsageError(f"--option {name} is given twice; give it once")
         try:
-            options[name.replace("-", "_")] = json.loads(value)
-        except json.JSONDecodeError:
-            options[name.replace("-", "_")] = value
+            options[key] = parse_json(value)
+        except ValueError:
+            options[key] = value
     return options

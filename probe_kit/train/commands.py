@@ -28,8 +28,12 @@ def train(
     views: Annotated[
         str, typer.Option(help="Comma-separated: mean, last, mean:language …, tokens, tokens:ROLE.")
     ] = "mean",
-    permutations: Annotated[int, typer.Option(help="Relabellings behind the p-values.", min=0)] = 200,
-    token_permutations: Annotated[int, typer.Option(help="Relabellings for token views.", min=0)] = 59,
+    permutations: Annotated[
+        int, typer.Option(help="Relabellings behind the p-values.", min=0, max=1_000_000)
+    ] = 200,
+    token_permutations: Annotated[
+        int, typer.Option(help="Relabellings for token views.", min=0, max=1_000_000)
+    ] = 59,
     target: Annotated[
         str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
     ] = "correct",
@@ -63,7 +67,9 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
     jobs: Annotated[
         int | None,
-        typer.Option(help="Processes that share the sites; default 1, with --ray one for every core.", min=1),
+        typer.Option(
+            help="Processes that share the sites; default 1, with --ray one for every core.", min=1, max=1024
+        ),
     ] = None,
     ray: Annotated[str | None, typer.Option(help="Share the sites on a Ray cluster: ADDRESS or auto.")] = None,
     device: Annotated[str | None, typer.Option(help="Solve with torch there, such as cuda; one process.")] = None,

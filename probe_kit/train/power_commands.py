@@ -1,15 +1,18 @@
 """`probe-kit power`: how many items are needed, and what so many can show."""
 
 from dataclasses import asdict
+from math import isfinite, nan
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from probe_kit.console import err, out, print_json, split
+from probe_kit.console import err, out, print_json, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.train.power import Power
+
+MOST_ITEMS = 100_000
 
 
 def power(
@@ -17,15 +20,15 @@ def power(
     signal: Annotated[
         str, typer.Option(help="Comma-separated signals: points of accuracy above chance, in %.")
     ] = "10,15,25",
-    sites: Annotated[int, typer.Option(help="Sites among which the best is looked for.", min=1)] = 19,
+    sites: Annotated[int, typer.Option(help="Sites among which the best is looked for.", min=1, max=10_000)] = 19,
     wanted: Annotated[
         float | None,
-        typer.Option("--power", help="Instead: the fewest items that see each so often, in %."),
+        typer.Option("--power", help="Instead: the fewest items that see each so often, in %.", min=1, max=99.9),
     ] = None,
     width: Annotated[
-        float | None, typer.Option(help="Instead: items for an SR interval so wide, in points.", min=0.1)
+        float | None, typer.Option(help="Instead: items for an SR interval so wide, in points.", min=0.1, max=100)
     ] = None,
-    draws: Annotated[int, typer.Option(help="Simulated experiments per number.", min=20)] = 200,
+    draws: Annotated[int, typer.Option(help="Simulated experiments per number.", min=20, max=100_000)] = 200,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """How many items do I need? Power of probes against chance, binding and a twin, by simulation.
@@ -34,6 +37,9 @@ def power(
     """
     from probe_kit.train.power import items_for_width, items_needed, simulate
 
+    for name, value in (("--power", wanted), ("--width", width)):
+        if value is not None and not isfinite(value):
+            raise UsageError(f"{name} is {value}; expected a number")
     counts = [_whole(part) for part in split(items) or ()]
     signals = [_points(part) for part in split(signal) or ()]
     if width is not None:
@@ -82,14 +88,17 @@ def _print(found: "list[Power]") -> None:
 
 
 def _whole(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise UsageError(f"{text!r} is not a number of items")
-    return int(text)
+    number = whole_number(text)
+    if number is None or not 1 <= number <= MOST_ITEMS:
+        raise UsageError(f"{text!r} is not a number of items; expected 1 to {MOST_ITEMS}")
+    return number
 
 
 def _points(text: str) -> float:
     try:
         points = float(text)
     except ValueError:
-        raise UsageError(f"{text!r} is not a number of points above chance") from None
+        points = nan
+    if not 0 < points <= 50:
+        raise UsageError(f"{text!r} is not a number of points above chance; expected up to 50")
     return points / 100

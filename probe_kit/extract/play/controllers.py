@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.env.controller import ACTION_SIZE
+from probe_kit.errors import PolicyFailedError
 from probe_kit.extract.play.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.play.ensemble import ensemble
 from probe_kit.extract.store.layout import StoredStream
 from probe_kit.hooks.edits import Edit, Vectors
+from probe_kit.hooks.foreign_code import acting
 from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
 
@@ -116,7 +119,8 @@ class PolicyController:
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
-        self.streams = stored_streams(policy, policy.roles(examples))
+        with acting(name):
+            self.streams = stored_streams(policy, policy.roles(examples))
         self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
         card = policy.card
         self.script: str | None = None
@@ -140,6 +144,10 @@ class PolicyController:
 
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
+        with acting(self.identity["model"]):
+            return self._act(turns)
+
+    def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         observations = [turn.seen for turn in turns]
         seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
@@ -155,6 +163,7 @@ class PolicyController:
             with self._edited(observations):
                 chunks = self.policy.act(observations, seeds)
         self.flagged = self.policy.flagged
+        _check_chunks(chunks, len(turns))
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
@@ -191,3 +200,16 @@ class PolicyController:
         with applied(self.policy, self._edits, observations, self._vectors) as ledger:
             yield
         self._ledger = [asdict(entry) for entry in ledger.entries]
+
+
+def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:
+    """Raise PolicyFailedError unless these are chunks of actions for so many observations.
+
+    Actions that are NaN cost their own episode only, so the environment is left to say that.
+    """
+    shape, kind = np.shape(chunks), getattr(chunks, "dtype", None)
+    if len(shape) != 3 or shape[0] != count or shape[1] < 1 or shape[2] != ACTION_SIZE or kind is None:
+        raise PolicyFailedError(
+            f"the policy gave a {type(chunks).__name__} of shape {shape} for {count} observations; expected an "
+            f"array ({count}, chunk, {ACTION_SIZE}) of actions"
+        )

@@ -16,6 +16,7 @@ from probe_kit.errors import (
     InstructionError,
     NonFiniteActivationError,
     ObservationError,
+    PolicyFailedError,
     ProbeKitError,
     SceneError,
     StageDiedError,
@@ -31,6 +32,7 @@ EPISODE_ERRORS = (
     InstructionError,
     NonFiniteActivationError,
     ObservationError,
+    PolicyFailedError,
     SceneError,
     StageDiedError,
 )

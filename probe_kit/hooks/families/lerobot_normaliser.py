@@ -1,6 +1,5 @@
 """Normalisation with the statistics of a lerobot checkpoint: in processor files or, until 2025, in its weights."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file
 
 from probe_kit.errors import CheckpointError
+from probe_kit.foreign_json import read_json_object
+from probe_kit.hooks.checkpoint import shard_name
+from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.pi0_keys import STATISTICS
 
 _EPS = 1e-8
@@ -43,6 +45,7 @@ class Normaliser:
 
     mode: MEAN_STD, MIN_MAX, QUANTILES or IDENTITY. low, high: the two statistics, (D,) float32.
     source: the file they come from.
+    Raises CheckpointError for statistics that are not finite, or whose scale is not positive.
     """
 
     mode: str
@@ -50,6 +53,12 @@ class Normaliser:
     high: NDArray[np.float32]
     eps: float
     source: str
+
+    def __post_init__(self) -> None:
+        if self.mode != "IDENTITY":
+            (check_deviations if self.mode == "MEAN_STD" else check_bounds)(self.low, self.high, self.source)
+        if not (np.isfinite(self.eps) and self.eps >= 0):
+            raise CheckpointError(f"{self.source}: eps is {self.eps}; expected a small positive number")
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D)."""
@@ -80,7 +89,8 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
     path = folder / f"{pipeline}.json"
     if not path.is_file():
         raise CheckpointError(f"{path} is missing: without it the units of {feature} are unknown")
-    for step in json.loads(path.read_text())["steps"]:
+    steps = read_json_object(path, CheckpointError, "Download the checkpoint again").get("steps")
+    for step in steps if isinstance(steps, list) else ():
         if step["registry_name"] in ("normalizer_processor", "unnormalizer_processor"):
             config = step["config"]
             mode = config["norm_map"].get(kind, "IDENTITY")
@@ -96,8 +106,11 @@ def _statistics(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if mode not in _NEEDED:
         raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
-    path = folder / name if name else None
-    arrays = load_file(path) if path is not None and path.is_file() else {}
+    try:
+        path = folder / shard_name(name) if name else None
+        arrays = load_file(path) if path is not None and path.is_file() else {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise CheckpointError(f"{folder / str(name)} cannot be read ({error}); download it again") from error
     wanted = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
     missing = [key for key in wanted if key not in arrays]
     if missing:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.identity import sha256_json
+from probe_kit.models.bounds import check_deviations
 
 DEFAULT_ROBOT = "bridge_delta"
 STATISTICS_FILE = "preprocessor_config.json"
@@ -66,6 +67,7 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
         )
     if not np.isfinite([mean, deviation]).all():
         raise CheckpointError(f"{file}: the statistics of {name} are not finite")
+    check_deviations(mean, deviation, f"{file}, {name}")
     return ActionUnits(name, mean, deviation)
 
 

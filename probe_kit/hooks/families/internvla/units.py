@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.identity import sha256_json
+from probe_kit.models.bounds import check_bounds
 
 DEFAULTS = ("bridge_dataset", "oxe_bridge")
 """The data set of the WidowX arm that Act2Answer imitates, as releases call it."""
@@ -58,6 +59,7 @@ class ActionUnits:
         mask = np.asarray(action.get("mask", np.ones(low.shape, bool)), bool)
         if not low.shape == high.shape == mask.shape or not np.isfinite([low, high]).all():
             raise CheckpointError(f"the action statistics of {key} are not one finite number per dimension")
+        check_bounds(low[mask], high[mask], f"the action statistics of {key}")
         return cls(key, low, high, mask)
 
     @property
