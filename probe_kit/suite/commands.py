@@ -60,9 +60,7 @@ def from_csv(
     terms = Terms(license_name, attribution, contains_real_face=real_faces)
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
-    out.print(
-        f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True
-    )
+    out.print(f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True)
     err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
 
 
