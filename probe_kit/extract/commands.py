@@ -201,7 +201,11 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     """What is going to be run, how much it stores and where."""
     from rich.table import Table
 
+    from probe_kit.extract.needs import space_needed
+    from probe_kit.extract.store.disk import in_units
+
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
+    needed = in_units(sum(space_needed(plan, extraction.settings).values()))
     weights = (identity["weights_sha256"] or "scripted")[:12]
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
@@ -211,7 +215,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
-        "disk": "no bound" if free is None else f"{free / 1e9:,.1f} GB free",
+        "disk": f"up to {needed} with columns, probes and report; "
+        + ("no bound" if free is None else f"{in_units(free)} free"),
         "run": str(location),
     }
     table = Table(show_header=False, title="plan", box=None)

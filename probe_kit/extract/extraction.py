@@ -11,6 +11,7 @@ from probe_kit.extract.crews.here import run_here
 from probe_kit.extract.crews.processes import run_in_processes
 from probe_kit.extract.crews.ray import run_on_ray
 from probe_kit.extract.crews.scheduler import Scheduler
+from probe_kit.extract.needs import space_needed
 from probe_kit.extract.play.events import Done, Event
 from probe_kit.extract.prepared import Prepared, check_run, load, load_reader
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
@@ -50,7 +51,7 @@ class Extraction(Prepared):
         """
         location = locate(out)
         if not force and not location.exists(RUN_FILE):
-            refuse_if_full(self.plan.bytes, location)
+            refuse_if_full(space_needed(self.plan, self.settings), location)
         with location.in_words():
             writer = self.writer(location)
             with writer.owned():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.foreign_json import parse_json, read_json
+from probe_kit.hooks.hub import unreachable
 from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
@@ -23,7 +24,10 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     patterns: which files of a hub repository are needed.
     Raises CheckpointError if the folder is not there or the hub cannot deliver it.
     """
-    folder = Path(checkpoint).expanduser()
+    try:
+        folder = Path(checkpoint).expanduser()
+    except RuntimeError as error:  # ~nobody
+        raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if folder.is_dir():
         return folder
     if checkpoint.count("/") != 1 or checkpoint.startswith((".", "/", "~")):
@@ -31,10 +35,11 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
+    why = unreachable()
     try:
-        return Path(snapshot_download(checkpoint, allow_patterns=list(patterns)))
-    except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
-        reason = str(error).strip().splitlines()[0]
+        return Path(snapshot_download(checkpoint, allow_patterns=list(patterns), local_files_only=bool(why)))
+    except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
+        reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
         raise CheckpointError(
             f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
             "models, `hf auth login`; or pass a local folder as --checkpoint"

@@ -86,8 +86,9 @@ def _baseline_scores(
 
 def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
     """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
-    if run.location.address == twin.location.address:
-        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
+    if run.location.address == twin.location.address or run.settings_sha256 == twin.settings_sha256:
+        copy = "" if run.location.address == twin.location.address else f", of which {twin.location} is a copy,"
+        raise UsageError(f"{run.location}{copy} cannot be its own twin; give another run of the same episodes")
     here, there = (_labels_by_episode(one, settings) for one in (run, twin))
     if here != there:
         raise UsageError(
@@ -96,13 +97,17 @@ def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None
         )
 
 
-def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[str, int]]:
+def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[str, str, int]]:
+    """Id, instruction and label of every episode that is probed: what two runs must have in common."""
     labels = target_labels(run.episodes, settings.target, settings.seed)
     chosen = run.episodes["category"].isin(settings.categories) | (POOLED in settings.categories)
-    names = run.episodes["episode_id"].astype(str)
+    names, asked = (
+        run.episodes["episode_id"].astype(str),
+        run.episodes.get("instruction", run.episodes["episode_id"]),
+    )
     return [
-        (name, label)
-        for name, label, kept in zip(names, labels.tolist(), chosen, strict=True)
+        (name, str(instruction), label)
+        for name, instruction, label, kept in zip(names, asked, labels.tolist(), chosen, strict=True)
         if kept and label >= 0
     ]
 

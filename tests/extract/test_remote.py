@@ -176,3 +176,23 @@ def test_the_commands_take_urls(copied: Run, tmp_path: Path, bucket: str) -> Non
 def test_a_url_without_a_run_is_named(bucket: str) -> None:
     with pytest.raises(RunNotFoundError, match=f"{bucket}/nothing is not a run"):
         open_run(f"{bucket}/nothing")
+
+
+@pytest.mark.usefixtures("bucket")
+def test_a_bucket_that_is_not_there_is_named() -> None:
+    with pytest.raises(StoreError, match="there is no bucket 'no-such-bucket-anywhere'"):
+        open_run("s3://no-such-bucket-anywhere/run")
+    with pytest.raises(StoreError, match="there is no bucket 'no-such-bucket-anywhere'"):
+        locate("s3://no-such-bucket-anywhere/run").create("run.json", b"{}")
+
+
+def test_missing_credentials_are_named_and_not_the_address_that_was_asked_for_them() -> None:
+    from obstore.exceptions import GenericError
+
+    asked = "Error performing PUT http://169.254.169.254/latest/api/token in 23ms - Server returned 403"
+    with (
+        pytest.raises(StoreError, match=r"no credentials.*AWS_ACCESS_KEY_ID") as caught,
+        locate("s3://b/r").in_words(),
+    ):
+        raise GenericError(asked)
+    assert "169.254" not in str(caught.value)

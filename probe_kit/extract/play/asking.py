@@ -8,6 +8,7 @@ from probe_kit.extract.play.ask_controller import AskController, AskTurn
 from probe_kit.extract.play.rollout import Failure, Rollout
 from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Seen
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
+from probe_kit.hooks.foreign_code import acting
 
 
 class _Chair:
@@ -68,7 +69,8 @@ class Asking:
         if not due:
             return
         try:
-            outcomes = self._controller.ask([turn for _, turn, _ in due])
+            with acting(self._controller.identity["model"]):
+                outcomes = self._controller.ask([turn for _, turn, _ in due])
         except EPISODE_ERRORS as error:
             for chair, turn, _ in due:
                 yield self._give_up(chair, turn.planned, error)

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 READERS = 32
 RETRY_TIMEOUT = timedelta(seconds=60)
 STAMP_DIGITS = 16
+_NO_BUCKET = "NoSuchBucket"
+# Where a client looks last for credentials: what a machine of a cloud is told about itself.
+_ASKED_FOR_CREDENTIALS = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
 
 class Bucket(Location):
@@ -98,12 +101,29 @@ class Bucket(Location):
 
         try:
             yield
+        except FileNotFoundError as error:
+            if _NO_BUCKET in str(error):
+                raise self._refused(error) from error
+            raise
         except BaseError as error:
-            why = str(error).split("\n\nDebug source", maxsplit=1)[0]
-            raise StoreError(
-                f"{self} cannot be used: {why}. Check the bucket, the network, and what the environment says of "
-                "endpoint and credentials (AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID …); the same command continues"
-            ) from error
+            raise self._refused(error) from error
+
+    def _refused(self, error: Exception) -> StoreError:
+        """What the store said, and what is to be done about it."""
+        why = str(error).split("\n\nDebug source", maxsplit=1)[0]
+        advice = (
+            "Check the bucket, the network, and what the environment says of endpoint and credentials "
+            "(AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID …)"
+        )
+        if _NO_BUCKET in str(error):
+            bucket = urlsplit(self._url).netloc
+            why, advice = f"there is no bucket {bucket!r}", "Create it, or correct its name or AWS_ENDPOINT_URL"
+        elif any(place in why for place in _ASKED_FOR_CREDENTIALS):
+            why = "the environment holds no credentials, and this machine has none of its own"
+            advice = (
+                "Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket"
+            )
+        return StoreError(f"{self} cannot be used: {why}. {advice}; the same command continues")
 
     def exists(self, key: str) -> bool:
         """One request for the head of the object."""

@@ -14,7 +14,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from probe_kit.errors import DiskSpaceError, SettingsMismatchError
-from probe_kit.extract.store.layout import COMMITS, DATA, FRAMES, PLAN_FILE, RUN_FILE, VIDEOS
+from probe_kit.extract.store.layout import COLUMNS, COMMITS, DATA, FRAMES, PLAN_FILE, RUN_FILE, VIDEOS
 from probe_kit.extract.store.location import Location
 
 # What a killed process leaves: objects and columns that never got their final name.
@@ -169,6 +169,8 @@ class Folder(Location):
         with (self._path / RUN_FILE).open() as run, (self._path / PLAN_FILE).open() as turn:
             fcntl.flock(run, fcntl.LOCK_SH)
             fcntl.flock(turn, fcntl.LOCK_EX)
+            for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: whoever seals holds this lock
+                shutil.rmtree(leftover, ignore_errors=True)
             yield
 
     def derived(self, folder: str, stamp: str) -> str:  # noqa: ARG002 - there is only one, see `rebuilding`

@@ -18,6 +18,7 @@ from probe_kit.hooks.checkpoint import side_files
 from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
 from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
+from probe_kit.hooks.hub import unreachable
 from probe_kit.hooks.views import PADDING
 from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_keys import current_pi0_keys
@@ -65,7 +66,7 @@ class Pi0(EvaluatedPi0):
         if (place := self._tokenizer_folder()) is not None:
             return AutoTokenizer.from_pretrained(place)
         try:
-            return AutoTokenizer.from_pretrained(_TOKENIZER)
+            return AutoTokenizer.from_pretrained(_TOKENIZER, local_files_only=bool(unreachable()))
         except OSError as error:
             raise CheckpointError(
                 f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "

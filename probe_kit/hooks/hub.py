@@ -1,0 +1,37 @@
+"""Whether the hub can be reached, found out within seconds: its own client retries for long. Imports no torch."""
+
+import time
+from threading import Thread
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+PATIENCE = 5.0
+"""Seconds until a hub that says nothing counts as out of reach."""
+
+
+def unreachable() -> str:
+    """Why the hub cannot be asked now; empty if it answers, whatever it says.
+
+    A proxy that the environment names is used. Nothing is sent when the hub's own offline mode is on.
+    """
+    from huggingface_hub import constants
+
+    if constants.HF_HUB_OFFLINE:
+        return "offline mode (HF_HUB_OFFLINE)"
+    found: list[str] = []
+    started = time.monotonic()
+    asking = Thread(target=lambda: found.append(_ask(constants.ENDPOINT)), daemon=True)
+    asking.start()
+    asking.join(PATIENCE)  # looking a name up knows no time limit of its own
+    waited = time.monotonic() - started
+    return found[0] if found else f"{constants.ENDPOINT} says nothing for {waited:.0f} s"
+
+
+def _ask(address: str) -> str:
+    try:
+        urlopen(Request(address, method="HEAD"), timeout=PATIENCE).close()
+    except HTTPError:
+        return ""  # it answered
+    except (OSError, ValueError) as error:
+        return f"{address} does not answer: {getattr(error, 'reason', error)}"
+    return ""

@@ -1,0 +1,240 @@
+"""A damaged checkpoint of any family is refused by name, or acts as if nothing had happened."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CheckpointError, MissingExtraError, ProbeKitError, WeightsError
+from probe_kit.hooks import Observation
+from probe_kit.hooks.foreign_code import acting
+from probe_kit.hooks.registry import find_family
+from probe_kit.models.pi0_tiny import embedded_checkpoint
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+FOLDERS = {
+    "pi0-tiny": embedded_checkpoint("pi0-tiny"),
+    "pi0": GOLDEN / "pi0" / "checkpoint",
+    "smolvla": GOLDEN / "smolvla" / "checkpoint",
+    "openvla": GOLDEN / "openvla" / "checkpoint",
+    "magma": GOLDEN / "magma" / "checkpoint",
+    "spatialvla": GOLDEN / "spatialvla" / "checkpoint",
+    "xiaomi-r0": GOLDEN / "xiaomi_r0" / "checkpoint",
+    "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
+}
+REFUSALS = (CheckpointError, WeightsError)
+WRONG = ("x", -7, 10**30, float("nan"), [], {}, None, 1e308, True, "../../x", "\ud800", [[[]]])
+COUNTS = ("num_hidden_layers", "num_layers", "depth", "chunk_size", "num_inference_steps", "num_steps")
+
+
+@pytest.fixture(params=FOLDERS)
+def family(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name
+
+
+@pytest.fixture
+def checkpoint(family: str, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    if not FOLDERS[family].is_dir():
+        pytest.skip(f"no golden reference at {FOLDERS[family]}")
+    return Path(shutil.copytree(FOLDERS[family], tmp_path / "checkpoint"))
+
+
+def load(family: str, checkpoint: Path) -> Any:
+    try:
+        return find_family(family).load(str(checkpoint))
+    except MissingExtraError as error:
+        pytest.skip(str(error))
+
+
+def mappings(value: Any) -> Iterator[dict[str, Any]]:
+    """Every object in a JSON value."""
+    if isinstance(value, dict):
+        yield value
+    for child in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from mappings(child)
+
+
+def edit_json(checkpoint: Path, change: Callable[[dict[str, Any]], bool]) -> int:
+    """Let `change` loose on every object of every JSON file; how many it says it changed."""
+    changed = 0
+    for file in sorted(checkpoint.rglob("*.json")):
+        content = json.loads(file.read_text())
+        here = sum(change(one) for one in list(mappings(content)))
+        if here:
+            file.write_text(json.dumps(content))
+        changed += here
+    return changed
+
+
+def edit_tensors(
+    checkpoint: Path, change: Callable[[str, torch.Tensor], torch.Tensor | None], only: str = ""
+) -> int:
+    """Replace tensors for which `change` gives one; how many."""
+    changed = 0
+    for file in sorted(checkpoint.rglob("*.safetensors")):
+        tensors = load_file(file)
+        new = {
+            name: given
+            for name, old in tensors.items()
+            if only in name and (given := change(name, old)) is not None
+        }
+        if new:
+            save_file({**tensors, **new}, file)
+        changed += len(new)
+    return changed
+
+
+def test_every_family_of_ours_is_looked_at() -> None:
+    from probe_kit.hooks.registry import known_families
+
+    untouched = {"pi0-tiny-early", "prismatic"}
+    acting = {name for name, one in known_families().items() if one.acts and one.loader.startswith("probe_kit.")}
+    assert acting - untouched <= FOLDERS.keys()
+
+
+@pytest.mark.parametrize("kind", [torch.int8, torch.float8_e4m3fn, torch.complex64], ids=str)
+def test_weights_of_a_kind_that_nobody_declared_are_refused(
+    family: str, checkpoint: Path, kind: torch.dtype
+) -> None:
+    done: list[str] = []
+
+    def first(name: str, old: torch.Tensor) -> torch.Tensor | None:
+        if done or not old.is_floating_point() or old.ndim < 2:
+            return None
+        done.append(name)
+        return old.to(kind)
+
+    if not edit_tensors(checkpoint, first):
+        pytest.skip("its weights are no safetensors")
+    with pytest.raises(REFUSALS, match=r"of a kind that no model declares"):
+        load(family, checkpoint)
+
+
+@pytest.mark.parametrize("spoil", ["turned around", "NaN", "text"])
+def test_statistics_that_would_change_what_actions_mean_are_refused(
+    family: str, checkpoint: Path, spoil: str
+) -> None:
+    def bounds(one: dict[str, Any]) -> bool:
+        for low, high in (("q01", "q99"), ("mean", "std")):
+            if isinstance(one.get(low), list) and isinstance(one.get(high), list) and len(one[low]):
+                worse = {
+                    "turned around": (np.asarray(one[high]) + 1, -1 - np.abs(one[high])),
+                    "NaN": (np.asarray(one[low]) * np.nan, np.asarray(one[high])),
+                    "text": (np.asarray(one[low]).astype(str), np.asarray(one[high])),
+                }[spoil]
+                one[low], one[high] = (part.tolist() for part in worse)
+                return True
+        return False
+
+    def stored(name: str, old: torch.Tensor) -> torch.Tensor | None:
+        ends = name.rsplit(".", 1)[-1]
+        if ends not in ("std", "max", "q99") or spoil == "text":
+            return None
+        return -old.abs() - 1e3 if spoil == "turned around" else old * torch.nan
+
+    processors = list(checkpoint.glob("policy_*.safetensors"))
+    if processors:
+        for file in processors:
+            tensors = load_file(file)
+            save_file({n: t if (new := stored(n, t)) is None else new for n, t in tensors.items()}, file)
+    elif not edit_json(checkpoint, bounds):
+        pytest.skip("no statistics of this form")
+    if processors and spoil == "text":
+        pytest.skip("its statistics are tensors")
+    with pytest.raises(CheckpointError):
+        load(family, checkpoint)
+
+
+def test_counts_without_bound_are_refused_before_anything_is_built(family: str, checkpoint: Path) -> None:
+    def absurd(one: dict[str, Any]) -> bool:
+        found = [name for name in COUNTS if type(one.get(name)) is int]
+        one.update(dict.fromkeys(found, 10**12))
+        return bool(found)
+
+    if not edit_json(checkpoint, absurd):
+        pytest.skip("its files hold no such count")
+    with pytest.raises(REFUSALS):
+        load(family, checkpoint)
+
+
+@pytest.mark.parametrize("name", ["../elsewhere.safetensors", "/etc/passwd", "", 7, None, ["a"], "a/b"])
+def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> None:
+    from probe_kit.hooks.checkpoint import missing_weights
+    from probe_kit.hooks.weights import INDEX_FILE, read_weights
+
+    (tmp_path / INDEX_FILE).write_text(json.dumps({"weight_map": {"a": name}}))
+    assert "damaged" in missing_weights(tmp_path)
+    with pytest.raises(WeightsError, match="is damaged"):
+        read_weights(tmp_path)
+
+
+def damage(checkpoint: Path, random: Random) -> str:
+    """One accident, chosen at random; what it was."""
+    file = random.choice([one for one in sorted(checkpoint.rglob("*")) if one.is_file()])
+    kinds = ["cut", "flip", "unlink"] + ["deep", "other", "drop", "wrong", "wrong", "wrong"] * (
+        file.suffix == ".json"
+    )
+    kind = random.choice(kinds)
+    content = file.read_bytes()
+    if kind == "cut":
+        file.write_bytes(content[: random.randrange(len(content) + 1)])
+    elif kind == "flip":
+        at = random.randrange(min(len(content), 4096))
+        file.write_bytes(content[:at] + bytes([content[at] ^ (1 << random.randrange(8))]) + content[at + 1 :])
+    elif kind == "unlink":
+        file.unlink()
+    elif kind in ("deep", "other"):
+        file.write_text("[" * 99_999 if kind == "deep" else random.choice(["null", "[]", '"x"', "{}", "7"]))
+    else:
+        value = json.loads(content)
+        objects = [one for one in mappings(value) if one]
+        if objects:
+            one = random.choice(objects)
+            key = random.choice(sorted(one))
+            if kind == "drop":
+                del one[key]
+            else:
+                one[key] = random.choice(WRONG)
+            file.write_text(json.dumps(value))
+    return f"{kind} {file.name}"
+
+
+def check(family: str, original: Path, place: Path, seed: int) -> None:
+    """Damage a copy, and find it refused by name or acting with finite numbers."""
+    copy = Path(shutil.copytree(original, place / str(seed)))
+    what = damage(copy, Random(seed))
+    observation = Observation(
+        np.full((48, 64, 3), 90, np.uint8), np.zeros(8, np.float32), "Put the cube on the red shape"
+    )
+    refusal, actions = family, np.zeros(1)
+    try:
+        model = load(family, copy)
+        with acting(family):
+            actions = model.act([observation], [0])
+    except ProbeKitError as error:
+        refusal = str(error)
+    assert np.isfinite(actions).all(), (family, seed, what)
+    assert family in refusal or str(copy) in refusal, (family, seed, what, refusal)
+    shutil.rmtree(copy)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_any_accident_is_refused_by_name_or_harmless(
+    family: str, checkpoint: Path, tmp_path: Path, seed: int
+) -> None:
+    check(family, checkpoint, tmp_path, seed)
+
+
+@pytest.mark.slow
+def test_a_hundred_accidents_of_each_family(family: str, checkpoint: Path, tmp_path: Path) -> None:
+    for seed in range(100, 200):
+        check(family, checkpoint, tmp_path, seed)
