@@ -47,7 +47,7 @@ class Option:
             if not isinstance(given, str):
                 raise ValueError
             value = _WORDS[given.lower()] if self.kind is bool else self.kind(given)
-            if self.kind in (int, float) and not abs(value) <= LARGEST:
+            if isinstance(value, int | float) and not abs(value) <= LARGEST:
                 raise ValueError
             return value
         except (ValueError, KeyError, OverflowError):
