@@ -53,8 +53,10 @@ def export(
 ) -> None:
     """Write a run as one ordinary file, with its sha256 beside it."""
     from probe_kit.extract import export_run
+    from probe_kit.extract.store.export import check_format
     from probe_kit.extract.store.locate import locate
 
+    check_format(style)
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")
     with err.status("exporting"):

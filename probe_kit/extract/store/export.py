@@ -30,8 +30,7 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
     Array axes are (episode, call, [iteration,] layer, view or token, feature).
     Raises UsageError for another format or a file that exists, MissingExtraError, RunDamagedError.
     """
-    if style not in _WRITERS:
-        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_WRITERS)}")
+    check_format(style)
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     run = open_run(path, allow_partial)
@@ -46,6 +45,12 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
         aside.rename(out)
     out.with_name(f"{out.name}.sha256").write_text(f"{digest}  {out.name}\n")
     return out
+
+
+def check_format(style: str) -> None:
+    """Raise UsageError for a format that is not offered."""
+    if style not in _WRITERS:
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_WRITERS)}")
 
 
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:

@@ -47,7 +47,7 @@ class Folder(Location):
 
     def beside(self, name: str) -> Path:
         """Next to the folder."""
-        return self._path.with_name(name)
+        return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
 
     def free_bytes(self) -> int:
         """Of the disk where the folder lies or will lie."""
