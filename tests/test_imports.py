@@ -31,11 +31,12 @@ EXTRACT = {
     "plan": {"store"},
     "asking": set(),
     "settings": {"store", "asking"},
+    "needs": {"store", "plan", "settings"},
     "early": {"store", "plan", "settings", "asking"},
     "play": {"store", "plan", "settings", "asking"},
     "prepared": {"store", "plan", "settings", "early", "play", "asking"},
     "crews": {"store", "plan", "settings", "play", "prepared"},
-    "extraction": {"store", "plan", "settings", "early", "play", "prepared", "crews"},
+    "extraction": {"store", "plan", "settings", "needs", "early", "play", "prepared", "crews"},
 }
 
 READS_ONLY = (

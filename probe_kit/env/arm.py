@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.env.arm_models import ArmModel
-from probe_kit.env.bullet import BulletClient
+from probe_kit.env.bullet import BulletClient, import_pybullet
 from probe_kit.env.kinematics import Pose, SerialChain
 from probe_kit.env.rotations import Array, from_rpy, to_rpy
 from probe_kit.env.spec import XYZ, PhysicsSpec
@@ -89,7 +89,10 @@ class Arm:
         client, model = self._client, self.model
         if not urdf.is_file():
             raise SceneError(f"there is no arm description {urdf}; check `arm_urdf`.")
-        body: int = client.loadURDF(str(urdf), model.base, useFixedBase=True)
+        try:
+            body: int = client.loadURDF(str(urdf), model.base, useFixedBase=True)
+        except import_pybullet().error as error:
+            raise SceneError(f"{urdf} cannot be read as a robot ({error}). Give another `arm_urdf`.") from error
         kinds = [client.getJointInfo(body, joint)[2] for joint in range(client.getNumJoints(body))]
         expected = dict.fromkeys(model.joints, client.JOINT_REVOLUTE)
         expected |= dict.fromkeys(model.fingers, client.JOINT_PRISMATIC) | {model.tool: client.JOINT_FIXED}

@@ -6,6 +6,8 @@ import pytest
 
 from probe_kit.env.arm_models import ARMS
 from probe_kit.env.rotations import from_rpy
+from probe_kit.env.scene import Scene
+from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import SceneError
 
 STAY_OPEN = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -74,3 +76,10 @@ def test_the_frame_that_points_down_is_a_rotation(model):
     down = np.array(model.down)
     np.testing.assert_allclose(down @ down.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(down) == pytest.approx(1.0)
+
+
+def test_a_description_that_is_none_is_refused(tmp_path):
+    rubbish = tmp_path / "arm.urdf"
+    rubbish.write_bytes(b"\x00\xff[[[")
+    with pytest.raises(SceneError, match="cannot be read as a robot"):
+        Scene(SceneSpec(arm_urdf=rubbish))
