@@ -50,13 +50,15 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     """Refuse a place that cannot be written, or where a run with other settings lies.
 
     Only settings that are known without the model are compared; the writer compares all of them.
-    Raises UsageError or SettingsMismatchError.
+    Raises UsageError, SettingsMismatchError, or RunDamagedError if what lies there was changed.
     """
+    from probe_kit.extract.store.root import read_root
+
     _check_writable(location)
     with location.in_words():
         if not location.exists(RUN_FILE):
             return
-        stored: dict[str, Any] = json.loads(location.read(RUN_FILE))["settings"]
+        stored: dict[str, Any] = read_root(location).card["settings"]
     known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
     refuse_other_settings({name: stored[name] for name in known}, known, str(location))
 

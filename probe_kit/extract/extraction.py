@@ -15,7 +15,6 @@ from probe_kit.extract.needs import space_needed
 from probe_kit.extract.play.events import Done, Event
 from probe_kit.extract.prepared import Prepared, check_run, load, load_reader
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
-from probe_kit.extract.store.commits import write_failure
 from probe_kit.extract.store.disk import refuse_if_full
 from probe_kit.extract.store.layout import RUN_FILE
 from probe_kit.extract.store.locate import locate
@@ -81,8 +80,7 @@ class Extraction(Prepared):
             if progress and isinstance(event, Done):
                 progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
             if event.number in scheduler.given_up:
-                episode = self.plan.episodes[event.number].episode
-                write_failure(writer.location, event.number, episode.episode_id, scheduler.given_up[event.number])
+                writer.give_up(event.number, scheduler.given_up[event.number])
             if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
                 raise self._failure(scheduler)
 

@@ -15,20 +15,25 @@ DAMAGED = 1
 @app.command("verify")
 def verify(
     run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Read every byte, not only sizes.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Read every byte.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
-    """Compare a run with what its commits promise; exit 1 if anything is missing or changed."""
+    """Compare a run with what it says of itself; exit 1 if anything is missing or changed."""
     from probe_kit.extract import verify_run
+    from probe_kit.extract.store.summary import NOT_PROTECTED
 
     found = verify_run(run, deep)
     if as_json:
         print_json({**asdict(found), "ok": found.ok})
     else:
-        checked = "every byte" if deep else "sizes"
+        checked = "every byte" if deep else "structure and sizes"
         sealed = "sealed" if found.sealed else "not sealed"
         failed = f", {found.failed} failed" if found.failed else ""
         out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
+        if not found.protected:
+            out.print(NOT_PROTECTED, soft_wrap=True)
+        for stray in found.strays:
+            out.print(f"belongs to no part of the run: {stray}", highlight=False, markup=False, soft_wrap=True)
         for problem in found.problems:
             out.print(f"damaged: {problem}", soft_wrap=True)
     if not found.ok:

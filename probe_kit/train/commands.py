@@ -136,6 +136,8 @@ def show(
 def _facts(found: "Inventory") -> "Table":
     from rich.table import Table
 
+    from probe_kit.extract.store.summary import NOT_PROTECTED
+
     missing = found.planned - found.episodes
     outcomes = ", ".join(f"{name} {count}" for name, count in found.outcomes.items())
     facts = {
@@ -147,6 +149,7 @@ def _facts(found: "Inventory") -> "Table":
         "episodes": f"{found.episodes} of {found.planned}" * (missing > 0) or str(found.episodes),
         "wordings": ", ".join(f"{name} {count}" for name, count in found.wordings.items()),
         "failed": str(found.failed or ""),
+        "integrity": "" if found.protected else NOT_PROTECTED,
         "outcomes": outcomes,
         "categories": ", ".join(found.categories),
         **found.streams,

@@ -7,7 +7,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.bundles import Bundle
 from probe_kit.hooks.sites import Site
 
 Place = tuple[str, str, Site]
@@ -52,20 +52,30 @@ def save_directions(directions: Mapping[Place, Direction], file: BinaryIO) -> No
 
 
 class StoredDirections(Mapping[Place, Direction]):
-    """Directions in the file `key` of a run, each read when it is asked for."""
+    """Directions in a file of stored results, each read when it is asked for.
 
-    def __init__(self, run: Location, key: str) -> None:
-        self._run, self._key = run, key
+    All of the file is checked once, before the first. Raises RunDamagedError then.
+    """
+
+    def __init__(self, bundle: Bundle, name: str) -> None:
+        self._bundle, self._name = bundle, name
+        self._checked = False
+
+    def _open(self) -> BinaryIO:
+        if not self._checked:
+            self._bundle.check(self._name)
+            self._checked = True
+        return self._bundle.open(self._name)
 
     def __getitem__(self, place: Place) -> Direction:
         name = "/".join(map(str, place))
-        with self._run.open(self._key) as file, np.load(file, allow_pickle=False) as arrays:
+        with self._open() as file, np.load(file, allow_pickle=False) as arrays:
             if f"{name}/weights" not in arrays:
                 raise KeyError(place)
             return Direction(**{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__})
 
     def __iter__(self) -> Iterator[Place]:
-        with self._run.open(self._key) as file, np.load(file, allow_pickle=False) as arrays:
+        with self._open() as file, np.load(file, allow_pickle=False) as arrays:
             for name in dict.fromkeys(member.rpartition("/")[0] for member in arrays):
                 category, view, site = name.rsplit("/", 2)
                 yield category, view, Site.parse(site)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from probe_kit.errors import NoProbesError
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.bundles import Bundle
 from probe_kit.train.reader import RunReader
 from probe_kit.train.settings import FORMAT
-from probe_kit.train.store import is_current, load_results, read_controls, read_headers, settings_of
+from probe_kit.train.store import is_current, load_results, read_controls, read_probes, settings_of
 from probe_kit.train.unfinished import unfinished_sweeps
 
 
@@ -39,8 +39,9 @@ class Inventory:
     """A run and what is stored with it.
 
     episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
-    in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone. probes:
-    oldest first. unfinished: finished sites of interrupted sweeps, by key.
+    in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone.
+    protected: whether a changed byte is found, as it is not in runs of former versions. probes: oldest first.
+    unfinished: finished sites of interrupted sweeps, by key.
     """
 
     run: str
@@ -54,6 +55,7 @@ class Inventory:
     planned: int
     failed: int
     outcomes: Mapping[str, int]
+    protected: bool
     streams: Mapping[str, str]
     probes: tuple[StoredProbes, ...]
     unfinished: Mapping[str, int]
@@ -75,6 +77,7 @@ def inventory(run: Any) -> Inventory:
         planned=getattr(run, "planned", len(episodes)),
         failed=len(getattr(run, "failed", ())),
         outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
+        protected=getattr(run, "protected", True),
         streams={name: _words(run, name) for name in run.streams},
         probes=tuple(stored_probes(run)),
         unfinished=unfinished_sweeps(run.location),
@@ -91,7 +94,7 @@ def stored_probes(run: Any) -> list[StoredProbes]:
     """Every set of probe results of a run, oldest first."""
     readers = _in_wordings(run)
     used = {_used(one) for one in readers}
-    found = [_probes(readers, key, header, used) for key, header in read_headers(run.location).items()]
+    found = [_probes(readers, bundle, used) for bundle in read_probes(run.location).values()]
     return sorted(found, key=lambda probes: (probes.created, probes.key))
 
 
@@ -102,9 +105,8 @@ def _used(run: RunReader) -> str | None:
         return None
 
 
-def _probes(
-    readers: Sequence[RunReader], key: str, header: Mapping[str, Any], used: Collection[str | None]
-) -> StoredProbes:
+def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
+    key, header = bundle.key, bundle.head
     created = str(header.get("created", ""))
     if not _readable(header):
         return StoredProbes(key, "other version", created)
@@ -122,7 +124,7 @@ def _probes(
         token_permutations=settings.token_permutations,
         seed=settings.seed,
         call=settings.call,
-        controls=_controls(readers[0].location, key),
+        controls=_controls(bundle),
     )
 
 
@@ -131,8 +133,8 @@ def _readable(header: Mapping[str, Any]) -> bool:
     return isinstance(settings, Mapping) and settings.get("format") == FORMAT
 
 
-def _controls(run: Location, key: str) -> tuple[str, ...]:
-    controls = read_controls(run, key)
+def _controls(bundle: Bundle) -> tuple[str, ...]:
+    controls = read_controls(bundle)
     names = dict.fromkeys(score.name for score in controls.baselines)
     twins = dict.fromkeys(f"twin: {score.twin}" for score in controls.twin)
     return (*names, *twins)

@@ -31,7 +31,8 @@ class ProbeResults:
 
     curves: one per (category, view). directions: the probes' weights per (category, view, site). controls: what
     the probes are held against, as far as that was asked for.
-    created: when they were fitted (UTC, ISO 8601); not part of the key.
+    created: when they were fitted (UTC, ISO 8601); not part of the key. stamp: hash of the commits they were
+    fitted to, empty for arrays in memory.
     """
 
     settings: ProbeSettings
@@ -39,6 +40,7 @@ class ProbeResults:
     directions: Mapping[Place, Direction] = field(default_factory=dict)
     controls: Controls = field(default_factory=Controls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
+    stamp: str = ""
 
     def __repr__(self) -> str:
         return results_text(self.settings)

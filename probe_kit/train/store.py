@@ -1,6 +1,6 @@
 """Where probe results live: `RUN/probes/<key>/`, complete or not there.
 
-Results are there when their settings are, which are written last.
+Results are there when their settings are, which are written last, with the hashes of all else; see `bundles`.
 """
 
 import json
@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.extract.store.bundles import HEAD, Bundle, read_bundles, write_bundle
+from probe_kit.extract.store.layout import PROBES
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.hooks.sites import Site
@@ -26,8 +28,7 @@ from probe_kit.train.results import ProbeResults, episodes_sha256
 from probe_kit.train.settings import FORMAT, ProbeSettings
 from probe_kit.train.targets import Target
 
-HOME = "probes"
-SETTINGS, SCORES, DECISIONS = "settings.json", "scores.csv", "decisions.npz"
+SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
 
 
@@ -37,45 +38,58 @@ def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = T
     asked: whether somebody asked for these probes, which `load_results` then prefers to all older ones, rather
     than needing them in passing, as the twin of another run.
     """
-    location, home = locate(run), f"{HOME}/{results.key}"
+    location = locate(run)
     if not is_stored(location, results.key):
-        decisions, directions = BytesIO(), BytesIO()
-        np.savez_compressed(decisions, allow_pickle=False, **_pack(results.curves))
-        save_directions(results.directions, directions)
-        location.write(f"{home}/{SCORES}", results.scores.to_csv(index=False).encode())
-        location.write(f"{home}/{DECISIONS}", decisions.getvalue())
-        location.write(f"{home}/{DIRECTIONS}", directions.getvalue())
-        _save_controls(results, location)
-        _write_header(location, results.key, _header(results, asked))
+        files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
+        _write(location, results.key, _header(results, asked), files | _controls(results))
         return
-    _save_controls(results, location)
-    stored = read_headers(location)
+    stored = {key: bundle.head for key, bundle in read_probes(location).items()}
+    header, found = stored[results.key], _controls(results)
     if asked and results.key != max(_ours(stored), key=lambda key: _rank(key, stored[key])):
-        _write_header(location, results.key, {**stored[results.key], "asked": _now()})
+        header = {**header, "asked": _now()}
+    if found or header != stored[results.key]:
+        _write(location, results.key, header, {**found, **({SCORES: _scores(results)} if found else {})})
+
+
+def _write(run: Location, key: str, header: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
+    write_bundle(run, PROBES, key, header, files)
 
 
 def _header(results: ProbeResults, asked: bool) -> dict[str, Any]:
-    settings = asdict(results.settings)
-    return {"settings": settings, "created": results.created, "asked": _now() if asked else ""}
+    return {
+        "settings": asdict(results.settings),
+        "created": results.created,
+        "asked": _now() if asked else "",
+        "stamp": results.stamp,
+    }
 
 
-def _write_header(run: Location, key: str, header: Mapping[str, Any]) -> None:
-    run.write(f"{HOME}/{key}/{SETTINGS}", json.dumps(header, indent=2).encode())
+def _scores(results: ProbeResults) -> bytes:
+    return results.scores.to_csv(index=False).encode()
 
 
-def _save_controls(results: ProbeResults, run: Location) -> None:
-    """Write the controls beside the probes, over former ones, and what the scores say of them; nothing where
-    nothing was controlled.
-    """
-    if results.controls != Controls():
-        content = json.dumps(results.controls.to_json(), indent=2)
-        run.write(f"{HOME}/{results.key}/{SCORES}", results.scores.to_csv(index=False).encode())
-        run.write(f"{HOME}/{results.key}/{CONTROLS}", content.encode())
+def _decisions(results: ProbeResults) -> bytes:
+    file = BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **_pack(results.curves))
+    return file.getvalue()
+
+
+def _directions(results: ProbeResults) -> bytes:
+    file = BytesIO()
+    save_directions(results.directions, file)
+    return file.getvalue()
+
+
+def _controls(results: ProbeResults) -> dict[str, bytes]:
+    """What the probes were held against, as a file; nothing where nothing was controlled."""
+    if results.controls == Controls():
+        return {}
+    return {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}
 
 
 def is_stored(run: Location, key: str) -> bool:
     """Whether complete results called `key` are there."""
-    return run.exists(f"{HOME}/{key}/{SETTINGS}")
+    return run.exists(f"{PROBES}/{key}/{HEAD}")
 
 
 def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
@@ -85,11 +99,12 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
 
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
     they were fitted then or read back. Results of another format, written by another version of probe_kit, are
-    passed over. Raises NoProbesError if there are none, and UsageError for a key that is not there.
+    passed over. Raises NoProbesError if there are none, UsageError for a key that is not there, and
+    RunDamagedError if any results of the run were changed, lost their settings, or are of other activations.
     """
     location = run.location
-    headers = read_headers(location)
-    stored = _ours(headers)
+    probes = read_probes(location)
+    stored = _ours({name: bundle.head for name, bundle in probes.items()})
     if key is not None:
         found = [name for name in stored if name == key] or [
             name for name in stored if key and name.startswith(key)
@@ -99,14 +114,14 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
                 f"{location} has {'several' if found else 'no'} probe results {key!r}; it has: "
                 f"{', '.join(stored) or 'none'}"
             )
-        return _read(location, found[0], stored[found[0]])
+        return _read(run, probes[found[0]])
     asked = [(name, settings_of(header)) for name, header in stored.items()]
     current = [name for name, settings in asked if (settings.target, settings.call) == (target, 0)]
     current = [name for name in current if is_current(settings_of(stored[name]), run)]
     if not current:
-        raise NoProbesError(_why_none(run, target, len(headers)))
+        raise NoProbesError(_why_none(run, target, len(probes)))
     newest = max(current, key=lambda name: _rank(name, stored[name]))
-    return _read(location, newest, stored[newest])
+    return _read(run, probes[newest])
 
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
@@ -165,11 +180,9 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
     }
 
 
-def read_headers(run: Location) -> dict[str, dict[str, Any]]:
-    """What the settings file of every complete result says, by key."""
-    parts = (key.split("/") for key in run.keys(HOME))
-    names = [own[1] for own in parts if own[2:] == [SETTINGS] and not own[1].startswith(".")]
-    return {name: json.loads(run.read(f"{HOME}/{name}/{SETTINGS}")) for name in names}
+def read_probes(run: Location) -> dict[str, Bundle]:
+    """Every complete result by key, of whatever version. Raises RunDamagedError for one that was changed."""
+    return read_bundles(run, PROBES)
 
 
 def settings_of(header: Mapping[str, Any]) -> ProbeSettings:
@@ -178,16 +191,38 @@ def settings_of(header: Mapping[str, Any]) -> ProbeSettings:
     return ProbeSettings(**{**stored, "categories": tuple(stored["categories"]), "views": tuple(stored["views"])})
 
 
-def read_controls(run: Location, key: str) -> Controls:
-    """What the results called `key` were held against so far."""
-    place = f"{HOME}/{key}/{CONTROLS}"
-    return Controls.from_json(json.loads(run.read(place))) if run.exists(place) else Controls()
+def read_controls(bundle: Bundle) -> Controls:
+    """What results were held against so far. Raises RunDamagedError."""
+    return Controls.from_json(json.loads(bundle.read(CONTROLS))) if bundle.has(CONTROLS) else Controls()
 
 
-def _read(run: Location, key: str, header: Mapping[str, Any]) -> ProbeResults:
-    home = f"{HOME}/{key}"
-    with run.open(f"{home}/{DECISIONS}") as file, np.load(file, allow_pickle=False) as arrays:
+def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
+    settings = settings_of(bundle.head)
+    _refuse_foreign(run, bundle, settings)
+    with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
         curves = _unpack(arrays)
-    controls = read_controls(run, key)
-    directions = StoredDirections(run, f"{home}/{DIRECTIONS}")
-    return ProbeResults(settings_of(header), curves, directions, controls, header["created"])
+    return ProbeResults(
+        settings,
+        curves,
+        StoredDirections(bundle, DIRECTIONS),
+        read_controls(bundle),
+        bundle.head["created"],
+        bundle.head.get("stamp", ""),
+    )
+
+
+def _refuse_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
+    """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
+    stamp, now = bundle.head.get("stamp", ""), stamp_of_run(run)
+    if stamp == now or not (stamp and now):
+        return
+    if settings.run_settings != run.settings_sha256 or is_current(settings, run):
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder} holds probes of other activations than the run has: they were fitted "
+            f"to commits {stamp[:12]}, here are {now[:12]}. Remove it and run the same `probe-kit train` again"
+        )
+
+
+def stamp_of_run(run: RunReader) -> str:
+    """Hash of the commits of a run; empty for one whose settings are the hash of all its numbers."""
+    return str(getattr(run, "stamp", ""))

@@ -21,7 +21,7 @@ from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults, episodes_sha256
 from probe_kit.train.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.settings import ProbeSettings
-from probe_kit.train.store import is_stored, load_results, save_results
+from probe_kit.train.store import is_stored, load_results, save_results, stamp_of_run
 from probe_kit.train.targets import Incomplete, Target
 from probe_kit.train.unfinished import Unfinished
 from probe_kit.train.workers import probe_columns
@@ -206,12 +206,12 @@ def _fit(sweep: _Sweep) -> ProbeResults:
         for (view, site), found in probes.items()
         for category, probe in found.items()
     }
-    return ProbeResults(sweep.settings, curves, directions)
+    return ProbeResults(sweep.settings, curves, directions, stamp=stamp_of_run(sweep.run))
 
 
 def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
-    keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key)
+    keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run))
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
     progress = sweep.progress or notebook_progress("sites probed")
     columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)

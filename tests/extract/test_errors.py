@@ -24,7 +24,9 @@ from probe_kit.extract import Extraction, ExtractSettings, extract_run, open_run
 from probe_kit.extract.crews.ray import RayActor
 from probe_kit.extract.play.stage import LocalStage
 from probe_kit.extract.play.stage_process import ProcessStage
+from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
@@ -145,8 +147,8 @@ def test_the_certificate_holds_what_was_measured_in_every_process(suite: Suite, 
     assert check["actions_with_hooks_sha256"] == check["actions_without_hooks_sha256"]
     assert len(check["actions_with_hooks_sha256"]) == 64
     assert run.certificate["hooks_on_equals_hooks_off"] is True
-    forged = tmp_path / "run" / "certificates" / "forged.json"
-    forged.write_text('{"capture_check": {"actions_with_hooks_sha256": "a", "actions_without_hooks_sha256": "b"}}')
+    differing = {"actions_with_hooks_sha256": "a", "actions_without_hooks_sha256": "b"}
+    write_certificate(run.root, {"capture_check": differing}, provenance_here())
     assert open_run(run.path).certificate["hooks_on_equals_hooks_off"] is False
 
 

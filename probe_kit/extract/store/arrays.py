@@ -13,7 +13,6 @@ from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.location import Location
 
 
 def create_arrays(
@@ -70,9 +69,8 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
     return [blosc, Crc32cCodec()]
 
 
-def open_array(location: Location, group: str, name: str) -> zarr.Array[Any]:
+def open_array(store: Store, name: str) -> zarr.Array[Any]:
     """Open one array for reading; a missing chunk is an error, never a fill value."""
-    store = location.store(group, read_only=True)
     return zarr.open_array(store, path=name, mode="r", config={"read_missing_chunks": False})
 
 

@@ -1,28 +1,34 @@
-"""Verifying a run: everything the commits promise is compared with what is stored."""
+"""Verifying a run: everything that the root and the commits promise is compared with what is stored."""
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.columns import find_columns
+from probe_kit.extract.store.bundles import bundle_problems
+from probe_kit.extract.store.certificates import read_certificate
+from probe_kit.extract.store.columns import Columns, find_columns
 from probe_kit.extract.store.commits import (
     CHECKSUM,
     Commit,
     commit_checksum,
     commit_key,
     committed_sizes,
-    crc32c,
+    numbered,
+    read_commit,
     read_failures,
+    redo,
     stamp_of,
     wrong_size,
 )
-from probe_kit.extract.store.layout import COMMITS, DATA, PLAN_FILE, RUN_FILE
+from probe_kit.extract.store.deep import content_problems
+from probe_kit.extract.store.layout import COMMITS, DATA, RUN_FILE
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.provenance import PROVENANCE, name_of, read_provenances
-from probe_kit.extract.store.run import Run, read_card
+from probe_kit.extract.store.provenance import PROVENANCE, read_provenances
+from probe_kit.extract.store.root import RESTORE, Root, read_root
+from probe_kit.extract.store.strays import stray_keys
 from probe_kit.identity import sha256_json
 
 
@@ -31,7 +37,9 @@ class Audit:
     """What was found.
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
-    deep: whether every byte was read, not only sizes.
+    deep: whether every byte was read, not only sizes. protected: whether hashes bind everything to the root, as in
+    every run that this version writes; in others much can change unseen. strays: objects that belong to no part
+    of the run and that nothing reads, such as copies that somebody made.
     """
 
     path: str
@@ -41,6 +49,8 @@ class Audit:
     sealed: bool
     deep: bool
     problems: tuple[str, ...]
+    protected: bool = True
+    strays: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -49,65 +59,91 @@ class Audit:
 
 
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
-    """Compare a run with its commits: presence and sizes, and with `deep` the checksum of every object.
+    """Compare a run with what it says of itself.
 
-    Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
+    Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, and columns against
+    rows. Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
     """
     location = locate(path)
-    card = read_card(location)
-    planned = json.loads(location.read(PLAN_FILE))["episodes"]
+    try:
+        root = read_root(location)
+        planned = len(root.plan)
+    except RunDamagedError as error:  # nothing can be said of the rest
+        return Audit(str(location), 0, 0, 0, False, deep, (str(error),))
+    problems = list(_root_problems(root))
     commits: dict[int, Commit] = {}
-    problems = list(_settings_problems(card))
-    for name, text in location.read_all(COMMITS, ".json").items():
+    for number, key, raw in numbered(location, COMMITS):
         try:
-            commits[int(name.removesuffix(".json"))] = json.loads(text)
-        except ValueError as error:
-            problems.append(f"{COMMITS}/{name} is no JSON: {error}")
-    sizes = committed_sizes(location, commits)
-    for number, commit in commits.items():
-        problems += _commit_problems(location, number, commit, sizes, deep)
-    problems += _provenance_problems(location, commits)
-    columns = find_columns(location, stamp_of(commits))
-    if deep and columns is not None and not problems:
-        problems += _column_problems(Run(location))
-    failed = len(read_failures(location))
-    return Audit(str(location), len(commits), len(planned), failed, columns is not None, deep, tuple(problems))
+            commits[number] = read_commit(root, number, key, raw)
+        except RunDamagedError as error:
+            problems.append(str(error))
+    problems += _commit_problems(root, commits)
+    problems += _provenance_problems(root, commits)
+    if commits and root.protected:
+        problems += _caught(partial(read_certificate, root))
+    failures: dict[str, str] = {}
+    problems += _caught(lambda: failures.update(read_failures(root)))
+    columns = _columns(root, commits, problems)
+    if columns is not None:
+        problems += columns.problems()
+    problems += bundle_problems(location, deep)
+    if deep:
+        problems += content_problems(root, commits, columns, sound=not problems)
+    return Audit(
+        path=str(location),
+        committed=len(commits),
+        planned=planned,
+        failed=len(failures),
+        sealed=columns is not None,
+        deep=deep,
+        problems=tuple(problems),
+        protected=root.protected,
+        strays=tuple(stray_keys(root, commits, columns, stamp_of(commits)))
+        if root.protected and not problems
+        else (),
+    )
 
 
-def _settings_problems(card: Commit) -> Iterator[str]:
-    if sha256_json(card["settings"]) != card["settings_sha256"]:
+def _caught(look: Callable[[], object]) -> list[str]:
+    """What a look at a part of the run complains of."""
+    try:
+        look()
+    except RunDamagedError as error:
+        return [str(error)]
+    return []
+
+
+def _root_problems(root: Root) -> Iterator[str]:
+    if sha256_json(root.card["settings"]) != root.card["settings_sha256"]:
         yield f"{RUN_FILE}: the settings do not have the hash stored beside them"
+    for key in root.sums:
+        yield from _caught(partial(root.read, key))
 
 
-def _commit_problems(
-    location: Location, number: int, commit: Commit, sizes: Mapping[str, int], deep: bool
-) -> Iterator[str]:
-    name = commit_key(number)
-    if commit_checksum(commit) != commit.get(CHECKSUM):
-        yield f"{name} was changed after it was written"
-    for key, (length, checksum) in commit["objects"].items():
-        problem = wrong_size(sizes, key, length)
-        if problem is None and deep and crc32c(location.read(f"{DATA}/{key}")) != checksum:
-            problem = f"has other bytes than were written (crc32c is not {checksum})"
-        if problem:
-            yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}; delete {name} to redo it"
+def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
+    sizes = committed_sizes(root.location, commits)
+    for number, commit in commits.items():
+        if not root.protected and commit_checksum(commit) != commit.get(CHECKSUM):
+            yield f"{commit_key(number)} was changed after it was written"
+        for key, (length, *_) in commit["objects"].items():
+            if problem := wrong_size(sizes, key, length):
+                yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
 
 
-def _provenance_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
-    stored = read_provenances(location)
+def _provenance_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
+    try:
+        stored = read_provenances(root.location)
+    except RunDamagedError as error:
+        yield str(error)
+        return
     for name in sorted({commit["provenance"] for commit in commits.values() if "provenance" in commit}):
         if name not in stored:
-            yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with"
-        elif name_of(stored[name]) != name:
-            yield f"{PROVENANCE}/{name}.json was changed after it was written"
+            yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with. {RESTORE}"
 
 
-def _column_problems(run: Run) -> Iterator[str]:
-    for stream in run.streams:
-        for view in run.views(stream):
-            for site in run.sites(stream):
-                for call in range(run.captured_calls):
-                    try:
-                        run.column(site, view, call)
-                    except RunDamagedError as error:
-                        yield str(error)
+def _columns(root: Root, commits: Mapping[int, Commit], problems: list[str]) -> Columns | None:
+    try:
+        return find_columns(root, stamp_of(commits))
+    except RunDamagedError as error:
+        problems.append(str(error))
+        return None

@@ -192,6 +192,10 @@ class Bucket(Location):
                 raise obstore.exceptions.GenericError(str(error)) from error
         return True
 
+    def delete(self, key: str) -> None:
+        """One request."""
+        self._delete([key])
+
     def remove(self, folder: str) -> None:
         """A listing, then bulk deletions."""
         self._delete(self.keys(folder))

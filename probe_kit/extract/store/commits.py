@@ -1,63 +1,37 @@
 """Commits: the small record that makes an episode count, written last and exactly once."""
 
-import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import google_crc32c
-from zarr.abc.store import Store
-from zarr.core.buffer import Buffer
-from zarr.storage import WrapperStore
 
 from probe_kit.errors import RunDamagedError
+from probe_kit.extract.store.hashes import HASH, Sum, as_record, read_plain, read_record, read_sums
 from probe_kit.extract.store.layout import COMMITS, DATA, FAILED
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.root import Root
 from probe_kit.identity import canonical_json, sha256_json
 
 Commit = dict[str, Any]
 CHECKSUM = "crc32c"
-
-
-class RecordingStore(WrapperStore[Store]):
-    """Passes writes on and remembers key, length and crc32c of every object."""
-
-    def __init__(self, store: Store) -> None:
-        super().__init__(store)
-        self.objects: dict[str, tuple[int, str]] = {}
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write one object."""
-        self._record(key, value)
-        await super().set(key, value)
-
-    def set_sync(self, key: str, value: Buffer) -> None:
-        """Write one object from synchronous code."""
-        self._record(key, value)
-        super().set_sync(key, value)
-
-    def _record(self, key: str, value: Buffer) -> None:
-        content = value.to_bytes()
-        self.objects[key] = (len(content), crc32c(content))
+"""What commits of former versions carry instead of a hash."""
+_NUMBERED = re.compile(r"(\d{8})\.json")
 
 
 def crc32c(content: bytes) -> str:
-    """The checksum commits carry, as eight hex digits."""
+    """The checksum that commits of former versions carry, as eight hex digits."""
     return f"{google_crc32c.value(content):08x}"
 
 
-def as_json(content: Mapping[str, Any]) -> bytes:
-    """The one way JSON is written in a run: keys sorted, a line each."""
-    return json.dumps(content, sort_keys=True, indent=1, allow_nan=False).encode()
-
-
 def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:
-    """Write JSON under `key` unless it exists; True if this call wrote it. Exclusive and atomic."""
-    return location.create(key, as_json(content))
+    """Write a record under `key` unless it exists; True if this call wrote it. Exclusive and atomic."""
+    return location.create(key, as_record(content))
 
 
 def write_commit(location: Location, number: int, commit: Commit) -> bool:
     """Make episode `number` count; False if another writer was first."""
-    return create_once(location, commit_key(number), {**commit, CHECKSUM: commit_checksum(commit)})
+    return create_once(location, commit_key(number), commit)
 
 
 def commit_key(number: int) -> str:
@@ -66,29 +40,62 @@ def commit_key(number: int) -> str:
 
 
 def commit_checksum(commit: Commit) -> str:
-    """crc32c over everything else a commit says."""
+    """crc32c over everything else that a commit of a former version says."""
     return crc32c(canonical_json({key: value for key, value in commit.items() if key != CHECKSUM}).encode())
 
 
-def read_commits(location: Location) -> dict[int, Commit]:
-    """All commits by episode number, each checked against the sizes of the objects it names.
+def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
+    """Number, key and content of the objects `<eight digits>.json` in `folder`.
 
-    Raises RunDamagedError naming the first object that is missing or has another size.
+    Other names are nobody's, such as those that file managers give to copies.
     """
-    commits: dict[int, Commit] = {
-        int(name.removesuffix(".json")): json.loads(text)
-        for name, text in location.read_all(COMMITS, ".json").items()
-    }
+    for name, raw in location.read_all(folder, ".json").items():
+        if found := _NUMBERED.fullmatch(name):
+            yield int(found[1]), f"{folder}/{name}", raw
+
+
+def read_commits(root: Root) -> dict[int, Commit]:
+    """All commits by episode number, each checked, and against the sizes of the objects it names.
+
+    Raises RunDamagedError naming the first commit that was changed or belongs elsewhere, or the first object that
+    is missing or has another size.
+    """
+    location = root.location
+    commits = {number: read_commit(root, number, key, raw) for number, key, raw in numbered(location, COMMITS)}
     sizes = committed_sizes(location, commits)
     for number, commit in commits.items():
-        for key, (length, _) in commit["objects"].items():
+        for key, (length, *_) in commit["objects"].items():
             problem = wrong_size(sizes, key, length)
             if problem:
                 raise RunDamagedError(
-                    f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. Delete "
-                    f"{commit_key(number)} and run the same `probe-kit extract` again to redo the episode"
+                    f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
                 )
     return commits
+
+
+def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
+    """One commit. Raises RunDamagedError if it was changed, or belongs to another episode or run."""
+    name = f"{root.location}/{key}"
+    if not root.protected:
+        return read_plain(raw, name, redo(number))
+    commit = read_record(raw, name, redo(number))
+    planned = root.planned.get(number)
+    if planned is None:
+        raise RunDamagedError(
+            f"{name} commits an episode that the run does not plan; it has {len(root.plan)}. Remove it"
+        )
+    expected = {"run": root.identity, "episode": number, "episode_id": planned["episode_id"]}
+    if wrong := [f"{part} {commit.get(part)}" for part, value in expected.items() if commit.get(part) != value]:
+        raise RunDamagedError(
+            f"{name} is the commit of {', '.join(wrong)}; in this place belongs that of episode {number}, "
+            f"{planned['episode_id']}, of run {root.identity}. {redo(number)}"
+        )
+    return commit
+
+
+def redo(number: int) -> str:
+    """What to do about a damaged episode."""
+    return f"Delete {commit_key(number)} and run the same `probe-kit extract` again to redo the episode"
 
 
 def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[str, int]:
@@ -96,9 +103,17 @@ def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[s
     return location.sizes(DATA, (key for commit in commits.values() for key in commit["objects"]))
 
 
+def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:
+    """Sums of all that may be read in `data.zarr`, by key: metadata, and what commits name."""
+    sums = dict(root.metadata)
+    for commit in commits.values():
+        sums |= read_sums(commit["objects"])
+    return sums
+
+
 def stamp_of(commits: Mapping[int, Commit]) -> str:
     """Hash of all commits: what derived files say they were made from."""
-    return sha256_json([[number, commits[number]] for number in sorted(commits)])
+    return sha256_json([[number, commits[number].get(HASH, commits[number])] for number in sorted(commits)])
 
 
 def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
@@ -108,12 +123,20 @@ def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
     return None if sizes[key] == length else f"has {sizes[key]} bytes; its commit says {length} bytes"
 
 
-def write_failure(location: Location, number: int, episode_id: str, reason: str) -> None:
+def write_failure(root: Root, number: int, reason: str) -> None:
     """Record why an episode was given up."""
-    create_once(location, f"{FAILED}/{number:08d}.json", {"episode_id": episode_id, "reason": reason})
+    failure = {"run": root.identity, "episode": number, "episode_id": root.planned[number]["episode_id"]}
+    create_once(root.location, f"{FAILED}/{number:08d}.json", {**failure, "reason": reason})
 
 
-def read_failures(location: Location) -> dict[str, str]:
-    """Reason by episode id of every episode that was given up."""
-    records = [json.loads(text) for text in location.read_all(FAILED, ".json").values()]
-    return {record["episode_id"]: record["reason"] for record in records}
+def read_failures(root: Root) -> dict[str, str]:
+    """Reason by episode id of every episode that was given up. Raises RunDamagedError."""
+    advice = "Remove it; the same `probe-kit extract` tries the episode again"
+    reasons = {}
+    for number, key, raw in numbered(root.location, FAILED):
+        name = f"{root.location}/{key}"
+        failure = read_record(raw, name, advice) if root.protected else read_plain(raw, name, advice)
+        if root.protected and (failure["run"], failure["episode"]) != (root.identity, number):
+            raise RunDamagedError(f"{name} belongs to another run or episode. {advice}")
+        reasons[failure["episode_id"]] = failure["reason"]
+    return reasons

@@ -111,6 +111,10 @@ class Folder(Location):
         with _written_aside(path, content, flush=False) as aside:
             aside.replace(path)
 
+    def delete(self, key: str) -> None:
+        """The file."""
+        (self._path / key).unlink(missing_ok=True)
+
     def remove(self, folder: str) -> None:
         """The folder and all in it."""
         shutil.rmtree(self._path / folder, ignore_errors=True)

@@ -1,16 +1,20 @@
 """The files of a run: their names, and how a stream lies in them. Only this package knows them.
 
 RUN/
-  run.json           settings and the sha256 of their canonical form
+  run.json           the root: settings, streams, hashes of the plan and of all metadata, and its own
   plan.json          the episodes in order
-  commits/<n>.json   one per finished episode, written last
+  commits/<n>.json   one per finished episode, written last: hashes of its objects, and its own
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
   data.zarr/         <stream>/pooled and, with --tokens all, <stream>/tokens
   columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
+  sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
   videos/            GIFs, if asked for
   frames/<n>.webp    first and last frame of an episode, see `thumbnails`
+
+Every object is bound to the root by hashes, see `hashes`; videos and frames alone are not, because no number,
+label or claim comes from them.
 """
 
 from collections.abc import Mapping
@@ -21,13 +25,17 @@ import numpy as np
 
 from probe_kit.hooks.sites import QUANTITIES, Part, Site, Stream
 
-SCHEMA_VERSION = 2
-READABLE = (1, 2)
+SCHEMA_VERSION = 3
+READABLE = (1, 2, 3)
 """Schemas that can be read; only runs of the last one are continued."""
+PROTECTED_SINCE = 3
+"""From this schema on hashes bind everything to the root."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
-FRAMES, CERTIFICATES = "frames", "certificates"
+FRAMES, CERTIFICATES, SEALED, PROBES = "frames", "certificates", "sealed", "probes"
+ILLUSTRATIONS = (FRAMES, VIDEOS)
+"""What no hash covers: pictures for people."""
 CODECS = ("zstd", "fast", "none")
 
 

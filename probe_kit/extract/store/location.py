@@ -82,6 +82,10 @@ class Location(ABC):
         """Write an object over whatever is there. Whole or not at all."""
 
     @abstractmethod
+    def delete(self, key: str) -> None:
+        """Remove one object, if it is there."""
+
+    @abstractmethod
     def remove(self, folder: str) -> None:
         """Remove everything below `folder`, if there is anything."""
 

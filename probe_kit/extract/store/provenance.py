@@ -6,8 +6,8 @@ Settings say what was asked for; provenance says what answered. Numbers made on 
 libraries are not the same numbers, so a run is not continued there unless that is asked for, and then says so.
 """
 
-import json
 import platform
+import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import probe_kit.version
-from probe_kit.errors import SettingsMismatchError
+from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract.store.commits import create_once
+from probe_kit.extract.store.hashes import HASH, is_record, read_plain, read_record
 from probe_kit.extract.store.location import Location
 from probe_kit.identity import sha256_json, sha256_text
 
@@ -24,6 +25,8 @@ Provenance = Mapping[str, Any]
 
 PROVENANCE = "provenance"
 DIGITS = 16
+_NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
+_RESTORE = "Restore it from a copy, or extract the run again"
 _LIBRARIES = ("torch", "lerobot", "transformers", "timm", "pybullet", "zarr", "numcodecs", "numpy", "pillow")
 DECISIVE = ("device", "dtype", *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")))
 """What changes numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
@@ -81,9 +84,21 @@ def keep_provenance(location: Location, provenance: Provenance) -> None:
 
 
 def read_provenances(location: Location) -> dict[str, Provenance]:
-    """Every provenance of a run by its name; a run made before there was any has none."""
-    stored = location.read_all(PROVENANCE, ".json")
-    return {name.removesuffix(".json"): json.loads(text) for name, text in stored.items()}
+    """Every provenance of a run by its name; a run made before there was any has none.
+
+    Raises RunDamagedError if one is not what its name says.
+    """
+    found: dict[str, Provenance] = {}
+    for file, raw in location.read_all(PROVENANCE, ".json").items():
+        if not _NAMED.fullmatch(file):
+            continue  # a copy that somebody made
+        where, name = f"{location}/{PROVENANCE}/{file}", file.removesuffix(".json")
+        content = read_record(raw, where, _RESTORE) if is_record(raw) else read_plain(raw, where, _RESTORE)
+        content.pop(HASH, None)
+        if name_of(content) != name:
+            raise RunDamagedError(f"{where} was changed after it was written. {_RESTORE}")
+        found[name] = content
+    return found
 
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:

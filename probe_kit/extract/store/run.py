@@ -1,6 +1,5 @@
 """Reading a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
 
-import json
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
@@ -10,32 +9,36 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from zarr.abc.store import Store
 
 from probe_kit.errors import (
     NoTrajectoryError,
     RunDamagedError,
     RunIncompleteError,
-    RunNotFoundError,
     UnknownSiteError,
     UsageError,
 )
 from probe_kit.extract.store.arrays import open_array
+from probe_kit.extract.store.certificates import read_certificate
+from probe_kit.extract.store.checking import CheckedStore
 from probe_kit.extract.store.columns import Columns, find_columns
-from probe_kit.extract.store.commits import Commit, read_commits, read_failures, stamp_of
-from probe_kit.extract.store.layout import (
-    CERTIFICATE_FILE,
-    CERTIFICATES,
-    DATA,
-    PLAN_FILE,
-    READABLE,
-    RUN_FILE,
-    StoredStream,
+from probe_kit.extract.store.commits import (
+    Commit,
+    committed_sums,
+    read_commits,
+    read_failures,
+    redo,
+    stamp_of,
 )
+from probe_kit.extract.store.hashes import Sum
+from probe_kit.extract.store.layout import DATA, StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import PROVENANCE, Provenance, differences, read_provenances
+from probe_kit.extract.store.root import RESTORE, read_root
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
-from probe_kit.extract.store.summary import run_html, run_text, what_to_open
+from probe_kit.extract.store.summary import run_html, run_text
+from probe_kit.extract.store.trajectories import NAME as TRAJECTORY
 from probe_kit.extract.store.trajectories import Trajectories, has_trajectories
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.views import resolve_view
@@ -55,7 +58,7 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
 
     allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
     Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
-    is another one or a committed object is missing.
+    is another one, a committed object is missing, or plan, metadata or a commit is not what was written.
     """
     run = Run(locate(path))
     done = len(run.episodes)
@@ -68,17 +71,6 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     return run
 
 
-def read_card(location: Location) -> dict[str, Any]:
-    """What `run.json` says. Raises RunNotFoundError if there is none."""
-    try:
-        card: dict[str, Any] = json.loads(location.read(RUN_FILE))
-    except FileNotFoundError:
-        raise RunNotFoundError(
-            f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}"
-        ) from None
-    return card
-
-
 class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
@@ -87,12 +79,9 @@ class Run:
 
     def __init__(self, location: Location, wording: str | None = None) -> None:
         self.location, self.wording = location, wording
-        card = read_card(location)
-        if card["schema_version"] not in READABLE:
-            raise RunDamagedError(
-                f"{location} has schema {card['schema_version']}; this version of probe_kit reads "
-                f"{', '.join(map(str, READABLE))}. Update it"
-            )
+        self.root = read_root(location)
+        self.root.check()
+        card = self.root.card
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
         self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
@@ -107,6 +96,11 @@ class Run:
     def path(self) -> Path:
         """The run's folder. Raises UsageError if it lies in an object store."""
         return self.location.path
+
+    @property
+    def protected(self) -> bool:
+        """Whether every changed byte is found when it is read; runs of former versions are not so protected."""
+        return self.root.protected
 
     @property
     def model(self) -> str:
@@ -142,8 +136,7 @@ class Run:
         answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
         episodes.
         """
-        certificate: dict[str, Any] = json.loads(self.location.read(CERTIFICATE_FILE))
-        processes = [json.loads(text) for text in self.location.read_all(CERTIFICATES, ".json").values()]
+        certificate, processes = read_certificate(self.root)
         if not processes:  # a run of schema 1
             return certificate
         checks = [process["capture_check"] for process in processes if process.get("capture_check")]
@@ -167,7 +160,7 @@ class Run:
         if missing := [name for name in named if name not in stored]:
             raise RunDamagedError(
                 f"{self.location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was "
-                "there when they were committed. Restore it from a copy, or extract the run again"
+                f"there when they were committed. {RESTORE}"
             )
         return {name: stored[name] for name in named}
 
@@ -204,7 +197,7 @@ class Run:
 
     @cached_property
     def _commits(self) -> dict[int, Commit]:
-        return read_commits(self.location)
+        return read_commits(self.root)
 
     def commits(self) -> list[Commit]:
         """The commit of every episode, in the order of `episodes`."""
@@ -222,7 +215,7 @@ class Run:
     @cached_property
     def failed(self) -> dict[str, str]:
         """Episodes that were given up, with the reason."""
-        return read_failures(self.location)
+        return read_failures(self.root)
 
     @cached_property
     def planned(self) -> int:
@@ -231,25 +224,20 @@ class Run:
 
     @cached_property
     def _plan(self) -> list[dict[str, Any]]:
-        return [e for e in self._whole_plan if self.wording is None or e["wording"] == self.wording]
-
-    @cached_property
-    def _whole_plan(self) -> list[dict[str, Any]]:
-        episodes: list[dict[str, Any]] = json.loads(self.location.read(PLAN_FILE))["episodes"]
-        return episodes
+        return [e for e in self.root.plan if self.wording is None or e["wording"] == self.wording]
 
     @cached_property
     def _columns_rows(self) -> NDArray[np.intp] | slice:
         """Which rows of the columns, which hold every committed episode, are those of `episodes`."""
         if self.wording is None:
             return slice(None)
-        sealed = [planned["episode"] for planned in self._whole_plan if planned["episode"] in self._commits]
+        sealed = [planned["episode"] for planned in self.root.plan if planned["episode"] in self._commits]
         return np.flatnonzero(np.isin(sealed, self._numbers))
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
         """One row per committed episode: the plan's columns, then the outcome's."""
-        plan = {planned["episode"]: planned for planned in self._plan}
+        plan = self.root.planned
         return pd.DataFrame([{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers])
 
     # -- trajectories ----------------------------------------------------------------------------------
@@ -257,7 +245,7 @@ class Run:
     @cached_property
     def has_trajectories(self) -> bool:
         """Whether episodes keep what happened in them step by step; runs made before it was stored do not."""
-        return has_trajectories(self.location)
+        return has_trajectories(self.root)
 
     @cached_property
     def trajectories(self) -> Trajectories:
@@ -267,7 +255,8 @@ class Run:
                 f"{self.location} keeps no trajectories; it was made before they were stored. Extract it again to "
                 "have them"
             )
-        return Trajectories(self.location, self._numbers, self.episodes["steps"].astype(int).tolist())
+        rows = Rows(open_array(self.data, TRAJECTORY), self._numbers)
+        return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
 
     def trajectory(self, episode: str | int) -> "Trajectory":
         """What happened in one episode, frame by frame; `.to_xarray()` labels it.
@@ -353,20 +342,21 @@ class Run:
         view = resolve_view(view, stored.views)
         if view not in stored.views:
             raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
-        if self._columns is None:
+        if self.columns is None:
             self._note_slow_reading()
             index: tuple[Any, ...] = (slice(None), call, *stored.at(site), stored.views.index(view))
             return np.asarray(self._pooled(site.stream)[index])
-        return self._columns.column(stored, site, view, call)[self._columns_rows]
+        return self.columns.column(stored, site, view, call)[self._columns_rows]
 
     @property
     def sealed(self) -> bool:
         """Whether columns were built from exactly the episodes that are committed."""
-        return self._columns is not None
+        return self.columns is not None
 
     @cached_property
-    def _columns(self) -> Columns | None:
-        return find_columns(self.location, self.stamp)
+    def columns(self) -> Columns | None:
+        """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
+        return find_columns(self.root, self.stamp)
 
     def _note_slow_reading(self) -> None:
         warnings.warn(
@@ -378,7 +368,24 @@ class Run:
 
     def rows(self, stream: str, kind: Literal["pooled", "tokens"] = "pooled") -> Rows:
         """The stored rows of the committed episodes: all that was captured in one episode at a time."""
-        return Rows(open_array(self.location, DATA, f"{stream}/{kind}"), self._numbers)
+        return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
+
+    @property
+    def data(self) -> Store:
+        """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
+        store = self.location.store(DATA, read_only=True)
+        if not self.protected:
+            return store
+        return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
+
+    @cached_property
+    def _sums(self) -> dict[str, Sum]:
+        return committed_sums(self.root, self._commits)
+
+    def _advice(self, key: str) -> str:
+        """What to do about a damaged object of `data.zarr`."""
+        of = next((number for number, commit in self._commits.items() if key in commit["objects"]), None)
+        return RESTORE if of is None else redo(of)
 
     def _pooled(self, stream: str) -> NDArray[np.float32]:
         """(E, S, [I,] L, V, D) rows of the committed episodes, read once per stream."""
@@ -400,11 +407,11 @@ class Run:
 
         arrays = {}
         for name, stored in self._streams.items():
-            if self._columns is None:
+            if self.columns is None:
                 dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
                 array = xr.DataArray(self._pooled(name), dims=dimensions)
             else:
-                array = self._columns.xarray(name).isel(episode=self._columns_rows)
+                array = self.columns.xarray(name).isel(episode=self._columns_rows)
             own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
             old = {"step": "call"} if "step" in array.dims else {}  # its name in runs of schema 1
             array = array.rename({**old, **own}).transpose("episode", "call", *own.values())

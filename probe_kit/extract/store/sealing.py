@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 import zarr
+from numpy.typing import NDArray
 
 from probe_kit.extract.store.arrays import codecs
-from probe_kit.extract.store.layout import COLUMNS
+from probe_kit.extract.store.columns import write_seal
+from probe_kit.extract.store.layout import COLUMNS, SEALED
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.recording import RecordingStore
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.views import PADDING
 
@@ -33,12 +36,16 @@ def seal(path: Path | str | Location) -> bool:
 def _seal(run: Run) -> bool:
     if not run.streams or run.episodes.empty or run.sealed:
         return False
-    with run.location.rebuilding(COLUMNS, run.stamp) as store:
+    run.location.remove(SEALED)  # nothing counts that is not whole
+    with run.location.rebuilding(COLUMNS, run.stamp) as place:
+        store = RecordingStore(place)
         group = zarr.open_group(store, mode="w", zarr_format=3)
         for name in run.streams:
             _write_pooled(run, name, group)
             _write_roles(run, name, group)
-        group.attrs["stamp"] = run.stamp  # what makes them count, so last
+        group.attrs["stamp"] = run.stamp
+    if run.protected:
+        write_seal(run.root, run.stamp, store.sums)  # what makes them count, so last
     return True
 
 
@@ -46,7 +53,7 @@ def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:
     stored = run.stored(name)
     rows = run.rows(name)
     calls, episodes = rows.array.shape[1], len(rows)
-    block = min(episodes, EPISODES_PER_CHUNK)
+    block = _block(episodes)
     lead = (calls, len(stored.views), *stored.lead)
     array = group.create_array(
         f"{name}/pooled",
@@ -59,17 +66,29 @@ def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:
         attributes={"views": list(stored.views)},
         config={"write_empty_chunks": True},
     )
-    cells = list(np.ndindex(*lead))
-    for start in range(0, episodes, block):
-        stop = min(start + block, episodes)
+    for index, column in columns_of_rows(run, name):
+        array[index] = column
+
+
+def columns_of_rows(run: "Run", name: str) -> Iterator[tuple[tuple[Any, ...], NDArray[np.float32]]]:
+    """Every chunk of the pooled columns of a stream as its rows have it: where it belongs, and (E, D) values."""
+    stored, rows = run.stored(name), run.rows(name)
+    episodes = len(rows)
+    cells = list(np.ndindex(rows.array.shape[1], len(stored.views), *stored.lead))
+    for start in range(0, episodes, _block(episodes)):
+        stop = min(start + _block(episodes), episodes)
         for slab in _slabs(cells, (stop - start) * stored.width * 4):
             values = np.empty((len(slab), stop - start, stored.width), np.float32)
             for position in range(start, stop):
                 row = np.moveaxis(rows[position], -2, 1)
                 values[:, position - start] = row[tuple(np.transpose(slab))]
             for cell, column in zip(slab, values, strict=True):
-                index: tuple[Any, ...] = (*cell, slice(start, stop))
-                array[index] = column
+                yield (*cell, slice(start, stop)), column
+
+
+def _block(episodes: int) -> int:
+    """Episodes per chunk."""
+    return min(episodes, EPISODES_PER_CHUNK)
 
 
 def _slabs(cells: list[tuple[int, ...]], bytes_per_cell: int) -> Iterator[list[tuple[int, ...]]]:

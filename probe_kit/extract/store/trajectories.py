@@ -16,9 +16,9 @@ from zarr.core.array_spec import ArrayConfigLike
 
 from probe_kit.env.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.arrays import codecs, open_array
+from probe_kit.extract.store.arrays import codecs
 from probe_kit.extract.store.layout import DATA
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.root import Root
 from probe_kit.extract.store.rows import Rows
 
 NAME = "trajectory"
@@ -40,9 +40,10 @@ def create_trajectories(store: Store, episodes: int, frames: int, codec: str) ->
     )
 
 
-def has_trajectories(location: Location) -> bool:
+def has_trajectories(root: Root) -> bool:
     """Whether the run was begun with room for them."""
-    return location.exists(f"{DATA}/{NAME}/zarr.json")
+    metadata = f"{NAME}/zarr.json"
+    return metadata in root.metadata if root.protected else root.location.exists(f"{DATA}/{metadata}")
 
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
@@ -56,17 +57,16 @@ def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], con
 class Trajectories:
     """The trajectories of the committed episodes of a run, in their order; read one at a time.
 
-    numbers: the plan's number of every committed episode. steps: how many actions each had.
+    rows: of the array `trajectory`. steps: how many actions every committed episode had. where: the run's name.
     Raises RunDamagedError if a channel that is read today is not among the stored ones.
     """
 
-    def __init__(self, location: Location, numbers: Sequence[int], steps: Sequence[int]) -> None:
-        self._location, self._steps = location, steps
-        self._rows = Rows(open_array(location, DATA, NAME), numbers)
+    def __init__(self, rows: Rows, steps: Sequence[int], where: str) -> None:
+        self._rows, self._steps, self._where = rows, steps, where
         channels = [str(name) for name in cast("list[str]", self._rows.array.attrs["channels"])]
         if lacking := [name for name in CHANNELS if name not in channels]:
             raise RunDamagedError(
-                f"the trajectories of {location} lack {', '.join(lacking)}; another version of probe_kit stored "
+                f"the trajectories of {where} lack {', '.join(lacking)}; another version of probe_kit stored "
                 "them. Read them with the version that the run's provenance names"
             )
         self._columns = [channels.index(name) for name in CHANNELS]
@@ -79,7 +79,7 @@ class Trajectories:
         row, frames = self._rows[position], self._steps[position] + 1
         if frames > len(row):
             raise RunDamagedError(
-                f"a trajectory of {self._location} has room for {len(row)} frames; its outcome says {frames - 1} "
+                f"a trajectory of {self._where} has room for {len(row)} frames; its outcome says {frames - 1} "
                 "actions. Check the run with `probe-kit run verify --deep`"
             )
         return Trajectory.of_frames(row[:frames, self._columns])

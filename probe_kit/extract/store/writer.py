@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,12 @@ from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.extract.plan import Plan, PlannedEpisode
-from probe_kit.extract.settings import refuse_other_settings
+from probe_kit.extract.settings import refuse_other_plan, refuse_other_settings
 from probe_kit.extract.store.arrays import create_arrays
-from probe_kit.extract.store.commits import RecordingStore, as_json, create_once, read_commits, write_commit
-from probe_kit.extract.store.layout import (
-    CERTIFICATE_FILE,
-    CERTIFICATES,
-    DATA,
-    FAILED,
-    PLAN_FILE,
-    RUN_FILE,
-    SCHEMA_VERSION,
-)
+from probe_kit.extract.store.certificates import write_certificate
+from probe_kit.extract.store.commits import read_commits, write_commit, write_failure
+from probe_kit.extract.store.hashes import as_json
+from probe_kit.extract.store.layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import (
     Provenance,
@@ -36,9 +31,10 @@ from probe_kit.extract.store.provenance import (
     read_provenances,
     refuse_other_provenance,
 )
-from probe_kit.extract.store.run import read_card
+from probe_kit.extract.store.recording import RecordingStore
+from probe_kit.extract.store.root import Root, new_root, read_root
 from probe_kit.extract.store.trajectories import create_trajectories, has_trajectories, write_trajectory
-from probe_kit.identity import canonical_json, sha256_json
+from probe_kit.identity import canonical_json
 
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
 # a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
@@ -66,7 +62,8 @@ class RunWriter:
     """Creates a run or continues the one that is there; any number of processes may do so at once.
 
     provenance: of this process, by default of one that computes on the CPU.
-    Raises SettingsMismatchError if the location holds a run with other settings, or anything else.
+    Raises SettingsMismatchError if the location holds a run with other settings or another plan, or anything
+    else, and RunDamagedError if what it holds was changed.
     """
 
     def __init__(
@@ -78,7 +75,7 @@ class RunWriter:
         self.settings = json.loads(canonical_json(settings))
         if not location.exists(RUN_FILE):
             location.found(self._beginning(), last=RUN_FILE)
-        self._refuse_other_settings()
+        self.root = self._continued()
 
     def _beginning(self) -> dict[str, bytes]:
         """Every object a run has before its first episode."""
@@ -95,28 +92,27 @@ class RunWriter:
         if "scene" in self.settings and "ask" not in self.settings:  # who is asked does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
-        run = {
-            "schema_version": SCHEMA_VERSION,
-            "settings": self.settings,
-            "settings_sha256": sha256_json(self.settings),
-            "streams": [stream.to_json() for stream in self.plan.streams],
-        }
-        return {
+        objects = {
             PLAN_FILE: as_json({"episodes": [e.to_json() for e in self.plan.episodes]}),
             **{f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()},
-            RUN_FILE: as_json(run),
         }
+        streams = [stream.to_json() for stream in self.plan.streams]
+        return {**objects, RUN_FILE: new_root(self.settings, streams, objects)}
 
-    def _refuse_other_settings(self) -> None:
-        stored = read_card(self.location)
+    def _continued(self) -> Root:
+        """The root of the run that is there, which must be the one that would be begun here."""
+        root = read_root(self.location)
         asked = {"schema_version": SCHEMA_VERSION, **self.settings}
-        there = {"schema_version": stored["schema_version"], **stored["settings"]}
+        there = {"schema_version": root.card["schema_version"], **root.card["settings"]}
         refuse_other_settings(there, asked, str(self.location))
+        root.check()
+        refuse_other_plan(root.plan, [episode.to_json() for episode in self.plan.episodes], str(self.location))
+        return root
 
     @cached_property
     def _keeps_trajectories(self) -> bool:
         """Not in a run that was begun before there were any: all of its episodes stay alike."""
-        return has_trajectories(self.location)
+        return has_trajectories(self.root)
 
     def several_may_write(self) -> bool:
         """Whether the location keeps the first of two objects of one key, which commits rely on."""
@@ -146,36 +142,41 @@ class RunWriter:
 
     def remaining(self) -> list[int]:
         """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
-        done = read_commits(self.location)
+        done = read_commits(self.root)
         return [episode.index for episode in self.plan.episodes if episode.index not in done]
 
     def write(self, episode: EpisodeRecord) -> None:
         """Store one episode: first its arrays, then the commit that makes it count."""
         self._say_who_plays()  # before any commit names it
+        self.write_certificate({})
         planned = episode.planned
         store = RecordingStore(self.location.store(DATA))
         for kind, by_stream in episode.arrays.items():
             for stream, values in by_stream.items():
                 array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
+                if array.shards:
+                    store.shards[f"{stream}/{kind}"] = prod(array.shards) // prod(array.chunks)
                 array[planned.index] = values
         if episode.trajectory is not None and self._keeps_trajectories:
             write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
         commit = {
+            "run": self.root.identity,
+            "episode": planned.index,
             "episode_id": planned.episode.episode_id,
             "outcome": episode.outcome,
             "roles": episode.roles,
             "provenance": name_of(self.provenance),
             **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
-            "objects": {key: list(record) for key, record in sorted(store.objects.items())},
+            "objects": {key: one.to_json() for key, one in store.sums.items()},
         }
         write_commit(self.location, planned.index, commit)
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
         """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""
-        if self._certified:
-            return
-        own = json.loads(json.dumps({**certificate, "provenance": name_of(self.provenance)}, default=list))
-        if not self.location.exists(CERTIFICATE_FILE):
-            create_once(self.location, CERTIFICATE_FILE, {**own, **self.provenance})
-        create_once(self.location, f"{CERTIFICATES}/{sha256_json(own)[:16]}.json", own)
-        self._certified = True
+        if not self._certified:
+            write_certificate(self.root, certificate, self.provenance)
+            self._certified = True
+
+    def give_up(self, number: int, reason: str) -> None:
+        """Record why episode `number` is not played."""
+        write_failure(self.root, number, reason)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.errors import RunNotFoundError
-from probe_kit.extract import Run, verify_run
+from probe_kit.errors import RunDamagedError, RunNotFoundError
+from probe_kit.extract import Run, open_run, verify_run
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_flipped_bit_is_found_by_reading_every_byte(damaged: Path) -> None:
     assert verify_run(damaged).ok
     (problem,) = verify_run(damaged, deep=True).problems
     assert "data.zarr/expert/tokens/c/7" in problem
-    assert "delete commits/00000007.json" in problem
+    assert "Delete commits/00000007.json" in problem
 
 
 def test_a_missing_and_a_truncated_object_are_found_by_size(damaged: Path) -> None:
@@ -54,7 +54,10 @@ def test_a_changed_outcome_is_found(damaged: Path) -> None:
     content = json.loads(commit.read_text())
     content["outcome"]["outcome"] = "correct"
     commit.write_text(json.dumps(content))
-    assert verify_run(damaged).problems == ("commits/00000002.json was changed after it was written",)
+    (problem,) = verify_run(damaged).problems
+    assert "commits/00000002.json was changed after it was written" in problem
+    with pytest.raises(RunDamagedError, match=r"commits/00000002\.json was changed"):
+        open_run(damaged)
 
 
 def test_changed_settings_are_found(damaged: Path) -> None:

@@ -84,5 +84,5 @@ def test_an_old_run_still_makes_a_table(runs: Path) -> None:
 def test_an_old_run_is_not_continued(runs: Path, small_suite: Suite) -> None:
     run = Run(locate(runs / "pooled"))
     plan = Plan(small_suite, (), tuple(run.stored(name) for name in run.streams), 0)
-    with pytest.raises(SettingsMismatchError, match="schema_version: stored 1, asked 2"):
+    with pytest.raises(SettingsMismatchError, match="schema_version: stored 1, asked 3"):
         RunWriter(run.location, plan, run.settings)

@@ -14,6 +14,7 @@ from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite
+from tests.rehashing import rehash
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_a_changed_bit_is_found_on_reading_and_by_verification(copy: Path) -> No
     chunk.write_bytes(content)
     run = open_run(copy)
     run.trajectory(2)
-    with pytest.raises(RunDamagedError, match="trajectory of episode 3"):
+    with pytest.raises(RunDamagedError, match=r"trajectory/c/3/0/0 has other bytes"):
         run.trajectory(3)
     problems = verify_run(copy, deep=True).problems
     assert any("trajectory/c/3/0/0" in problem for problem in problems)
@@ -75,6 +76,9 @@ def test_a_lost_trajectory_is_no_empty_one(copy: Path) -> None:
 def test_channels_of_another_version_are_refused(copy: Path) -> None:
     array = zarr.open_array(copy / "data.zarr/trajectory", mode="r+")
     array.attrs["channels"] = [str(name).replace("held", "grip") for name in array.attrs["channels"]]
+    with pytest.raises(RunDamagedError, match=r"trajectory/zarr\.json has"):
+        open_run(copy)
+    rehash(copy)
     with pytest.raises(RunDamagedError, match=r"lack held\.bool"):
         _ = open_run(copy).trajectories
 
@@ -85,6 +89,7 @@ def test_a_run_begun_without_room_for_them_is_finished_without(
     """As a run that an earlier version began."""
     shutil.rmtree(copy / "data.zarr/trajectory")
     shutil.rmtree(copy / "commits")
+    rehash(copy)
     run = Run(locate(copy))
     assert not run.has_trajectories
     with pytest.raises(NoTrajectoryError, match="keeps no trajectories"):

@@ -1,0 +1,73 @@
+"""Certificates: what was loaded and checked, as the processes that played wrote it down.
+
+certificate.json               the first process's record, with its provenance
+certificates/<digits>.json     a record per process, named by its sha256
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.extract.store.commits import create_once
+from probe_kit.extract.store.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.layout import CERTIFICATE_FILE, CERTIFICATES
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.provenance import Provenance, name_of
+from probe_kit.extract.store.root import RESTORE, Root
+from probe_kit.identity import sha256_json
+
+Record = dict[str, Any]
+DIGITS = 16
+_NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
+
+
+def write_certificate(root: Root, found: Mapping[str, Any], provenance: Provenance) -> None:
+    """Record what one process loaded and checked; the whole of it stays from the first one."""
+    own = json.loads(json.dumps({**found, "provenance": name_of(provenance), "run": root.identity}, default=list))
+    create_once(root.location, f"{CERTIFICATES}/{sha256_json(own)[:DIGITS]}.json", own)
+    if not root.location.exists(CERTIFICATE_FILE):
+        create_once(root.location, CERTIFICATE_FILE, {**own, **provenance})
+
+
+def read_certificate(root: Root) -> tuple[Record, list[Record]]:
+    """What the first process wrote, and the records of all; a run of schema 1 has no records.
+
+    Raises RunDamagedError if one is missing, was changed, or is another run's.
+    """
+    try:
+        first = _reader(root)(CERTIFICATE_FILE, root.location.read(CERTIFICATE_FILE))
+    except FileNotFoundError:
+        raise RunDamagedError(f"{root.location}/{CERTIFICATE_FILE} is missing. {RESTORE}") from None
+    records = []
+    for name, raw in root.location.read_all(CERTIFICATES, ".json").items():
+        if not _NAMED.fullmatch(name):
+            continue  # nobody's, such as a copy that somebody made
+        record = _reader(root)(f"{CERTIFICATES}/{name}", raw)
+        if root.protected and sha256_json(record)[:DIGITS] != name.removesuffix(".json"):
+            raise RunDamagedError(f"{root.location}/{CERTIFICATES}/{name} is another process's. {RESTORE}")
+        records.append(record)
+    if root.protected and not records:
+        raise RunDamagedError(f"{root.location}/{CERTIFICATES} holds no record of who played. {RESTORE}")
+    return first, records
+
+
+def certificate_keys(location: Location) -> list[str]:
+    """Where certificates lie."""
+    records = [key for key in location.keys(CERTIFICATES) if _NAMED.fullmatch(key.rpartition("/")[2])]
+    return [CERTIFICATE_FILE, *records]
+
+
+def _reader(root: Root) -> Callable[[str, bytes], Record]:
+    def read(key: str, raw: bytes) -> Record:
+        name = f"{root.location}/{key}"
+        if not root.protected:
+            return read_plain(raw, name, RESTORE)
+        record = read_record(raw, name, RESTORE)
+        if record.get("run") != root.identity:
+            raise RunDamagedError(f"{name} is the certificate of another run. {RESTORE}")
+        del record[HASH]
+        return record
+
+    return read

@@ -1,0 +1,91 @@
+"""The deep half of verifying a run: every byte against its hash, and the columns against the rows."""
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+
+import numpy as np
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.extract.store.columns import Columns
+from probe_kit.extract.store.commits import Commit, crc32c, redo
+from probe_kit.extract.store.hashes import Sum
+from probe_kit.extract.store.layout import DATA
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.root import Root
+from probe_kit.extract.store.run import Run
+from probe_kit.extract.store.sealing import columns_of_rows
+
+READERS = 4
+"""Objects that are read and hashed at once: hashing lets other threads work."""
+BATCH = 256
+
+Job = tuple[str, int, str, str, str]
+"""Key, length, checksum, whose it is, and what to do."""
+
+
+def content_problems(
+    root: Root, commits: Mapping[int, Commit], columns: Columns | None, sound: bool
+) -> Iterator[str]:
+    """What is wrong with the bytes behind the commits and in the columns.
+
+    sound: whether nothing was found so far, without which rows and columns cannot be compared.
+    """
+    jobs = [*_committed(commits), *_sealed(columns)]
+    found = list(_wrong(root.location, jobs))
+    yield from found
+    if sound and not found and columns is not None:
+        yield from _differences(Run(root.location))
+
+
+def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
+    for number, commit in commits.items():
+        for key, (length, checksum, *_) in commit["objects"].items():
+            yield f"{DATA}/{key}", length, checksum, f" of episode {commit['episode_id']}", redo(number)
+
+
+def _sealed(columns: Columns | None) -> Iterator[Job]:
+    if columns is not None:
+        for key, (length, checksum, _) in (columns.sums or {}).items():
+            yield f"{columns.folder}/{key}", length, checksum, "", columns.advice
+
+
+def _wrong(location: Location, jobs: list[Job]) -> Iterator[str]:
+    def look(job: Job) -> str | None:
+        key, length, checksum, whose, advice = job
+        problem = _problem(location, key, length, checksum)
+        return problem and f"{key}{whose} {problem}. {advice}"
+
+    remaining = iter(jobs)
+    with ThreadPoolExecutor(READERS) as readers:
+        while batch := list(islice(remaining, BATCH)):
+            yield from filter(None, readers.map(look, batch))
+
+
+def _problem(location: Location, key: str, length: int, checksum: str) -> str | None:
+    """None also for what has another size or is not there, which was said before."""
+    try:
+        content = location.read(key)
+    except FileNotFoundError:
+        return None
+    if len(content) != length:
+        return None
+    if len(checksum) == len("00000000"):  # of a former version
+        same = crc32c(content) == checksum
+        return None if same else f"has other bytes than were written (crc32c is not {checksum})"
+    return Sum(length, checksum).problem(content)
+
+
+def _differences(run: Run) -> Iterator[str]:
+    """Columns that are not what the rows give, and what cannot be read."""
+    columns = run.columns
+    assert columns is not None
+    for stream in run.streams:
+        try:
+            array = columns.array(f"{stream}/pooled")
+            for index, expected in columns_of_rows(run, stream):
+                if not np.array_equal(np.asarray(array[index]), expected, equal_nan=True):
+                    place = f"{columns.folder}/{stream}/pooled at {index}"
+                    yield f"{place} is not what the rows give. {columns.advice}"
+        except RunDamagedError as error:
+            yield str(error)

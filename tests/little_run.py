@@ -1,0 +1,95 @@
+"""A small run through the real writer, with everything a run can hold, made in a second without a model."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probe_kit.env.trajectory import CHANNELS
+from probe_kit.extract import Run, open_run, seal
+from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.store.layout import StoredStream
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.identity import derive_seed
+from probe_kit.suite import Suite
+from probe_kit.train import train_probes
+
+STREAMS = (
+    StoredStream("backbone", 2, 6, None, 130, ("mean", "last"), quantities=("residual",)),
+    StoredStream("expert", 1, 4, 2, 3, ("mean", "mean:action"), quantities=("residual",)),
+)
+STEPS = 2
+PLACED = ("left", "right", "none")
+
+
+def little_plan(suite: Suite, seed: int = 0, episodes: int | None = None) -> Plan:
+    plan = make_plan(suite, list(STREAMS), seed, 1, True)
+    return replace(plan, episodes=plan.episodes[:episodes])
+
+
+def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
+    return {
+        "model": "little",
+        "weights_sha256": "0" * 64,
+        "random_weights": True,
+        "captured_calls": 1,
+        "tokens": "all",
+        "codec": codec,
+        "seed": seed,
+        "suite": {"identity": "little@1#0123456789ab"},
+        "scene": {"max_steps": STEPS},
+    }
+
+
+def little_writer(where: Location, plan: Plan, seed: int = 0, codec: str = "zstd") -> RunWriter:
+    writer = RunWriter(where, plan, little_settings(seed, codec))
+    check = {f"actions_{how}_hooks_sha256": "a" * 64 for how in ("with", "without")}
+    writer.write_certificate({"policy": {"family": "little"}, "capture_check": check})
+    return writer
+
+
+def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:
+    """The same numbers for the same episode and seed, always."""
+    draw = np.random.default_rng(derive_seed("little", seed, number))
+    planned = plan.episodes[number]
+    arrays: dict[str, dict[str, Any]] = {"pooled": {}, "tokens": {}}
+    for stream in STREAMS:
+        arrays["pooled"][stream.name] = draw.normal(
+            size=(1, *stream.lead, len(stream.views), stream.width)
+        ).astype(np.float32)
+        tokens = draw.integers(0, 0x7F00, (1, *stream.lead, stream.stored_tokens, stream.width), np.uint16)
+        tokens[..., stream.tokens :, :] = 0
+        arrays["tokens"][stream.name] = tokens
+    placed = PLACED[int(draw.integers(3))]
+    outcome = {
+        "outcome": "oob" if placed == "none" else "correct" if placed == planned.episode.side_correct else "wrong",
+        "side_placed": placed,
+        "cube_x": float(draw.uniform()),
+        "cube_y": float(draw.uniform(-0.3, 0.3)),
+        "steps": STEPS,
+    }
+    roles = [{"backbone": [("language", 0, 130)], "expert": [("action", 0, 3)]}]
+    trajectory = draw.normal(size=(STEPS + 1, len(CHANNELS))).astype(np.float32)
+    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number))
+
+
+def write_little_run(
+    where: Path | str, suite: Suite, seed: int = 0, codec: str = "zstd", episodes: int | None = None
+) -> Run:
+    """Written and sealed."""
+    plan = little_plan(suite, seed, episodes)
+    writer = little_writer(locate(where), plan, seed, codec)
+    for number in writer.remaining():
+        writer.write(episode(plan, number, seed))
+    seal(where)
+    return open_run(where)
+
+
+def probe_little_run(run: Run) -> None:
+    """Two sets of probes; to the second a control is added later."""
+    train_probes(run, permutations=1, seed=1)
+    train_probes(run, permutations=2)
+    train_probes(run, permutations=2, controls=("position",))

@@ -1,0 +1,53 @@
+"""Accidents at random places of a run: reading raises or tells what it told before, and `run verify` sees them."""
+
+from collections import Counter
+
+import pytest
+
+from probe_kit.suite import Suite, build_suite
+from tests.faults import Stored, draw_fault
+from tests.little_run import probe_little_run, write_little_run
+
+FAST, SLOW, BLOCK = 100, 5000, 500
+
+
+@pytest.fixture(scope="module")
+def little_suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "twelve", ["color"], 12)
+
+
+@pytest.fixture(scope="module")
+def stored(little_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    folder = tmp_path_factory.mktemp("faults")
+    for seed, name in enumerate(("run", "other")):
+        run = write_little_run(folder / name, little_suite, seed)
+        probe_little_run(run)
+        (folder / name / "frames").mkdir()
+        (folder / name / "frames" / "00000000.webp").write_bytes(f"picture {seed}".encode())
+    return Stored.of(folder / "run", folder / "other")
+
+
+def assert_nothing_is_silent(stored: Stored, seeds: range) -> None:
+    found: Counter[str] = Counter()
+    wrong = []
+    for seed in seeds:
+        fault = draw_fault(stored, seed)
+        try:
+            verdict = stored.verdict(fault)
+        except Exception as error:  # noqa: BLE001 - whatever is no error of ours is a traceback for somebody
+            verdict = f"TRACEBACK {type(error).__name__}: {error}"
+        found[verdict.partition(" ")[0].rstrip(":")] += 1
+        if verdict not in ("found", "harmless"):
+            wrong.append(f"seed {seed}: {fault.words}: {verdict}")
+    print(f"seeds {seeds.start} to {seeds.stop - 1}: {dict(found)}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_accident_changes_a_number_unseen(stored: Stored) -> None:
+    assert_nothing_is_silent(stored, range(FAST))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", range(FAST, FAST + SLOW, BLOCK))
+def test_five_thousand_accidents_change_no_number_unseen(stored: Stored, start: int) -> None:
+    assert_nothing_is_silent(stored, range(start, start + BLOCK))
