@@ -124,6 +124,21 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
 
 
 @pytest.fixture(scope="session")
+def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of two runs without a model, `run` and `other`, of other seeds, with everything a run can hold."""
+    from probe_kit.extract.store.locate import locate
+    from probe_kit.extract.store.thumbnails import write_thumbnail
+    from tests.little_run import probe_little_run, write_little_run
+
+    folder = tmp_path_factory.mktemp("little")
+    for seed, name in enumerate(("run", "other")):
+        probe_little_run(write_little_run(folder / name, small_suite.select(["color"]), seed))
+        picture = np.full((60, 80, 3), 100 * seed, np.uint8)
+        write_thumbnail(locate(folder / name), 0, (picture, picture))
+    return folder
+
+
+@pytest.fixture(scope="session")
 def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
     """A real run of pi0-tiny's random twin with all tokens: 48 episodes of four actions."""
     from probe_kit.env import SceneSpec

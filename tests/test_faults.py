@@ -1,30 +1,18 @@
 """Accidents at random places of a run: reading raises or tells what it told before, and `run verify` sees them."""
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
-from probe_kit.suite import Suite, build_suite
 from tests.faults import Stored, draw_fault
-from tests.little_run import probe_little_run, write_little_run
 
 FAST, SLOW, BLOCK = 100, 5000, 500
 
 
 @pytest.fixture(scope="module")
-def little_suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return build_suite(tmp_path_factory.mktemp("suite") / "twelve", ["color"], 12)
-
-
-@pytest.fixture(scope="module")
-def stored(little_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Stored:
-    folder = tmp_path_factory.mktemp("faults")
-    for seed, name in enumerate(("run", "other")):
-        run = write_little_run(folder / name, little_suite, seed)
-        probe_little_run(run)
-        (folder / name / "frames").mkdir()
-        (folder / name / "frames" / "00000000.webp").write_bytes(f"picture {seed}".encode())
-    return Stored.of(folder / "run", folder / "other")
+def stored(little_runs: Path) -> Stored:
+    return Stored.of(little_runs / "run", little_runs / "other")
 
 
 def assert_nothing_is_silent(stored: Stored, seeds: range) -> None:

@@ -1,0 +1,196 @@
+"""What integrity costs: hashes while writing, opening a large run, and reading every byte to verify it.
+
+    python benchmarks/integrity.py [--width 512] [--episodes 3440] [--repeats 5]
+
+Rivals: the same writing without any checksum and with the crc32c of former versions; opening the same run as a
+former version stored it; reading the same files and doing nothing with them.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from probe_kit.extract import open_run, verify_run
+from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
+from probe_kit.extract.play.rollout import Rollout
+from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.extract.store.commits import CHECKSUM, commit_checksum, commit_key, crc32c, write_commit
+from probe_kit.extract.store.hashes import HASH, as_json
+from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.suite import Suite, build_suite
+
+BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
+EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
+RECORDING = "probe_kit.extract.store.recording"
+Seconds = tuple[float, float]
+
+
+def seconds(work: Callable[[], object]) -> Seconds:
+    """Wall-clock and CPU seconds of one call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def medians(turns: list[Seconds]) -> Seconds:
+    """Of wall-clock and CPU seconds."""
+    return statistics.median(turn[0] for turn in turns), statistics.median(turn[1] for turn in turns)
+
+
+def episode(plan: Plan, number: int) -> Rollout:
+    """Residual-like numbers: every channel has a scale of its own."""
+    draw, buffers = np.random.default_rng(number), EpisodeBuffers(list(plan.streams), 1, True, pinned=False)
+    spans: dict[str, list[tuple[str, int, int]]] = {}
+    for stream in plan.streams:
+        scale = np.exp(np.random.default_rng(0).normal(size=stream.width))
+        shape = (*stream.lead, stream.tokens, stream.width)
+        bits = (draw.normal(size=shape) * scale).astype(np.float32).view(np.uint32) >> 16
+        buffers.tokens[stream.name][0][..., : stream.tokens, :] = bits
+        spans[stream.name] = [("language", 0, stream.tokens)]
+    buffers.roles.append(spans)
+    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
+
+
+def settings(codec: str) -> dict[str, Any]:
+    """Of a run that nobody extracted."""
+    return {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic", "weights_sha256": None,
+            "random_weights": False, "suite": {"identity": "synthetic"}}  # fmt: skip
+
+
+def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:
+    """Two episodes of tokens through the whole write path; the three ways take turns."""
+    stream = replace(BACKBONE, width=width)
+    plan = make_plan(suite, [stream], 0, 1, True)
+    records = [episode(plan, number).record for number in range(2)]
+    raw = 2 * stream.raw_bytes(True) / 1e6
+    ways: dict[str, Callable[[bytes], str] | None] = {
+        "blake2b": None, "crc32c": crc32c, "nothing": lambda _content: "0" * 8
+    }  # fmt: skip
+    for codec in ("zstd", "fast", "none"):
+        found: dict[str, list[Seconds]] = {name: [] for name in ways}
+        for repeat in range(repeats):
+            for name, digest in ways.items():
+                writer = RunWriter(locate(folder / f"{codec}-{name}-{repeat}"), plan, settings(codec))
+                if digest is None:
+                    found[name].append(seconds(partial(write, writer, records)))
+                    continue
+                with patch(f"{RECORDING}.digest", digest), patch(f"{RECORDING}.block_digest", lambda _part: "0"):
+                    found[name].append(seconds(partial(write, writer, records)))
+        for name, turns in found.items():
+            wall, cpu = medians(turns)
+            without = medians(found["nothing"])[1]
+            print(f"write --codec {codec:4} {name:8} {raw / wall:6.0f} MB/s {raw / cpu:6.0f} MB/CPU-s, "
+                  f"{cpu / without:.2f} x the CPU of nothing")  # fmt: skip
+
+
+def write(writer: RunWriter, records: list[EpisodeRecord]) -> None:
+    """All of them."""
+    for record in records:
+        writer.write(record)
+
+
+def read_all(files: list[Path]) -> None:
+    """And do nothing with them."""
+    for path in files:
+        path.read_bytes()
+
+
+def bench_verifying(folder: Path, repeats: int) -> None:
+    """Every byte of the runs that were just written, against reading the same files."""
+    runs = [folder / f"none-blake2b-{repeat}" for repeat in range(repeats)]
+    for run in runs:
+        files = [path for path in run.rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in files) / 1e6
+        read = seconds(partial(read_all, files))
+        deep = seconds(partial(verify_run, run, deep=True))
+        print(f"verify --deep {size:.0f} MB: {size / deep[0]:.0f} MB/s ({size / deep[1]:.0f} per CPU-second); "
+              f"reading alone {size / read[0]:.0f} MB/s ({size / read[1]:.0f})")  # fmt: skip
+
+
+def large_run(suite: Suite, run: Path, episodes: int) -> None:
+    """A run of many episodes, all with the objects of the first under other names."""
+    plan = make_plan(suite, [replace(BACKBONE, width=2), replace(EXPERT, width=2)], 0, 1, True)
+    first = plan.episodes[0]
+    many = tuple(_numbered(first, number) for number in range(episodes))
+    writer = RunWriter(locate(run), replace(plan, episodes=many), settings("zstd"))
+    writer.write(episode(writer.plan, 0).record)
+    model = writer.root.location.read(commit_key(0))
+    commit = json.loads(model)
+    del commit[HASH]
+    for number in range(1, episodes):
+        objects = {}
+        for key, known in commit["objects"].items():
+            new = key.replace("/c/0/", f"/c/{number}/", 1)
+            objects[new] = known
+            (run / DATA / new).parent.mkdir(parents=True)
+            os.link(run / DATA / key, run / DATA / new)
+        one = {**commit, "episode": number, "episode_id": many[number].episode.episode_id, "objects": objects}
+        write_commit(writer.location, number, one)
+
+
+def _numbered(planned: PlannedEpisode, number: int) -> PlannedEpisode:
+    item = replace(planned.episode.item, item_id=f"color-{number:05d}")
+    return replace(planned, index=number, episode=replace(planned.episode, item=item))
+
+
+def as_former_version(run: Path) -> None:
+    """The same run with the checksums of schema 2."""
+    card = json.loads((run / RUN_FILE).read_text())
+    del card[HASH], card["objects"]
+    (run / RUN_FILE).write_bytes(as_json({**card, "schema_version": 2}))
+    for path in sorted((run / "commits").iterdir()):
+        commit = json.loads(path.read_text())
+        for part in (HASH, "run", "episode"):
+            del commit[part]
+        commit["objects"] = {key: [known[0], "00000000"] for key, known in commit["objects"].items()}
+        path.write_bytes(as_json({**commit, CHECKSUM: commit_checksum(commit)}))
+
+
+def bench_opening(suite: Suite, folder: Path, episodes: int, repeats: int) -> None:
+    """`open_run` and the stamp, which is what every command asks first."""
+    run = folder / "large"
+    large_run(suite, run, episodes)
+    ways: dict[str, Seconds] = {}
+    for name in ("blake2b", "former version"):
+        if name == "former version":
+            as_former_version(run)
+        turns = [seconds(lambda: open_run(run).stamp) for _ in range(repeats + 1)][1:]
+        ways[name] = medians(turns)
+        sizes = [path.stat().st_size for path in (run / "commits").iterdir()]
+        print(f"open {episodes} episodes, {name}: {ways[name][0]:.2f} s ({ways[name][1]:.2f} CPU-s), "
+              f"{statistics.mean(sizes) / 1e3:.1f} kB per commit")  # fmt: skip
+    wall, cpu = (ways["blake2b"][part] / ways["former version"][part] for part in (0, 1))
+    print(f"opening: {wall:.2f} x wall, {cpu:.2f} x CPU")
+
+
+def main() -> None:
+    """All of it, on a fresh folder."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--width", type=int, default=512)
+    parser.add_argument("--episodes", type=int, default=3440)
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        suite = build_suite(folder / "suite", ["color"], 6)
+        bench_opening(suite, folder, options.episodes, options.repeats)
+        bench_writing(suite, folder, options.width, options.repeats)
+        bench_verifying(folder, options.repeats)
+
+
+if __name__ == "__main__":
+    main()
