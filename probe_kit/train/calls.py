@@ -5,7 +5,7 @@ from dataclasses import replace
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
 from probe_kit.train.settings import FORMAT
-from probe_kit.train.store import is_current, load_results, read_headers, settings_of
+from probe_kit.train.store import is_current, load_results, read_probes, settings_of
 
 
 def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
@@ -14,10 +14,10 @@ def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
     Episodes that ended before an inference have no part in its probes. `like` itself is among them.
     """
     found = {like.settings.call: like}
-    for key, header in read_headers(run.location).items():
-        if header["settings"].get("format") != FORMAT:
+    for key, bundle in read_probes(run.location).items():
+        if bundle.head["settings"].get("format") != FORMAT:
             continue
-        settings = settings_of(header)
+        settings = settings_of(bundle.head)
         alike = replace(settings, call=like.settings.call, episodes=like.settings.episodes)
         if alike == like.settings and settings.call != like.settings.call and is_current(settings, run):
             found[settings.call] = load_results(run, key)
