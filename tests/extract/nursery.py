@@ -2,7 +2,8 @@
 
 Usage: python nursery.py. A line of JSON on standard input is a job: what to do with which run, by how many
 processes, and after how many seconds each of them is killed (null: not at all). The answer says how each ended:
-true if it was done, false if it was killed. Nothing here may use Zarr or obstore before it forks: both have threads.
+true if it was done, false if it was killed. Nothing here may use Zarr or obstore before it forks, because both
+have threads.
 """
 
 import json

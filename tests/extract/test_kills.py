@@ -61,8 +61,9 @@ def nursery(suite: Suite) -> Iterator[Nursery]:
 
 
 def objects(run: Path | str) -> dict[str, bytes]:
-    """Every object by key, columns by their name in a folder; of probes what neither tells the time nor was written
-    aside by a process that was killed.
+    """Every object by key, columns by their name in a folder.
+
+    Of probes, what neither tells the time nor was written aside by a process that was killed.
     """
     location = locate(run)
     stamped = f"{location.derived(COLUMNS, open_run(run, allow_partial=True).stamp)}/"
