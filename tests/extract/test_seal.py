@@ -69,14 +69,6 @@ def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: py
     assert tree(copy) == before
 
 
-def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path) -> None:
-    before = tree(copy)
-    shutil.move(copy / "columns.zarr", copy / "columns.zarr1234.tmp")
-    shutil.copytree(copy / "columns.zarr1234.tmp", copy / "columns.zarr5678.tmp")
-    assert seal(copy)
-    assert tree(copy) == before
-
-
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_columns_of_other_commits_are_not_used_until_sealed_again(copy: Path) -> None:
     (copy / "commits/00000005.json").unlink()

@@ -183,12 +183,7 @@ class Folder(Location):
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """Aside; then renamed, so that a crash leaves the old group or none.
-
-        What a killed process left of it goes first: processes that build it take turns, see `one_at_a_time`.
-        """
-        for leftover in self._path.glob(f"{folder}*.tmp"):
-            shutil.rmtree(leftover, ignore_errors=True)
+        """Aside; then renamed, so that a crash leaves the old group or none."""
         aside = Path(tempfile.mkdtemp(dir=self._path, prefix=folder, suffix=".tmp"))
         aside.chmod(0o755)
         try:
