@@ -25,12 +25,13 @@ from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
+from probe_kit.retention.join_commands import join
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import show, train
 from probe_kit.train.power_commands import power
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "export",
+    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "join", "export",
     "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
@@ -133,7 +134,7 @@ def _before_commands(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)
-for command in (extract, ask, export, demo, models, verify, new_adapter, train, power, retention, doctor):
+for command in (extract, ask, export, demo, models, verify, new_adapter, train, power, retention, join, doctor):
     app.command()(command)
 
 

@@ -146,6 +146,12 @@ class RunDamagedError(ProbeKitError):
     """Stored bytes are missing or differ from what was committed."""
 
 
+class OtherFramesError(ProbeKitError):
+    """Two runs did not begin with the same frames, or one of them does not say what its frames were."""
+
+    exit_code = 3
+
+
 class RunIncompleteError(ProbeKitError):
     """Episodes of the plan are not committed yet."""
 

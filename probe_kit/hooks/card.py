@@ -17,6 +17,7 @@ class Card:
     chunk, execute: actions per inference and how many of them are carried out; 0 for a model that does not act.
     ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
     newest weighing most; None carries out the head of the newest chunk.
+    source: the family of the reader whose network this policy grew from, if it is one of ours.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """
 
@@ -39,6 +40,7 @@ class Card:
     batch: int | None = None
     needs: frozenset[str] = frozenset()
     ensemble: float | None = None
+    source: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As stored in a run's certificate: plain values only."""

@@ -110,7 +110,7 @@ class Family:
             _check_streams(model, str(place))
         # What an adapter does not say of its options itself is part of the identity all the same.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
-        model.card = replace(model.card, settings={**said, **model.card.settings})
+        model.card = replace(model.card, settings={**said, **model.card.settings}, source=self.source)
         return model
 
     def check(

@@ -11,9 +11,12 @@ from probe_kit.console import err, marked, out, print_json_text, print_text, say
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
     from probe_kit.retention import RetentionTable
     from probe_kit.retention.measure import Iterations
+    from probe_kit.train.reader import RunReader
+
+
+ASKED = "Asked runs"
 
 
 def retention(
@@ -44,12 +47,25 @@ def retention(
     ] = None,
     html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
+    score: Annotated[
+        str, typer.Option(help="Of asked runs: text, logits, or debiased (no letter bias).", rich_help_panel=ASKED)
+    ] = "text",
+    gap: Annotated[
+        bool, typer.Option("--gap", help="Test VLM − VLA: asked runs against acting ones.", rich_help_panel=ASKED)
+    ] = False,
+    with_side_words: Annotated[
+        bool,
+        typer.Option(
+            "--with-side-words", help="Count items such as 'no left turn sign' too.", rich_help_panel=ASKED
+        ),
+    ] = False,
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
     from probe_kit.env.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention as make_table
+    from probe_kit.retention.asked import scored
 
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
@@ -66,7 +82,10 @@ def retention(
     }
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
-    table = make_table(opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii)
+    table = make_table(
+        opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii,
+        score=score, gap=gap, with_side_words=with_side_words,
+    )  # fmt: skip
     if style == "table":
         out.print(table.to_rich())
     else:
@@ -74,13 +93,14 @@ def retention(
         show(getattr(table, f"to_{style}")())
         for note in table.notes:
             say(marked("[yellow]note:[/] {}", note))
+    shown = [scored(run, score, with_side_words) for run in listed]
     if figures is not None:
-        _save_figures(listed, table, figures)
+        _save_figures(shown, table, figures)
     if html is not None:
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):
-            written = write_report(listed, html, table)
+            written = write_report(shown, html, table)
         say(f"report: {written}")
 
 
@@ -155,7 +175,7 @@ def _iterations(text: str) -> "Iterations":
 _FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
-def _save_figures(runs: "list[Run]", table: "RetentionTable", folder: Path) -> None:
+def _save_figures(runs: "list[RunReader]", table: "RetentionTable", folder: Path) -> None:
     from probe_kit.retention.displays import gallery, save_figures
 
     for path in save_figures(gallery(runs, table), folder):

@@ -32,6 +32,7 @@ from probe_kit.retention.cells import (
     wording_title,
 )
 from probe_kit.retention.differences import Difference
+from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
 from probe_kit.retention.wordings import WordingPair
@@ -52,15 +53,28 @@ def rich_tables(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
+    further: Sequence[PlainTable] = (),
 ) -> "Group":
-    """Success rates of every run, its retention and controls per view, differences, wordings, notes."""
+    """Success rates of every run, its retention and controls per view, differences, wordings, notes.
+
+    Asked runs stand above a rule. further: tables behind these.
+    """
     from rich.console import Group
+    from rich.rule import Rule
     from rich.text import Text
 
-    tables: list[FittingTable] = []
+    tables: list[FittingTable | Rule] = []
+    kinds: list[str] = []
     for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
         found = list(of_run)
-        tables.append(_of_run("Success rate", once_per_category(found), _SUCCESS, [_OUTCOME_LEGEND]))
+        if kinds[-1:] == ["asks"] and not is_asked(found[0]):
+            tables.append(Rule("asked above, acting below", style="dim"))
+        kinds.append(found[0].kind)
+        once = once_per_category(found)
+        if is_asked(found[0]):
+            tables.append(_of_run("Accuracy of answers", once, _ANSWERS, [_ANSWER_LEGEND]))
+        else:
+            tables.append(_of_run("Success rate", once, _SUCCESS, [_OUTCOME_LEGEND]))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
             reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
@@ -72,7 +86,26 @@ def rich_tables(
         tables.append(_fitting(title, "", list(of_pair), {"Difference": DIFFERENCE_COLUMNS}))
     for title, of_ladder in groupby(wordings, key=wording_title):
         tables.append(_fitting(title, _LADDER_LEGEND, list(of_ladder), _LADDER))
-    return Group(*tables, *(Text(note, style="yellow") for note in notes))
+    return Group(*tables, *map(_plain, further), *(Text(note, style="yellow") for note in notes))
+
+
+def _plain(table: PlainTable) -> FittingTable:
+    """Its first columns name the rows."""
+    fixed = 1 if table.columns[0] == "category" else 2
+    return FittingTable(
+        title=table.title,
+        caption=table.note,
+        name=" · ".join(table.columns[:fixed]),
+        names=tuple(" · ".join(cells[:fixed]) for cells in table.cells),
+        styles=tuple("bold" if MEAN in cells[:fixed] else "" for cells in table.cells),
+        parts=(
+            Part(
+                "",
+                table.columns[fixed:],
+                tuple(tuple(Cell(cell, "") for cell in cells[fixed:]) for cells in table.cells),
+            ),
+        ),
+    )
 
 
 def _judged(rows: Sequence[RetentionRow]) -> list[str]:
@@ -109,6 +142,26 @@ _LADDER: dict[str, Sequence[tuple[str, Callable[[WordingPair], str]]]] = {
     "Same items, same seeds": WORDING_COLUMNS
 }
 
+_ANSWER_LEGEND = "wrong, unread (no answer, or several): each in % of all; without letter bias: options exchanged"
+
+_ANSWERS: dict[str, Sequence[Column]] = {
+    "Does it know the answer?": [
+        ("accuracy % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+        ("± Δ", margin_value),
+        ("regime", _regime),
+        ("left / right", _sides),
+    ],
+    "How it answered": [
+        ("wrong", lambda row: percent(row.p_wrong)),
+        ("unread", lambda row: percent(row.p_oob)),
+        ("by text", lambda row: percent(row.accuracy_text)),
+        ("by logits", lambda row: percent(row.accuracy_logits)),
+        ("without letter bias", lambda row: percent(row.accuracy_debiased)),
+        ("letter bias", lambda row: number(row.letter_bias)),
+        ("option mass", lambda row: number(row.option_mass)),
+        ("near ties", lambda row: percent(row.p_near_tie)),
+    ],
+}
 _SUCCESS: dict[str, Sequence[Column]] = {
     "Does it act on the answer?": [
         ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),

@@ -25,6 +25,7 @@ from probe_kit.retention.cells import (
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.heat import HEAT
+from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
@@ -37,10 +38,15 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
 }
 
 
-def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), notes: Sequence[str] = ()) -> str:
+def latex(
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference] = (),
+    notes: Sequence[str] = (),
+    further: Sequence[PlainTable] = (),
+) -> str:
     """Complete `table` environments: retention, then controls and differences between groups where there are any.
 
-    notes: sentences for the author, as comments.
+    further: tables behind these. notes: sentences for the author, as comments.
     Needs the packages booktabs and xcolor with its option `table`.
     """
     parts = [_retention_table(rows)]
@@ -54,6 +60,7 @@ def latex(rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), 
     for heading, of_pair in groupby(differences, key=difference_title):
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
         parts.append(_plain_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
+    parts += [_plain_table(f"{own.title} ({own.note})", own.columns, own.cells) for own in further]
     return "\n".join([*parts, *(f"% {note}" for note in notes)])
 
 
@@ -82,17 +89,22 @@ def _coloured(cell: str) -> str:
 def _retention_table(rows: Sequence[RetentionRow]) -> str:
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
     body: list[str] = []
-    for row in rows:
+    asked = any(is_asked(row) for row in rows)
+    for place, row in enumerate(rows):
+        if place and is_asked(rows[place - 1]) and not is_asked(row):
+            body += [r"\midrule"]
         body += [r"\midrule"] * (row.category == MEAN) + [_line(row)] + [r"\midrule"] * (row.category == MEAN)
+    what = "SR / accuracy and retention" if asked else "Success rate and retention"
     return "\n".join(
         [
             "% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}",
             *colours,
             r"\begin{table}",
-            rf"\caption{{{escape(title('Success rate and retention', rows))}}}",
+            rf"\caption{{{escape(title(what, rows))}}}",
             rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in _COLUMNS)}}}",
             r"\toprule",
-            " & ".join(heading for heading, _, _ in _COLUMNS) + r" \\",
+            " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in _COLUMNS)
+            + r" \\",
             r"\midrule",
             *body[:-1],
             r"\bottomrule",

@@ -31,6 +31,7 @@ from probe_kit.retention.cells import (
     wording_title,
 )
 from probe_kit.retention.differences import Difference
+from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.wordings import WordingPair
 
@@ -76,13 +77,16 @@ def markdown(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
+    further: Sequence[PlainTable] = (),
 ) -> str:
-    """Success rates and, where there are any, retention, controls, differences, wordings and notes."""
-    parts = [_rows_table("Success rate", once_per_category(rows), SUCCESS_COLUMNS)]
+    """Success rates and, where there are any, retention, controls, differences, wordings, more tables and notes."""
+    asked = any(is_asked(row) for row in rows)
+    columns = [(_of_both(name) if asked else name, cell) for name, cell in SUCCESS_COLUMNS]
+    parts = [_rows_table("SR / accuracy" if asked else "Success rate", once_per_category(rows), columns)]
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
-        columns: list[Column] = [("model", model_name), ("view", lambda row: row.view or "–")]
+        columns = [("model", model_name), ("view", lambda row: row.view or "–")]
         columns += [("call", call_value), *CONTROL_COLUMNS]
         parts.append(_rows_table("Controls", probed(rows), columns))
     for heading, of_pair in groupby(differences, key=difference_title):
@@ -91,7 +95,13 @@ def markdown(
     for heading, of_run in groupby(wordings, key=wording_title):
         ladder = [[row.category, *(cell(row) for _, cell in WORDING_COLUMNS)] for row in of_run]
         parts.append(_markdown_table(heading, ["category", *(name for name, _ in WORDING_COLUMNS)], ladder))
+    parts += [f"{_markdown_table(own.title, own.columns, own.cells)}\n{own.note}\n" for own in further]
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
+
+
+def _of_both(heading: str) -> str:
+    """A heading over policies that acted and readers that were asked."""
+    return {"SR % [95 %]": "SR / accuracy % [95 %]", "outside %": "outside / unread %"}.get(heading, heading)
 
 
 def _rows_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:

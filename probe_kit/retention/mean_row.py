@@ -12,8 +12,10 @@ from probe_kit.retention.success import normalised_score
 _AVERAGED = (
     "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
     "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
-    "action_twin", "action_first_accuracy",
+    "action_twin", "action_first_accuracy", "accuracy_text", "accuracy_logits", "accuracy_debiased",
+    "p_unreadable", "option_mass", "letter_bias", "p_near_tie",
 )  # fmt: skip
+_OF_THE_RUN = ("kind", "prompt", "picture", "picture_size", "asked_for", "score")
 
 
 def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
@@ -38,6 +40,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         probe_settings=first.probe_settings,
         group=first.group,
         category=MEAN,
+        **{name: getattr(first, name) for name in _OF_THE_RUN},
         view=first.view,
         action_stream=first.action_stream,
         n_episodes=sum(row.n_episodes for row in rows),

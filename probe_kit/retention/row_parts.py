@@ -63,6 +63,31 @@ class Behaviour:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Asked:
+    """How a run was asked and what else its answers say; `kind` is `acts` for a run that was not.
+
+    asked_for: `target`, `distractor` or `absent`. score: by which of its scores `sr` is. accuracy_text,
+    accuracy_logits, accuracy_debiased: shares that are right by each score. p_unreadable: answers in text that
+    could not be read. option_mass: mean probability of the admissible answers together. letter_bias: mean
+    logit by which the option named first is preferred. p_near_tie: choices that rounding may have made.
+    """
+
+    kind: str = "acts"
+    prompt: str | None = None
+    picture: str | None = None
+    picture_size: str | None = None
+    asked_for: str | None = None
+    score: str | None = None
+    accuracy_text: float | None = None
+    accuracy_logits: float | None = None
+    accuracy_debiased: float | None = None
+    p_unreadable: float | None = None
+    option_mass: float | None = None
+    letter_bias: float | None = None
+    p_near_tie: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class BackbonePeak:
     """The backbone's best site, the first one on ties.
 

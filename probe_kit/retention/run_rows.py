@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
+from probe_kit.retention.asked import ask_of
 from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
-from probe_kit.retention.row_parts import ActionPeak, BackbonePeak, Background, Behaviour, Kept, Source
+from probe_kit.retention.row_parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
 from probe_kit.retention.rows import Part, RetentionRow
 from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
 from probe_kit.statistics.bootstrap import units_seed
@@ -69,7 +70,11 @@ def _row(
     view: str | None,
 ) -> Drawn:
     success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
-    parts: list[Part] = [_source(run, results), _behaviour(success, sensitivity(episodes, settings.epsilons))]
+    parts: list[Part] = [
+        _source(run, results),
+        _asked(run, episodes),
+        _behaviour(success, sensitivity(episodes, settings.epsilons)),
+    ]
     estimates = {"sr": sr_estimate(episodes, run.suite)}
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
@@ -97,6 +102,29 @@ def _source(run: RunReader, results: ProbeResults | None) -> Source:
         run_settings=run.settings_sha256,
         probe_settings=None if results is None else results.key,
         call=None if results is None else results.settings.call,
+    )
+
+
+def _asked(run: RunReader, episodes: "pd.DataFrame") -> Asked:
+    ask = ask_of(run)
+    if ask is None:
+        return Asked()
+    text = episodes["outcome_text" if "outcome_text" in episodes else "outcome"]
+    bias = episodes["letter_bias"].astype(float).mean()
+    return Asked(
+        kind="asks",
+        prompt=str(ask["prompt"]),
+        picture=str(ask["picture"]),
+        picture_size=str(ask["picture_size"]),
+        asked_for=str(ask["object"]),
+        score=getattr(run, "score", "text"),
+        accuracy_text=float((text == "correct").mean()),
+        accuracy_logits=float((episodes["outcome_logits"] == "correct").mean()),
+        accuracy_debiased=float((episodes["outcome_debiased"] == "correct").mean()),
+        p_unreadable=float((text == "oob").mean()),
+        option_mass=float(episodes["option_mass"].mean()),
+        letter_bias=_number(float(bias)),
+        p_near_tie=float(episodes["near_tie"].astype(bool).mean()),
     )
 
 

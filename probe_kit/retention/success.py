@@ -78,14 +78,15 @@ class SuccessRate:
     paired: PairedItems
 
 
-def regime(sr: float, delta: float, p_wrong: float, p_oob: float) -> tuple[Regime, str]:
-    """The regime of a success rate, and why in a few words."""
+def regime(sr: float, delta: float, p_wrong: float, p_oob: float, asked: bool = False) -> tuple[Regime, str]:
+    """The regime of a success rate, and why in a few words. asked: `oob` is an answer not read."""
     if sr > 0.5 + delta:
         return Regime.KNOWLEDGE, f"SR {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
     if sr >= 0.5 - delta:
         return Regime.NO_RELIABLE_KNOWLEDGE, f"SR {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
+    nowhere = "no answer could be read in" if asked else "the cube ends outside both zones in"
     cause = (
-        f"the cube ends outside both zones in {p_oob:.0%} of episodes"
+        f"{nowhere} {p_oob:.0%} of episodes"
         if p_oob >= p_wrong
         else f"the wrong picture is chosen in {p_wrong:.0%} of episodes"
     )
@@ -114,7 +115,7 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     p_oob = float((episodes["outcome"] == "oob").mean())
     n_items = int(episodes["item_id"].nunique())
     delta_regime = chance_margin(independent_items(episodes))
-    name, reason = regime(sr, delta_regime, p_wrong, p_oob)
+    name, reason = regime(sr, delta_regime, p_wrong, p_oob, "parse" in episodes)
     low, high = group_bootstrap(correct.to_numpy(bool)[:, None], units_of(episodes), seed)
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]

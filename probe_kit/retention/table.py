@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.outcome import SENSITIVITY_RADII
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention.asked import ask_of, left_out, scored
 from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.frames import frame_of
+from probe_kit.retention.gap import VlmGap, vlm_gaps
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_settings
+from probe_kit.retention.plain_tables import ANSWERS, PlainTable, answer_table, gap_tables, size_table
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.retention.wordings import WordingPair, wording_pairs
@@ -33,7 +36,7 @@ class RetentionTable:
     results: the probes that the rows were made of, by `row.run`; figures and reports of the table draw these.
     wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
-    which runs have no probes, and which settings the rows mix.
+    which runs have no probes, and which settings the rows mix. gaps: VLM − VLA, if that was asked for.
     """
 
     rows: list[RetentionRow]
@@ -43,6 +46,7 @@ class RetentionTable:
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
     wordings: list[WordingPair] = field(default_factory=list)
+    gaps: list[VlmGap] = field(default_factory=list)
 
     def __repr__(self) -> str:
         from probe_kit.retention.notebook import table_text
@@ -82,12 +86,12 @@ class RetentionTable:
     def to_json(self) -> str:
         """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
 
-        With groups, or runs in several wordings, an object with the lists `rows`, `differences` and `wordings`.
+        With groups, runs in several wordings or gaps, an object with the lists `rows`, `differences`, `wordings` and
+        `gaps`, as far as there are any.
         """
         rows = [asdict(row) for row in self.all_rows]
-        differences, wordings = [asdict(row) for row in self.differences], [asdict(row) for row in self.wordings]
-        beside = {"differences": differences} if differences else {}
-        beside |= {"wordings": wordings} if wordings else {}
+        lists = {"differences": self.differences, "wordings": self.wordings, "gaps": self.gaps}
+        beside = {name: [asdict(row) for row in found] for name, found in lists.items() if found}
         content = {"rows": rows, **beside} if beside else rows
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
 
@@ -99,19 +103,26 @@ class RetentionTable:
         """Success rates, retention, controls and differences as Markdown tables."""
         from probe_kit.retention.markdown import markdown
 
-        return markdown(self.all_rows, self.differences, self.notes, self.wordings)
+        return markdown(self.all_rows, self.differences, self.notes, self.wordings, self.further_tables)
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
         from probe_kit.retention.latex import latex
 
-        return latex(self.all_rows, self.differences, self.notes)
+        return latex(self.all_rows, self.differences, self.notes, self.further_tables)
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.console import rich_tables
 
-        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings)
+        further = [table for table in self.further_tables if table.title != ANSWERS]  # its blocks say the same
+        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further)
+
+    @property
+    def further_tables(self) -> list[PlainTable]:
+        """Answers, sizes of the picture by prompt, and VLM − VLA, as far as runs were asked."""
+        found = [answer_table(self.all_rows), size_table(self.means)]
+        return [table for table in found if table is not None] + gap_tables(self.gaps)
 
 
 def retention(
@@ -122,6 +133,9 @@ def retention(
     keys: Sequence[str | None] | None = None,
     epsilons: Sequence[float] = SENSITIVITY_RADII,
     seed: int = 0,
+    score: str = "text",
+    with_side_words: bool = False,
+    gap: bool = False,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
@@ -129,15 +143,20 @@ def retention(
     with each other. views: those that were probed by default. iterations: which expert iterations take part.
     keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
     metres at which SR is scored again. A run without activations or probes shows success rates only.
+    score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
+    their items in whose name a side stands. gap: compare every asked run with every acting one, see `vlm_gaps`.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, or for a run that is given twice, SceneError for overlapping zones.
     """
     groups = runs if isinstance(runs, Mapping) else {None: runs}
-    listed = [(name, run) for name, of_group in groups.items() for run in of_group]
+    listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
     _refuse_doubles([run for _, run in listed])
-    results, notes = _read_probes([run for _, run in listed], keys or [None] * len(listed))
+    chosen = list(keys or [None] * len(listed))
+    order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
+    listed, chosen = [listed[at] for at in order], [chosen[at] for at in order]
+    results, notes = _read_probes([run for _, run in listed], chosen)
     settings = RowSettings(views, iterations, epsilons, seed)
     drawn: list[Drawn] = []
     means: list[RetentionRow] = []
@@ -149,13 +168,19 @@ def retention(
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
     differences = group_differences(by_group)
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
-    notes += chosen_wordings([run for _, run in listed])
+    notes += [*chosen_wordings([run for _, run in listed]), *left_out([run for _, run in listed])]
     names = _distinct_labels([run for _, run in listed])
     rows, means = (
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
     pairs = [pair for _, run in listed for pair in _wordings(run, names[str(run.location)])]
-    return RetentionTable(rows, means, differences, results, iterations, tuple(notes), pairs)
+    gaps = vlm_gaps([run for _, run in listed], names) if gap else []
+    if gap and not gaps:
+        raise UsageError(
+            "--gap compares asked runs with acting ones in the same categories, and these runs have no such pair. "
+            "Make the missing ones with `probe-kit ask` or `probe-kit extract`"
+        )
+    return RetentionTable(rows, means, differences, results, iterations, tuple(notes), pairs, gaps)
 
 
 def _wordings(run: RunReader, label: str) -> list[WordingPair]:

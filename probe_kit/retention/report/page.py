@@ -19,6 +19,7 @@ from probe_kit.retention.report.tables import (
     control_table,
     difference_tables,
     more_behaviour_table,
+    plain_tables,
     retention_table,
 )
 from probe_kit.retention.table import RetentionTable, retention
@@ -84,7 +85,7 @@ def report_html(
         more_behaviour=more_behaviour_table(rows),
         retention=retention_table(rows),
         controls=control_table(rows),
-        differences=difference_tables(table.differences),
+        differences=[*difference_tables(table.differences), *plain_tables(table.further_tables)],
         pictures={
             subject: _pictures(exhibits, subject, names) for subject in ("behaviour", "probes", "retention")
         },

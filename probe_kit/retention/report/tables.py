@@ -28,6 +28,7 @@ from probe_kit.retention.cells import (
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.displays.style import spell
 from probe_kit.retention.heat import heat_colour
+from probe_kit.retention.plain_tables import PlainTable
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
@@ -266,6 +267,23 @@ def difference_tables(differences: Sequence[Difference]) -> list[HtmlTable]:
         )
         for title in titles
     ]
+
+
+def plain_tables(tables: Sequence[PlainTable]) -> list[HtmlTable]:
+    """As they are; rows of means stay below when others are sorted."""
+    return [
+        HtmlTable(
+            f"{table.title} ({table.note})",
+            tuple(HtmlColumn(_unbroken(name), "", name not in _WORDS) for name in table.columns),
+            tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN not in cells[:2]),
+            tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN in cells[:2]),
+        )
+        for table in tables
+    ]
+
+
+_WORDS = ("model", "category", "prompt")
+"""Columns of plain tables that hold no numbers."""
 
 
 def _radius(radius: str) -> _Column:

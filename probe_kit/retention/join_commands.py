@@ -1,0 +1,43 @@
+"""`probe-kit join`."""
+
+from typing import Annotated
+
+import typer
+
+from probe_kit.console import out, print_json
+from probe_kit.errors import NoProbesError, UsageError
+
+
+def join(
+    asked: Annotated[str, typer.Argument(help="A run of `probe-kit ask`.")],
+    acted: Annotated[str, typer.Argument(help="A run of `probe-kit extract` in the same scenes.")],
+    score: Annotated[str, typer.Option(help="Of the asked run: text, logits, or debiased.")] = "text",
+    view: Annotated[str | None, typer.Option(help="View of the acting run's probes; default the first.")] = None,
+    probes: Annotated[str | None, typer.Option(help="Key of these probes; default those asked for last.")] = None,
+    with_side_words: Annotated[
+        bool, typer.Option("--with-side-words", help="Count items such as 'no left turn sign' too.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Join what a model knows, what a policy encodes and what it does, question by question.
+
+    known: the model answers right. encoded: the policy's probe reads it, better than chance and controls. used:
+    the action follows. Refuses runs that did not begin with the same frames.
+    """
+    from probe_kit.extract import open_run
+    from probe_kit.retention.asked import scored
+    from probe_kit.retention.known import join as join_runs
+    from probe_kit.train import load_results
+
+    reader, policy = scored(open_run(asked), score, with_side_words), open_run(acted)
+    try:
+        results = load_results(policy, probes)
+    except NoProbesError:
+        if view is not None:
+            raise UsageError(f"--view {view}: {acted} has no probes. Run `probe-kit train {acted}`") from None
+        results = None
+    joined = join_runs(reader, policy, results, view)
+    if as_json:
+        print_json(joined.to_json())
+    else:
+        out.print(joined.to_rich())
