@@ -118,7 +118,7 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
 
 
 FLOATS = ("sr", "delta", "accuracy", "_ci_", "retention", "p_", "depth", "gap", "chance", "score", "paired_p")
-TEXTS = ("retention_note",)
+TEXTS = ("retention_note", "score")
 
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:
