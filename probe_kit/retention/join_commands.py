@@ -27,6 +27,7 @@ def join(
     from probe_kit.extract import open_run
     from probe_kit.retention.asked import scored
     from probe_kit.retention.known import join as join_runs
+    from probe_kit.retention.known_tables import rich_join
     from probe_kit.train import load_results
 
     reader, policy = scored(open_run(asked), score, with_side_words), open_run(acted)
@@ -40,4 +41,4 @@ def join(
     if as_json:
         print_json(joined.to_json())
     else:
-        out.print(joined.to_rich())
+        out.print(rich_join(joined))

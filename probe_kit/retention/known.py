@@ -34,7 +34,6 @@ from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
     import pandas as pd
-    from rich.console import Group
 
 Bools = NDArray[np.bool_]
 COIN = 0.25
@@ -129,12 +128,6 @@ class KnownUsed:
             for code in row.counts
         )
 
-    def to_rich(self) -> "Group":
-        """Counts, tests and notes as tables for a rich console."""
-        from probe_kit.retention.known_tables import rich_join
-
-        return rich_join(self)
-
 
 def join(
     asked: RunReader,
@@ -187,6 +180,12 @@ def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
                 "hash. Make it again with this version"
             )
     keys = ["item_id", "layout"]
+    for run in (asked, acted):
+        if run.episodes.duplicated(keys).any():
+            raise UsageError(
+                f"{run.location} holds an item more than once in a layout, such as in several wordings; join runs "
+                "that ask every item once"
+            )
     there = asked.episodes[[*keys, "outcome", FRAME]]
     pairs = acted.episodes.merge(there, on=keys, suffixes=("", "_asked"))
     if pairs.empty:

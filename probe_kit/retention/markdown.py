@@ -79,7 +79,7 @@ def markdown(
     wordings: Sequence[WordingPair] = (),
     further: Sequence[PlainTable] = (),
 ) -> str:
-    """Success rates and, where there are any, retention, controls, differences, wordings, more tables and notes."""
+    """Success rates and, where there are any, retention, controls, differences, wordings, more and notes."""
     asked = any(is_asked(row) for row in rows)
     columns = [(_of_both(name) if asked else name, cell) for name, cell in SUCCESS_COLUMNS]
     parts = [_rows_table("SR / accuracy" if asked else "Success rate", once_per_category(rows), columns)]

@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probe_kit.env.outcome import SENSITIVITY_RADII
 from probe_kit.errors import NoProbesError, UsageError
@@ -86,11 +86,15 @@ class RetentionTable:
     def to_json(self) -> str:
         """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
 
-        With groups, runs in several wordings or gaps, an object with the lists `rows`, `differences`, `wordings` and
-        `gaps`, as far as there are any.
+        With groups, runs in several wordings or gaps, an object with the lists `rows`, `differences`, `wordings`
+        and `gaps`, as far as there are any.
         """
         rows = [asdict(row) for row in self.all_rows]
-        lists = {"differences": self.differences, "wordings": self.wordings, "gaps": self.gaps}
+        lists: dict[str, Sequence[Any]] = {
+            "differences": self.differences,
+            "wordings": self.wordings,
+            "gaps": self.gaps,
+        }
         beside = {name: [asdict(row) for row in found] for name, found in lists.items() if found}
         content = {"rows": rows, **beside} if beside else rows
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)

@@ -15,6 +15,7 @@ from rich.console import Console
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.asked import scored
 from probe_kit.retention.known import Joined, encoded_decisions, join
+from probe_kit.retention.known_tables import rich_join
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
 SIZES = {"color": 14, "shape": 12}
@@ -206,7 +207,7 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     reader, policy = runs
     found = join(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
-    console.print(found.to_rich())
+    console.print(rich_join(found))
     text = console.export_text()
     for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "known − used"):
         assert words in text
