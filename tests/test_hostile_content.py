@@ -41,7 +41,8 @@ def said(*words: object) -> str:
     [
         ("run", "verify"), ("run", "verify", "--deep"), ("run", "verify", "--json"), ("run", "show"),
         ("run", "show", "--json"), ("run", "seal"), ("retention",), ("retention", "--format", "json"),
-        ("retention", "--format", "csv"), ("retention", "--format", "markdown"), ("retention", "--format", "latex"),
+        ("retention", "--format", "csv"), ("retention", "--format", "latex"),
+        ("retention", "--format", "markdown"),
         ("models", "--run"), ("train", "--views", "nothing"), ("export", "--format", "nothing"),
     ],
     ids=" ".join,
