@@ -1,6 +1,7 @@
 """Coverage of bounded and area retention, for one category and for the mean of twelve, and of perfect categories.
 
     python benchmarks/retention_coverage.py [--draws 240] [--shuffles 20] [--perfect-draws 1000] [--first-seed 0]
+        [--worlds …]
 
 Means of twelve are made of the same draws: all of them are shuffled into twelves again and again, so that
 `draws` / 12 means that share nothing stand behind each coverage, put together in many ways. Perfect: 12 groups of
@@ -175,7 +176,7 @@ def perfect(world: World, draws: int, first_seed: int) -> str:
         found["bounded"].append(bounded_fit(backbone, expert, PLACES, 0.5, seed))
         found["area"].append(area_fit(backbone, expert, 0.5, seed))
     truth = world.truth()
-    parts = [f"{world.name:30}"]
+    parts = [f"perfect, 12 groups: {world.name:22}"]
     for name, of_kind in found.items():
         covered, median, width = coverage(of_kind, truth[name == "area"])
         parts.append(
@@ -185,7 +186,7 @@ def perfect(world: World, draws: int, first_seed: int) -> str:
 
 
 def _covers(mean: Estimate, truth: float) -> bool:
-    low, high = mean.ci
+    low, high = mean.centred.ci
     return low is None or high is None or low <= truth <= high
 
 
@@ -196,14 +197,15 @@ def main() -> None:
     parser.add_argument("--shuffles", type=int, default=20)
     parser.add_argument("--perfect-draws", type=int, default=1000)
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--worlds", default="", help="beginnings of names, separated by semicolons; default all")
     asked = parser.parse_args()
     console = Console(width=220)
     with threadpool_limits(1):
-        console.print(f"perfect categories, 12 groups, {asked.perfect_draws} draws")
-        for world in PERFECT:
+        for world in PERFECT if asked.perfect_draws else ():
             console.print(perfect(world, asked.perfect_draws, asked.first_seed), highlight=False)
         console.print(f"one category and means of twelve, {asked.draws} draws")
-        for world in (*OWN, *TUNING):
+        names = tuple(asked.worlds.split(";"))
+        for world in (world for world in (*OWN, *TUNING) if world.name.startswith(names)):
             console.print(study(world, asked.draws, asked.shuffles, asked.first_seed), highlight=False)
 
 

@@ -53,6 +53,17 @@ class Estimate:
         return Estimate(value, draws, self.units, count)
 
     @property
+    def centred(self) -> "Estimate":
+        """With the median of the draws at the value.
+
+        A ratio is skewed, so that the average of many drifts away from the average of their estimates, in the
+        draws once more than in the estimates themselves.
+        """
+        known = self.draws[~np.isnan(self.draws)]
+        drift = float(np.median(known)) - self.value if known.size else 0.0
+        return Estimate(self.value, self.draws - drift, self.units, self.count)
+
+    @property
     def ci(self) -> Limits:
         """95 % percentile interval, with the value in it; without limits if too many draws have no meaning."""
         known = self.draws[~np.isnan(self.draws)]

@@ -88,13 +88,17 @@ def _other_retention(counted: Sequence[RetentionRow], estimates: Estimates) -> d
 def _retention_limits(
     counted: Sequence[RetentionRow], estimates: Estimates, name: str, limits: str
 ) -> Limits | None:
-    """The category's own where there is one, and none where one category has none: a mean knows no more."""
+    """The category's own where there is one, and none where one category has none: a mean knows no more.
+
+    Those of several are around their mean, as ratios are skewed.
+    """
     if len(counted) == 1:
         own: Limits | None = getattr(counted[0], limits)
         return own
     if any(getattr(row, limits) == UNBOUNDED for row in counted):
         return UNBOUNDED
-    return _limits(estimates, name)
+    found = estimates.get(name)
+    return None if found is None else found.centred.ci
 
 
 def _mean(rows: Sequence[RetentionRow], name: str) -> Any:

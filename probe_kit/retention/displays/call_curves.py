@@ -29,6 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_RELABELLED = "best relabelled probe, 95 %"
+_ROOM = 18.0
+"""Points below chance that the names of events need."""
+
+
 @dataclass
 class CallCurveDisplay(Shown):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
@@ -82,16 +87,18 @@ class CallCurveDisplay(Shown):
         for line in self.lines:
             _draw(axes, line.calls, line)
             style = PARTS[line.part]
-            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":")
+            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_RELABELLED)
             clear = line.significant
             axes.plot(
                 line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
             )
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 100 * self.chance - _ROOM * bool(self.events)), high)
         for number, event in enumerate(self.events):
-            _draw_event(axes, event, number)
+            _draw_event(axes, event, len(self.events) - number)
         _finish(axes, spell(self.category), "call (captured inference, from 0)")
         if figure is not None:
-            _complete(figure, axes, self.certificate)
+            _complete(figure, axes, self.certificate, tested=True)
         self.ax_ = axes
         return self
 
@@ -107,7 +114,7 @@ class CallCurveDisplay(Shown):
             _draw(axes, line.offsets, line)
         _finish(axes, f"{spell(self.category)}: {event}", "calls after the last one before it")
         if figure is not None:
-            _complete(figure, axes, self.certificate)
+            _complete(figure, axes, self.certificate, tested=False)
         self.ax_ = axes
         return self
 
@@ -139,7 +146,7 @@ def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
             display.plot(axes)
         else:
             display.plot_aligned(event, axes)
-    _complete(figure, grid[0], displays[0].certificate)
+    _complete(figure, grid[0], displays[0].certificate, tested=event is None)
     return figure
 
 
@@ -155,13 +162,13 @@ def _draw(axes: "Axes", places: "object", line: CallLine | AlignedLine) -> None:
 
 
 def _draw_event(axes: "Axes", event: EventTimes, number: int) -> None:
-    """Names stand one below the other, as several events may fall into one call."""
+    """Names stand one above the other below chance, as several events may fall into one call."""
     axes.axvspan(event.low, event.high, color="0.5", alpha=0.08, lw=0)
     axes.axvline(event.median, color="0.4", lw=0.8)
     words = event.event + ("" if event.share > 0.995 else f" ({100 * event.share:.0f} %)")
     axes.annotate(
-        words, (event.median, 1), (3, -8 * number - 2), xycoords=("data", "axes fraction"), fontsize=6.5,
-        textcoords="offset points", va="top", color="0.3",
+        words, (event.median, 0), (3, 8 * number - 5), xycoords=("data", "axes fraction"), fontsize=6.5,
+        textcoords="offset points", color="0.3",
     )  # fmt: skip
 
 
@@ -174,9 +181,10 @@ def _finish(axes: "Axes", title: str, below: str) -> None:
     axes.set_xlabel(below, fontsize=8.5)
 
 
-def _complete(figure: "Figure", axes: "Axes", certificate: Certificate) -> None:
+def _complete(figure: "Figure", axes: "Axes", certificate: Certificate, tested: bool) -> None:
+    """tested: whether markers are filled where something is evidence."""
 
     handles: dict[str, Artist] = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    legend_above(figure, [*handles.values(), *significance_handles()])
-    figure.supylabel("best site's held-out accuracy (%)", fontsize=9)
+    legend_above(figure, [*handles.values(), *(significance_handles() if tested else ())])
+    figure.supylabel("best site, accuracy (%)", fontsize=9)
     caption(figure, replace(certificate, call=None))
