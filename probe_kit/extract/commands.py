@@ -60,7 +60,13 @@ def extract(
             "seeds; default its own words (knowledge)."
         ),
     ] = None,
-    scene: Annotated[str, typer.Option(help="Scene preset: bridge, frontal, vl-think or act2answer.")] = "bridge",
+    protocol: Annotated[
+        str | None, typer.Option(help="act2answer: scene, checkpoint and options as released; what you give wins.")
+    ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(help="bridge (default), frontal, vl-think or act2answer; else the protocol's."),
+    ] = None,
     max_steps: Annotated[
         int | None, typer.Option(help="Actions per episode, at 5 Hz.", rich_help_panel=SCENE)
     ] = None,
@@ -100,6 +106,10 @@ def extract(
     execute: Annotated[
         int | None, typer.Option(help="Actions executed per inference; default the model's.")
     ] = None,
+    listen: Annotated[
+        bool,
+        typer.Option("--listen", help="Hear the first inference of every episode, do not act; no success rate."),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of cube places and policy noise.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
     dtype: Annotated[str | None, typer.Option(help="float32 or bfloat16; default the checkpoint's.")] = None,
@@ -131,8 +141,8 @@ def extract(
 
     The same command continues an interrupted run; other settings in the same folder are refused.
     """
-    from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, prepare
+    from probe_kit.extract.protocols import protocol_scene
     from probe_kit.extract.store.locate import locate
     from probe_kit.hooks.options import read_pairs
     from probe_kit.suite.ladder import check_wordings
@@ -162,11 +172,13 @@ def extract(
         categories=split(categories),
         items=items,
         wordings=None if wordings is None else check_wordings(split(wordings) or ()),
-        scene=SceneSpec.preset(scene, **changes),
+        protocol=protocol,
+        scene=protocol_scene(protocol, scene, **changes),
         seed=seed,
         tokens=tokens,
         captured_calls=captured_calls,
         execute=execute,
+        listen=listen,
         codec=codec,
         device=device,
         dtype=dtype,
@@ -209,11 +221,13 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     weights = (identity["weights_sha256"] or "scripted")[:12]
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
+        **_protocol_row(identity),
         "suite": plan.suite.identity,
         "categories": ", ".join(plan.suite.categories),
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
+        **({"acts": "no: it is listened to once per episode; no success rate"} if identity.get("listen") else {}),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),
@@ -232,6 +246,14 @@ def _describe_wordings(skipped: "Mapping[Wording, int]") -> str:
     return ", ".join(
         f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()
     )
+
+
+def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:
+    if "protocol" not in identity:
+        return {}
+    said = identity["protocol"]
+    changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in said["deviations"].items())
+    return {"protocol": said["name"] + (f", but {changed}" if changed else ", as released")}
 
 
 def _describe(stored: Any) -> str:

@@ -13,7 +13,7 @@ from probe_kit.extract.crews.ray import run_on_ray
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.play.events import Done, Event
-from probe_kit.extract.prepared import Prepared, check_run, load, load_reader
+from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_reader
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
 from probe_kit.extract.store.disk import refuse_if_full
 from probe_kit.extract.store.layout import RUN_FILE
@@ -113,6 +113,7 @@ def prepare(
     reader: the model of these `AskSettings`, if it is loaded already.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
+    settings = as_protocol(settings)
     location = None if out is None else locate(out)
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.

@@ -30,6 +30,9 @@ def models(
         for key in ("checkpoint", "streams", "embodiment", "does", "ready", "notes"):
             if row[key]:
                 out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
+        for protocol, settings in row["protocols"].items():
+            line = ", ".join(f"{name} {value}" for name, value in settings.items())
+            out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
@@ -62,6 +65,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "ready": _ready(family),
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
+            "protocols": {protocol: row.settings() for protocol, row in family.protocols.items()},
             "options": [
                 {"name": option.name, "kind": option.kind.__name__, "help": option.help, "default": option.default}
                 for option in family.options
@@ -71,7 +75,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
     ]
     scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
     rows += [
-        {"model": model, "description": text, **scripted, "does": "acts", "options": []}
+        {"model": model, "description": text, **scripted, "does": "acts", "protocols": {}, "options": []}
         for model, text in SCRIPTED.items()
         if name in (None, model)
     ]

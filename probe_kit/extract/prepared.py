@@ -11,8 +11,9 @@ from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episod
 from probe_kit.extract.play.ask_controller import AskController
 from probe_kit.extract.play.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
 from probe_kit.extract.play.examples import example_observations, refuse_unfit
-from probe_kit.extract.play.refusals import refuse_meaningless, refuse_unreachable
+from probe_kit.extract.play.refusals import refuse_meaningless, refuse_misfit, refuse_unreachable
 from probe_kit.extract.play.rehearsal import rehearse
+from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -48,6 +49,7 @@ class Prepared:
             "items": len(suite.items),
             "scene": self.settings.scene.to_json(),
             **({} if self.plan.wordings is None else {"wordings": self.plan.wordings}),
+            **(protocol_identity(self.settings) if isinstance(self.settings, ExtractSettings) else {}),
         }
 
     def provenance(self) -> dict[str, Any]:
@@ -82,6 +84,7 @@ def load(
     reader: the model of these `AskSettings`, if it is loaded already.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
+    settings = as_protocol(settings)
     suite = check_run(settings, location)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
@@ -96,6 +99,11 @@ def load(
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings)
     return Prepared(settings, plan, controller.identity, controller)
+
+
+def as_protocol(settings: RunSettings) -> RunSettings:
+    """The settings with what their protocol decides; see `ExtractSettings.followed`."""
+    return settings.followed() if isinstance(settings, ExtractSettings) else settings
 
 
 def check_run(settings: RunSettings, location: Location | None = None) -> Suite:
@@ -157,6 +165,7 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         **settings.options,
     )
     examples = example_observations(settings.scene, instructions)
+    refuse_misfit(settings, policy)
     refuse_unfit(policy.card, settings.batch, examples[0])
     refuse_unreachable(settings, policy.card)
     return PolicyController(
@@ -168,4 +177,5 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         settings.tokens == "all",
         settings.edits,
         settings.vectors,
+        settings.listen,
     )

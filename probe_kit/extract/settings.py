@@ -1,15 +1,16 @@
 """What one extraction is asked to do, and the part of it that names the result."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.asking.phrases import ASKED, Asked
 from probe_kit.extract.asking.templates import P1, Template
+from probe_kit.extract.protocols import deviations, protocol_row, protocol_scene
 from probe_kit.extract.store.layout import CODECS
 from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.identity import sha256_json
@@ -32,6 +33,8 @@ _ELSEWHERE = {
     "scene",
     "edits",
     "vectors",
+    "listen",
+    "protocol",
 }
 _MOST = {
     "captured_calls": 10_000,
@@ -44,6 +47,10 @@ _MOST = {
 LONGEST_LABEL = 200
 LARGEST = 1_000_000
 _MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", "workers", "ray"}
+
+
+_DEFAULT_SCENE = SceneSpec()
+"""This very object stands for a scene that was not chosen."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class RunSettings:
     suite: Path | None = None
     categories: tuple[str, ...] | None = None
     items: int | None = None
-    scene: SceneSpec = field(default_factory=SceneSpec)
+    scene: SceneSpec = _DEFAULT_SCENE
     seed: int = 0
     tokens: str = "pooled"
     label: str | None = None
@@ -145,6 +152,9 @@ class ExtractSettings(RunSettings):
     wordings: names of `suite.ladder`, each a condition of the run; None for the items' own words alone.
     captured_calls: policy inferences captured per episode, from the first on.
     execute: actions executed per inference; None for the policy's own.
+    protocol: a published one, such as `act2answer`: what is not given is as it has it, see `protocols`; its scene
+    takes the place of the default one.
+    listen: capture the first inference of every episode and do not act; for checkpoints of other arms.
     edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
     """
@@ -152,11 +162,15 @@ class ExtractSettings(RunSettings):
     wordings: tuple[Wording, ...] | None = None
     captured_calls: int = 1
     execute: int | None = None
+    listen: bool = False
+    protocol: str | None = None
     edits: tuple[Edit, ...] = ()
     vectors: Vectors = field(default_factory=dict)
     video: str = "none"
 
     def __post_init__(self) -> None:
+        if self.protocol is not None and self.scene is _DEFAULT_SCENE:
+            object.__setattr__(self, "scene", protocol_scene(self.protocol))
         super().__post_init__()
         self._check_one_of("video", VIDEOS)
         self._check_at_least("captured_calls", 1)
@@ -165,8 +179,26 @@ class ExtractSettings(RunSettings):
             check_wordings(self.wordings)
 
     def choices(self) -> dict[str, Any]:
-        """As of every run, and the edits."""
-        return super().choices() | ({"edits": [edit.to_json() for edit in self.edits]} if self.edits else {})
+        """As of every run, and what was not always there: whether it is listened to, and the edits."""
+        listening = {"listen": True} if self.listen else {}
+        edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
+        return super().choices() | listening | edits
+
+    def followed(self) -> Self:
+        """The settings with all that was not given as their protocol has it for the model; scripts get its scene.
+
+        Raises UsageError for a model that the protocol does not use.
+        """
+        row = protocol_row(self.model, self.protocol)
+        if row is None:
+            return self
+        return replace(
+            self,
+            checkpoint=self.checkpoint or row.checkpoint,
+            options={**row.options_for(self.checkpoint), **self.options},
+            execute=self.execute if self.execute or self.listen else row.execute,
+            dtype=self.dtype or row.dtype,
+        )
 
     @property
     def stored_calls(self) -> int:
@@ -254,9 +286,11 @@ def run_label(settings: RunSettings) -> str:
     if settings.label is not None:
         return " · ".join([settings.label, *(settings.marks() if asks else [])])
     parts = [settings.model]
-    if settings.checkpoint is not None:
-        parts.append(Path(settings.checkpoint).name)
-    parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
+    if isinstance(settings, ExtractSettings) and settings.protocol is not None:
+        parts += [settings.protocol, *(f"{name}={run}" for name, (_, run) in deviations(settings).items())]
+    else:
+        parts += [] if settings.checkpoint is None else [Path(settings.checkpoint).name]
+        parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights and settings.weights_seed:
         parts.append(f"twin {settings.weights_seed}")
     return " · ".join([*parts, *settings.marks()])

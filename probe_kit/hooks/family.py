@@ -13,6 +13,7 @@ from probe_kit.errors import CheckpointError, MissingExtraError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.foreign_code import loading
 from probe_kit.hooks.options import Option, check_options
+from probe_kit.hooks.protocol import ProtocolRow
 from probe_kit.machine import check_device_name, what_is_here
 from probe_kit.models.bounds import MOST_STEPS
 
@@ -43,7 +44,8 @@ class Family:
     released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
-    for one of them, what to do. needs_checkpoint: nothing is there by default.
+    for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
+    use the family, by name, with what they use it with.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -66,6 +68,7 @@ class Family:
     config_types: tuple[str, ...] = ()
     instead: tuple[tuple[str, str], ...] = ()
     needs_checkpoint: bool = False
+    protocols: Mapping[str, ProtocolRow] = MappingProxyType({})
     source: str | None = None
     sizes: tuple[tuple[str, str], ...] = ()
 

@@ -436,6 +436,21 @@ class AdapterContract(ModelContract):
         assert first.dtype == np.float32
         assert np.isfinite(first).all()
 
+    def test_listening_hears_the_inference_that_acting_makes(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        """Site by site, bit by bit; and what acts fits the arm."""
+        assert policy.misfit() is None
+        seen = self.shown(policy, observations)[:1]
+        sites = policy.sites()
+        with capture(policy, sites) as acting:
+            policy.act(seen, [5])
+        with capture(policy, sites) as listening:
+            heard = policy.listen(seen, [5])
+        assert heard.shape[0] == 1
+        for site in sites:
+            torch.testing.assert_close(acting[site], listening[site], rtol=0, atol=0)
+
     def test_every_observation_needs_its_seed(self, policy: Policy, observations: list[Observation]) -> None:
         with pytest.raises(ObservationError):
             policy.act(self.shown(policy, observations), [])

@@ -11,6 +11,10 @@ Column = tuple[str, Callable[[RetentionRow], str]]
 """Heading, and what a row shows under it."""
 
 
+NOT_ACTED = "n/a"
+"""In place of a success rate, for a model that was listened to."""
+
+
 def percent(value: float | None, digits: int = 1) -> str:
     """A share as a percentage, with one decimal unless told otherwise; a dash for None."""
     return "–" if value is None else f"{100 * value:.{digits}f}"
@@ -22,9 +26,10 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def model_name(row: RetentionRow) -> str:
-    """The model, marked if its weights are random, and its group if there are groups."""
+    """The model, marked if its weights are random or it was only listened to, and its group if there is one."""
     name = row.label or row.model
     name += " (random weights)" if row.random_weights else ""
+    name += " (listened to)" if row.listened else ""
     return name if row.group is None else f"{row.group}: {name}"
 
 
@@ -37,8 +42,8 @@ def with_limits(value: str, limits: Limits | None, write: Callable[[float | None
 
 
 def success_interval(row: RetentionRow) -> str:
-    """SR in percent with its interval."""
-    return with_limits(percent(row.sr), row.sr_ci, percent)
+    """SR in percent with its interval; n/a for a model that did not act."""
+    return NOT_ACTED if row.listened else with_limits(percent(row.sr), row.sr_ci, percent)
 
 
 def retention_value(row: RetentionRow) -> str:
@@ -143,6 +148,7 @@ def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
 def title(what: str, rows: Sequence[RetentionRow]) -> str:
     """Title of a table: what it shows, on which suites, and whether any weights are random."""
     marked = "; random weights" if any(row.random_weights for row in rows) else ""
+    marked += "; listened to: no success rate" if any(row.listened for row in rows) else ""
     return f"{what} ({', '.join(dict.fromkeys(row.suite for row in rows))}{marked})"
 
 

@@ -28,6 +28,7 @@ from probe_kit.retention.cells import (
     percent,
     prefix_place,
     probed,
+    success_interval,
     with_limits,
     wording_title,
 )
@@ -117,7 +118,9 @@ def _judged(rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _regime(row: RetentionRow) -> str:
-    return f"score {number(row.normalised_score, 1)}" if row.category == MEAN else _REGIMES[row.regime]
+    if row.regime is None:
+        return "did not act" if row.listened else f"score {number(row.normalised_score, 1)}"
+    return _REGIMES[row.regime]
 
 
 def _sides(row: RetentionRow) -> str:
@@ -164,7 +167,7 @@ _ANSWERS: dict[str, Sequence[Column]] = {
 }
 _SUCCESS: dict[str, Sequence[Column]] = {
     "Does it act on the answer?": [
-        ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+        ("SR % [95 %]", success_interval),
         ("± Δ", margin_value),
         ("paper's Δ", paper_margin),
         ("regime", _regime),

@@ -25,8 +25,8 @@ class Difference:
     category: str
     view: str | None
     paired: bool
-    sr: float
-    sr_ci: Limits
+    sr: float | None = None
+    sr_ci: Limits | None = None
     prefix_accuracy: float | None = None
     prefix_ci: Limits | None = None
     action_accuracy: float | None = None
@@ -71,7 +71,7 @@ def _average_common(found: Sequence[Estimates]) -> Estimates:
 def _compare(
     group: str, minus: str, view: str | None, here: Mapping[str, Estimates], there: Mapping[str, Estimates]
 ) -> list[Difference]:
-    common = [category for category in here if category in there]
+    common = [category for category in here if set(here[category]) & set(there.get(category, {}))]
     gaps = {
         category: {
             name: estimate - there[category][name]
@@ -80,20 +80,24 @@ def _compare(
         }
         for category in common
     }
-    paired = {category: here[category]["sr"].units == there[category]["sr"].units for category in common}
+    paired = {category: _drawn_alike(here[category], there[category]) for category in common}
     rows = [_row(group, minus, category, view, paired[category], gap) for category, gap in gaps.items()]
     if rows:
         rows.append(_row(group, minus, MEAN, view, all(paired.values()), average_estimates(list(gaps.values()))))
     return rows
 
 
+def _drawn_alike(here: Estimates, there: Estimates) -> bool:
+    """Whether both drew the same items: seen at the first quantity that both have, SR where both acted."""
+    name = next(name for name in here if name in there)
+    return here[name].units == there[name].units
+
+
 def _row(group: str, minus: str, category: str, view: str | None, paired: bool, gap: Estimates) -> Difference:
+    sr = _value(gap.get("sr"))
     prefix, action = (_value(gap.get(f"{part}_accuracy")) for part in ("prefix", "action"))
     debiased, bounded, area = (_value(gap.get(f"retention_{part}")) for part in ("debiased", "bounded", "area"))
-    sr = gap["sr"]
-    return Difference(
-        group, minus, category, view, paired, sr.value, sr.ci, *prefix, *action, *debiased, *bounded, *area
-    )
+    return Difference(group, minus, category, view, paired, *sr, *prefix, *action, *debiased, *bounded, *area)
 
 
 def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:

@@ -35,6 +35,11 @@ from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.wordings import WordingPair
 
+
+def _score(row: RetentionRow) -> str:
+    return f"normalised score {number(row.normalised_score, 1)}"
+
+
 SUCCESS_COLUMNS: list[Column] = [
     ("model", model_name),
     ("category", lambda row: row.category),
@@ -47,7 +52,7 @@ SUCCESS_COLUMNS: list[Column] = [
     ("flagged steps %", lambda row: percent(row.p_flagged)),
     ("original / swapped %", lambda row: f"{percent(row.sr_original)} / {percent(row.sr_swapped)}"),
     ("left / right %", lambda row: f"{percent(row.sr_left)} / {percent(row.sr_right)}"),
-    ("regime", lambda row: row.regime or f"normalised score {number(row.normalised_score, 1)}"),
+    ("regime", lambda row: row.regime or ("did not act" if row.listened else _score(row))),
     ("n (items)", lambda row: f"{row.n_episodes} ({row.n_items})"),
 ]
 

@@ -28,6 +28,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
     first, counted = rows[0], [row for row in rows if row.retention_defined]
     left_out = tuple(row.category for row in rows if row.view is not None and not row.retention_defined)
     note = f"without {', '.join(left_out)}" if left_out else ""
+    acted = all(row.sr is not None for row in rows)
     return RetentionRow(
         run=first.run,
         model=first.model,
@@ -45,8 +46,9 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         action_stream=first.action_stream,
         n_episodes=sum(row.n_episodes for row in rows),
         n_items=sum(row.n_items for row in rows),
-        normalised_score=normalised_score([row.sr for row in rows]),
-        sr=fmean(row.sr for row in rows),
+        listened=first.listened,
+        normalised_score=normalised_score([row.sr for row in rows if row.sr is not None]) if acted else None,
+        sr=_mean(rows, "sr"),
         sr_ci=_limits(estimates, "sr"),
         prefix_ci=_limits(estimates, "prefix_accuracy"),
         action_ci=_limits(estimates, "action_accuracy"),

@@ -13,7 +13,8 @@ class Source:
     """Whose numbers a row holds.
 
     label: what the run is called in tables and legends. action_stream: `expert`, or `action` in a policy without
-    one, whose iterations are action tokens. call: the captured inference that was probed, from 0.
+    one, whose iterations are action tokens. call: the captured inference that was probed, from 0. listened: the
+    model was only heard and did not act.
     """
 
     run: str
@@ -26,11 +27,12 @@ class Source:
     label: str = ""
     action_stream: str | None = None
     call: int | None = None
+    listened: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """What the policy did.
+    """What the policy did; `sr` is None where it was listened to and did not act.
 
     delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
     which decides `regime`. sr_by_epsilon: SR by zone radius in metres.
@@ -38,7 +40,7 @@ class Behaviour:
 
     n_episodes: int
     n_items: int
-    sr: float
+    sr: float | None
     delta: float | None = None
     delta_items: float | None = None
     delta_regime: float | None = None

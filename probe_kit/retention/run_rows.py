@@ -12,7 +12,7 @@ from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_es
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.row_parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
 from probe_kit.retention.rows import Part, RetentionRow
-from probe_kit.retention.success import SuccessRate, sensitivity, success_rate, units_of
+from probe_kit.retention.success import SuccessRate, listened, sensitivity, success_rate, units_of
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.controls import Controls, TwinScore
@@ -69,13 +69,12 @@ def _row(
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> Drawn:
-    success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
-    parts: list[Part] = [
-        _source(run, results),
-        _asked(run, episodes),
-        _behaviour(success, sensitivity(episodes, settings.epsilons)),
-    ]
-    estimates = {"sr": sr_estimate(episodes, run.suite)}
+    success = None if listened(episodes) else success_rate(episodes, units_seed(units_of(episodes), run.suite))
+    behaviour = (
+        _unmoved(episodes) if success is None else _behaviour(success, sensitivity(episodes, settings.epsilons))
+    )
+    parts: list[Part] = [_source(run, results, success is None), _asked(run, episodes), behaviour]
+    estimates = {} if success is None else {"sr": sr_estimate(episodes, run.suite)}
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
         probed = _Probed(results.controls, category, view, curve, _peaks(curve, settings.iterations))
@@ -90,7 +89,7 @@ def _row(
     return Drawn(RetentionRow.of(category, view, group, *parts), estimates)
 
 
-def _source(run: RunReader, results: ProbeResults | None) -> Source:
+def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> Source:
     return Source(
         run=str(run.location),
         model=run.model,
@@ -102,6 +101,7 @@ def _source(run: RunReader, results: ProbeResults | None) -> Source:
         run_settings=run.settings_sha256,
         probe_settings=None if results is None else results.key,
         call=None if results is None else results.settings.call,
+        listened=heard,
     )
 
 
@@ -126,6 +126,11 @@ def _asked(run: RunReader, episodes: "pd.DataFrame") -> Asked:
         letter_bias=_number(float(bias)),
         p_near_tie=float(episodes["near_tie"].astype(bool).mean()),
     )
+
+
+def _unmoved(episodes: "pd.DataFrame") -> Behaviour:
+    """Of a model that was listened to."""
+    return Behaviour(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), sr=None)
 
 
 def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviour:
@@ -221,14 +226,14 @@ class _Probed:
             action_ties=peak.ties,
         )
 
-    def background(self, success: SuccessRate) -> Background:
+    def background(self, success: SuccessRate | None) -> Background:
         """What the best sites are held against."""
         baselines, prefix = self.controls.of_category(self.category), self.peaks.get("prefix")
         twins = [self._twin(stream) for stream in ("backbone", self.curve.action_stream)]
         return Background(
             n_groups=self.curve.n_groups,
             chance=self.curve.chance,
-            gap=None if prefix is None else prefix.accuracy - success.sr,
+            gap=None if prefix is None or success is None else prefix.accuracy - success.sr,
             baselines={name: score.accuracy for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
             twin=next((twin.twin for twin in twins if twin is not None), None),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
+from probe_kit.extract.store.layout import LISTENED
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.reader import refuse_several_wordings
@@ -100,14 +101,28 @@ def normalised_score(success_rates: Sequence[float]) -> float:
     return (100 * fmean(success_rates) - 50) / 50 * 100
 
 
+def listened(episodes: "pd.DataFrame") -> bool:
+    """Whether the model of these episodes was only listened to: it did not act, and there is no success rate."""
+    return not episodes.empty and bool((episodes["outcome"] == LISTENED).all())
+
+
+def _refuse_listened(episodes: "pd.DataFrame") -> None:
+    if listened(episodes):
+        raise UsageError(
+            "this run's model was listened to (extract --listen) and did not act: there is no success rate. Its "
+            "probes are as ever"
+        )
+
+
 def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
     episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
     and `group_id` where items share pictures. Raises UsageError for a table that is empty or of several
-    wordings.
+    wordings, and for episodes in which the model did not act.
     """
     refuse_several_wordings(episodes)
+    _refuse_listened(episodes)
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
     correct = episodes["outcome"] == "correct"
@@ -183,7 +198,8 @@ def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_R
 
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:
-    """Items that ran in both layouts, by outcome; others are left out."""
+    """Items that ran in both layouts, by outcome; others are left out. Raises UsageError if nothing was acted."""
+    _refuse_listened(episodes)
     outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
     outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
     right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)

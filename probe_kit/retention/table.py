@@ -18,6 +18,7 @@ from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_
 from probe_kit.retention.plain_tables import ANSWERS, PlainTable, answer_table, gap_tables, size_table
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
+from probe_kit.retention.success import listened
 from probe_kit.retention.wordings import WordingPair, wording_pairs
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
@@ -171,6 +172,7 @@ def retention(
         means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
     by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
     differences = group_differences(by_group)
+    notes += [f"{run.location} was listened to and did not act: SR is n/a." for _, run in listed if _heard(run)]
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
     notes += [*chosen_wordings([run for _, run in listed]), *left_out([run for _, run in listed])]
     names = _distinct_labels([run for _, run in listed])
@@ -198,13 +200,17 @@ def _wordings(run: RunReader, label: str) -> list[WordingPair]:
 
 def _distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
     """By run what it is called; runs that share a name are told apart by the hash of their settings."""
-    shared = Counter((run.label, run.random_weights) for run in runs)
+    shared = Counter((run.label, run.random_weights, _heard(run)) for run in runs)
     return {
         str(run.location): run.label
-        if shared[run.label, run.random_weights] == 1
+        if shared[run.label, run.random_weights, _heard(run)] == 1
         else f"{run.label} · {run.settings_sha256[:6]}"
         for run in runs
     }
+
+
+def _heard(run: RunReader) -> bool:
+    return listened(run.episodes)
 
 
 def _refuse_doubles(runs: Sequence[RunReader]) -> None:

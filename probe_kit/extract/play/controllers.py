@@ -66,8 +66,10 @@ class ActingController(Controller, Protocol):
     """Acts.
 
     flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
+    listens: whether what `act` gives is only to be heard, and episodes end with it.
     """
 
+    listens: bool
     flagged: NDArray[np.bool_] | None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -85,7 +87,7 @@ class ScriptedController:
         self.streams: list[StoredStream] = []
         self.script: str | None = name
         self.threads: int | None = None
-        self.on_gpu = False
+        self.on_gpu = self.listens = False
         self.flagged: NDArray[np.bool_] | None = None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -101,7 +103,10 @@ class ScriptedController:
 
 
 class PolicyController:
-    """Infers, executes the head of the chunk, and captures the first inferences of every episode."""
+    """Infers, executes the head of the chunk, and captures the first inferences of every episode.
+
+    One that listens infers and captures once per episode; nothing is executed.
+    """
 
     def __init__(
         self,
@@ -113,9 +118,11 @@ class PolicyController:
         with_tokens: bool,
         edits: Sequence[Edit] = (),
         vectors: Vectors | None = None,
+        listens: bool = False,
     ) -> None:
         """examples: an observation per instruction of the suite, as the scene will show them."""
-        self.policy = policy
+        self.policy, self.listens = policy, listens
+        self._infer = policy.listen if listens else policy.act
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
@@ -136,6 +143,8 @@ class PolicyController:
         }
         if card.settings:
             self.identity["policy"] = dict(card.settings)
+        if listens and (deaf := policy.deaf_to()):
+            self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._ledger: list[dict[str, Any]] = []
 
@@ -153,7 +162,7 @@ class PolicyController:
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if captured:
             chunks = self._capturer.run(
-                lambda: self.policy.act(observations, seeds),
+                lambda: self._infer(observations, seeds),
                 lambda actions: actions,
                 self.policy.roles(observations),
                 captured,
@@ -161,7 +170,7 @@ class PolicyController:
             )
         else:
             with self._edited(observations):
-                chunks = self.policy.act(observations, seeds)
+                chunks = self._infer(observations, seeds)
         self.flagged = self.policy.flagged
         _check_chunks(chunks, len(turns))
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
@@ -175,7 +184,7 @@ class PolicyController:
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
         exponent = self.policy.card.ensemble
-        if exponent is None:
+        if exponent is None or self.listens:
             return chunk[: self.execute]
         turn.past.append(chunk)
         return ensemble(turn.past, exponent)[None]

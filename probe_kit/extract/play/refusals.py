@@ -1,9 +1,14 @@
 """Combinations of settings that would be obeyed and mean nothing."""
 
-from probe_kit.errors import UsageError
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.play.controllers import SCRIPTED
 from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.card import Card
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
 
 
 def refuse_meaningless(settings: RunSettings) -> None:
@@ -13,9 +18,14 @@ def refuse_meaningless(settings: RunSettings) -> None:
             f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
             "Leave it out, or add --random-weights"
         )
-    if settings.model not in SCRIPTED or not isinstance(settings, ExtractSettings):
+    if not isinstance(settings, ExtractSettings):
+        return
+    if settings.listen:
+        _refuse_acting(settings)
+    if settings.model not in SCRIPTED:
         return
     asked = {
+        "--listen": settings.listen,
         "--checkpoint": settings.checkpoint is not None,
         "--random-weights": settings.random_weights,
         "--batch": settings.batch != 1,
@@ -32,8 +42,32 @@ def refuse_meaningless(settings: RunSettings) -> None:
         )
 
 
+def _refuse_acting(settings: ExtractSettings) -> None:
+    acting = {
+        "--captured-calls": settings.captured_calls != 1,
+        "--execute": settings.execute is not None,
+        "--video": settings.video != "none",
+    }
+    if meaningless := [option for option, given in acting.items() if given]:
+        raise UsageError(
+            f"--listen hears the first inference of every episode and moves nothing, so {', '.join(meaningless)} "
+            "means nothing. Leave it out"
+        )
+
+
+def refuse_misfit(settings: ExtractSettings, policy: "Policy") -> None:
+    """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only listened to."""
+    if not settings.listen and (reason := policy.misfit()) is not None:
+        raise CheckpointError(
+            f"{reason}. To capture what it thinks without acting, add --listen: the first inference of every "
+            "episode is stored and probed as ever, and there is no success rate"
+        )
+
+
 def refuse_unreachable(settings: ExtractSettings, card: Card) -> None:
     """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    if settings.listen:
+        return
     if settings.execute is not None and settings.execute > card.chunk:
         raise UsageError(
             f"--execute {settings.execute}: {settings.model} gives {card.chunk} actions per inference; execute "

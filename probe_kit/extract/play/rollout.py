@@ -83,6 +83,12 @@ class Seat:
             self.flagged = (self.flagged or 0) + flagged
         self.stage.ask("advance", actions)
 
+    def hear_out(self) -> None:
+        """The model was heard; the episode ends before anything moves."""
+        self.seen = None
+        self.calls += 1
+        self.stage.ask("dismiss")
+
     @property
     def counts(self) -> dict[str, int]:
         """What the outcome record says of the policy's steps, where the policy can tell."""
@@ -168,7 +174,10 @@ class Play:
                 seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
         flags = self._controller.flagged
         for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
-            seat.go_on(actions, None if flags is None else bool(flags[row]))
+            if self._controller.listens:
+                seat.hear_out()
+            else:
+                seat.go_on(actions, None if flags is None else bool(flags[row]))
 
     def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
         assert seat.planned is not None

@@ -22,6 +22,7 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.store.layout import LISTENED
 from probe_kit.extract.store.thumbnails import Ends, shrink
 from probe_kit.hooks.observation import Observation
 
@@ -112,6 +113,11 @@ class Stage:
         except ProbeKitError as error:
             raise self._named(error) from None
 
+    def dismiss(self) -> Answer:
+        """End the episode as it began: its model listened and does not act. There is no outcome."""
+        ends = None if self._first is None else (self._first,)
+        return Ending({"outcome": LISTENED, **self._facts}, self._frames, ends)
+
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
@@ -174,7 +180,7 @@ class AskableStage(Protocol):
     """A stage somewhere: asked first, answered later, so that several can work at a time."""
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Start `Stage.begin`, `Stage.advance` or `Stage.look`."""
+        """Start `Stage.begin`, `Stage.advance`, `Stage.dismiss` or `Stage.look`."""
 
     def answer(self) -> Answer:
         """What the last question gave; raises what it raised."""

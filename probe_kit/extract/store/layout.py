@@ -37,6 +37,8 @@ FRAMES, CERTIFICATES, SEALED, PROBES = "frames", "certificates", "sealed", "prob
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """What no hash covers: pictures for people."""
 CODECS = ("zstd", "fast", "none")
+LISTENED = "listened"
+"""Outcome of an episode in which the model was heard and did not act: there is no success rate."""
 
 
 @dataclass(frozen=True)

@@ -124,6 +124,11 @@ class Run:
         return bool(self.settings["random_weights"])
 
     @property
+    def listened(self) -> bool:
+        """Whether its model was only heard and did not act: it has activations and no success rate."""
+        return bool(self.settings.get("listen"))
+
+    @property
     def suite(self) -> str:
         """Identity of the suite that was run, `name@version#hash`."""
         return str(self.settings["suite"]["identity"])

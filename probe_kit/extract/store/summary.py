@@ -4,7 +4,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from probe_kit.extract.store.layout import RUN_FILE
+from probe_kit.extract.store.layout import LISTENED, RUN_FILE
 from probe_kit.hooks.summary import streams_text
 from probe_kit.notebook import facts_html
 
@@ -63,6 +63,7 @@ NOT_PROTECTED = "not protected: made by a former version, without hashes that fi
 def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
+    random += ", LISTENED TO (it did not act)" if LISTENED in _outcomes(run) else ""
     old = "" if run.protected else ", not protected"
     return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}{old}, at {run.location}>"
 

@@ -89,7 +89,8 @@ class RunWriter:
             self.settings["tokens"] == "all",
             self.settings["codec"],
         )
-        if "scene" in self.settings and "ask" not in self.settings:  # who is asked does not move
+        still = "ask" in self.settings or bool(self.settings.get("listen"))
+        if "scene" in self.settings and not still:  # who is asked or listened to does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
         objects = {

@@ -3,6 +3,7 @@
 B batch, P patches, T text tokens, S = P + T positions, D width of the language model, V its vocabulary.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,15 @@ class Projector(nn.Module):
         """(B, P, D) from (B, P, vision width)."""
         projected: Tensor = self.fc2(nn.functional.gelu(self.fc1(patches)))
         return projected if self.fc3 is None else self.fc3(nn.functional.gelu(projected))
+
+
+Choose = Callable[[Tensor], Tensor]
+"""(B,) ids of the next tokens from their logits (B, V)."""
+
+
+def likeliest(logits: Tensor) -> Tensor:
+    """Greedy decoding."""
+    return logits.argmax(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -84,11 +94,13 @@ class PrismaticNetwork(nn.Module):
             output_hidden_states=True,
         )
 
-    def decode(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int) -> Decoded:
-        """Exactly `steps` greedy tokens behind the prompt, whatever they are.
+    def decode(
+        self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int, choose: Choose = likeliest
+    ) -> Decoded:
+        """Exactly `steps` tokens behind the prompt, whatever they are.
 
-        ids, mask: as for `forward`, with a token, not padding, at the end of every row. The language model is
-        called once with the prompt and `steps - 1` times with one token.
+        ids, mask: as for `forward`, with a token, not padding, at the end of every row. choose: the next ids; the
+        likeliest by default. The language model is called once with the prompt and `steps - 1` times with a token.
         """
         embeddings, mask = self.embed(ids, mask, pixel_values)
         cache = DynamicCache(config=self.language_model.config)
@@ -105,7 +117,7 @@ class PrismaticNetwork(nn.Module):
                 logits_to_keep=1,
             )
             logits.append(output.logits[:, -1])
-            chosen.append(logits[-1].argmax(dim=-1))
+            chosen.append(choose(logits[-1]))
             if len(chosen) == steps:
                 break
             embeddings = self.language_model.get_input_embeddings()(chosen[-1][:, None])

@@ -25,6 +25,7 @@ from probe_kit.retention.displays.model_depth import model_depths
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.success import listened
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.calls import load_calls
 from probe_kit.train.reader import RunReader
@@ -122,11 +123,14 @@ def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Ex
     def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
         return Exhibit(name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True)
 
-    exhibits = [
-        show(SuccessTableDisplay, "success", "Success rate", "behaviour"),
-        show(SideTableDisplay, "sides", "Success rate by side", "behaviour"),
-    ]
-    if any(row.prefix_accuracy is not None for row in table.rows):
+    acted = [row for row in table.rows if row.sr is not None]
+    exhibits: list[Exhibit] = []
+    if acted:
+        exhibits += [
+            show(SuccessTableDisplay, "success", "Success rate", "behaviour"),
+            show(SideTableDisplay, "sides", "Success rate by side", "behaviour"),
+        ]
+    if any(row.prefix_accuracy is not None for row in acted):
         exhibits.append(
             Exhibit(
                 "knowledge-action", "Knowledge and action", "retention",
@@ -151,6 +155,8 @@ def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Ex
 
 
 def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
+    if listened(run.episodes):
+        return []
     exhibits = [
         Exhibit(
             f"{name}-paired-layouts", "The same question, pictures swapped", "behaviour",

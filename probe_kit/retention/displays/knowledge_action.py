@@ -70,7 +70,9 @@ class KnowledgeActionDisplay(Shown):
             if (point := _point(row, stream)) is not None:
                 points.append(point)
         if not points:
-            raise UsageError(f"no run has probes of stream {stream!r}" + (f" in view {view!r}" if view else ""))
+            raise UsageError(
+                f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
+            )
         means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
         return cls(stream, tuple(points), tuple(Certificate.of_row(mean) for mean in means))
 
@@ -100,7 +102,7 @@ class KnowledgeActionDisplay(Shown):
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     prefix = stream == "backbone"
     accuracy = row.prefix_accuracy if prefix else row.action_accuracy
-    if accuracy is None:
+    if accuracy is None or row.sr is None or row.sr_ci is None:
         return None
     return GapPoint(
         model=model_name(row),

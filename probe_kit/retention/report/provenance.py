@@ -37,6 +37,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
         "suite": run.suite,
         "episodes": str(len(run.episodes)),
         "streams": "; ".join(_stream(run, stream) for stream in run.streams) or "none",
+        **_protocol(settings),
         "run settings sha256": run.settings_sha256,
         "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
             certificate.get("hooks_on_equals_hooks_off"), "no"
@@ -51,6 +52,27 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
         Certificate.of_run(run).line,
         tuple((key, value) for key, value in facts.items() if value),
         tuple((key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value),
+    )
+
+
+def _protocol(settings: dict[str, Any]) -> dict[str, str]:
+    """The protocol that a run follows, how it differs from the default, and how the run differs from it."""
+    said = settings.get("protocol")
+    if not said:
+        return {}
+    return {
+        "protocol": said["name"],
+        "deviates from it in": _listed(said["deviations"], "instead of") or "nothing",
+        "it differs from the default in": _listed(
+            {name: pair[::-1] for name, pair in said["differs_from_default"].items()}, "instead of"
+        ),
+        "of it cannot be matched": "; ".join(said["unmatched"]),
+    }
+
+
+def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
+    return "; ".join(
+        f"{name} {now or 'nothing'} {between} {was or 'nothing'}" for name, (was, now) in pairs.items()
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from probe_kit.retention.cells import model_name, percent
+from probe_kit.retention.cells import NOT_ACTED, model_name, percent
 from probe_kit.retention.displays.style import spell
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
@@ -51,7 +51,8 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 
 def _headlines(mean: RetentionRow) -> list[Headline]:
-    found = [Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")]
+    rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
+    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
     if mean.prefix_accuracy is not None:
         found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
     if mean.action_accuracy is not None:
@@ -91,6 +92,8 @@ def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
+    if mean.listened:
+        return "The model was listened to at the first picture of every episode and did not act: no success rate."
     knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
     fails = [row for row in rows if row.regime == Regime.FAILURE]
     text = f"The cube ended on the correct picture in {percent(mean.sr)} % of episodes, averaged over categories. "
@@ -152,8 +155,11 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
 
 def read_row(row: RetentionRow) -> list[str]:
     """One category in sentences."""
-    right = round(row.sr * row.n_episodes)
-    found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
+    if row.sr is None:
+        found = [f"Listened to in {row.n_episodes} episodes; it did not act."]
+    else:
+        right = round(row.sr * row.n_episodes)
+        found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
     if row.items_both_right is not None:
         items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
         found.append(f"{row.items_both_right} of {items} questions right in both layouts.")

@@ -130,6 +130,12 @@ def _twice(row: RetentionRow) -> str:
     return f"{row.items_both_right} of {total}"
 
 
+def _reading(row: RetentionRow) -> str:
+    if row.listened:
+        return "did not act"
+    return _REGIMES.get(row.regime) or f"score {number(row.normalised_score, 1)}"
+
+
 _NAMES = [
     _Column("model", model_name, model_name, "The policy; marked if its weights are random."),
     _Column("category", lambda row: spell(row.category), lambda row: row.category, "Kind of question."),
@@ -152,7 +158,7 @@ _BEHAVIOUR = [
     _share("± Δ", "delta_regime", "Δ"),
     _share("paper's Δ", "delta", "paper's Δ"),
     _Column(
-        "reading", lambda row: _REGIMES.get(row.regime) or f"score {number(row.normalised_score, 1)}",
+        "reading", _reading,
         lambda row: row.sr, "reading",
     ),
     _share("wrong %", "p_wrong", "wrong"),

@@ -2,6 +2,7 @@
 
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 
 FAMILIES = (
     Family(
@@ -26,5 +27,15 @@ FAMILIES = (
             Option("vlm", str, "Folder or hub id of its Qwen2.5-VL; no weights.", "as config.yaml says"),
             Option("tokenizer", str, "Folder of another tokenizer.json.", "the vision-language model's"),
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge",
+                execute=1,
+                dtype="bfloat16",
+                options={"steps": 10, "guidance": 1.5},
+                of_checkpoint={"unnorm_key": "bridge_dataset"},
+                unmatched=(OWN_SEEDS,),
+            )
+        },
     ),
 )

@@ -45,6 +45,7 @@ STEPS, GUIDANCE = 10, 1.5
 _TIED = ("qwen_vl_interface.model.lm_head.weight",)
 _BLOCK = ("residual", "attention", "mlp")
 _GRIPPER_OPEN = 0.5
+_DIMENSIONS = 7
 _UNCONDITIONAL = "expert_unconditional"
 
 
@@ -171,18 +172,31 @@ class InternVLA(QwenVLA):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
-        self.check(seen, seeds)
-        head = self.config.head
-        if len(self.units.low) != head.action_dim or head.action_dim != 7:
-            raise CheckpointError(
-                f"{self.units.key} has actions of {len(self.units.low)} dimensions, the head {head.action_dim}; "
-                "Act2Answer needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
-            )
-        noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)
-        chunk = self.infer(self.inputs(seen), self.views(seen), noise)
-        actions = self.units.restore(chunk.cpu().numpy())
+        if (reason := self.misfit()) is not None:
+            raise CheckpointError(reason)
+        actions = self.units.restore(self.listen(seen, seeds))
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
+
+    def misfit(self) -> str | None:
+        """No statistics, or other actions than an end-effector delta."""
+        units, head = self._units_or_reason(), self.config.head
+        if isinstance(units, str):
+            return units
+        if len(units.low) == head.action_dim == _DIMENSIONS:
+            return None
+        return (
+            f"{units.key} has actions of {len(units.low)} dimensions, the head {head.action_dim}; Act2Answer "
+            "needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
+        )
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, A, action numbers) as the head puts them out, without units."""
+        self.check(seen, seeds)
+        head = self.config.head
+        noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)
+        output: NDArray[np.float32] = self.infer(self.inputs(seen), self.views(seen), noise).cpu().numpy()
+        return output
 
     def infer(self, inputs: QwenInputs, views: Tensor, noise: Tensor) -> Tensor:
         """(B, A, action numbers) normalised actions; one inference, as `capture` counts it."""

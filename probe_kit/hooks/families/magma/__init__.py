@@ -2,6 +2,7 @@
 
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 
 FAMILIES = (
     Family(
@@ -32,6 +33,18 @@ FAMILIES = (
                 "layer_scale", str, "weight: accept them under that name.", "gamma", choices=("gamma", "weight")
             ),
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "microsoft/Magma-8B",
+                execute=1,
+                dtype="bfloat16",
+                options={"unnorm_key": "bridge_orig", "prompt": "act2answer", "temperature": 0.7, "shrink": 256},
+                unmatched=(
+                    OWN_SEEDS,
+                    "an answer that is no action stops the hand; there row 0's tokens are taken",
+                ),
+            )
+        },
         reads=True,
         unstored=(
             "vision_tower.clip_vision_model.head.",

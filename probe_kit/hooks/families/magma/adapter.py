@@ -20,9 +20,9 @@ from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
-from probe_kit.hooks.families.magma.sampling import chooser
 from probe_kit.hooks.families.magma.text import ChatText, Prompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
+from probe_kit.hooks.families.sampling import chooser
 from probe_kit.hooks.model import Policy, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
@@ -174,22 +174,38 @@ class Magma(Policy, Reader):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; a row that put out no action holds still, see `flagged` and the contract."""
-        self.check(seen, seeds)
-        if not len(self.statistics.low) == self.steps == STEPS:
-            raise CheckpointError(
-                f"{self.statistics.key} has actions of {len(self.statistics.low)} dimensions and Magma puts out "
-                f"{self.steps} tokens; Act2Answer needs {STEPS} of both. Choose another -M unnorm_key"
-            )
-        choose = chooser(self.temperature, seeds)
-        prompts = [self.prompt(observation.instruction).ids for observation in seen]
-        decoded = self.generate(prompts, [self.picture(observation.image) for observation in seen], choose)
-        ids = decoded.ids.cpu().numpy()
-        self.flagged = ~self._whole(ids, decoded, choose)
+        if (reason := self.misfit()) is not None:
+            raise CheckpointError(reason)
+        ids = self._tokens(seen, seeds)
+        assert self.flagged is not None
         actions = self.statistics.restore(self.action_tokens.values(ids))
         actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
         for row in np.flatnonzero(self.flagged):
             actions[row] = [0] * (STEPS - 1) + [seen[row].state[-1] > _GRIPPER_OPEN]
         return actions[:, None].astype(np.float32)
+
+    def misfit(self) -> str | None:
+        """Other actions than an end-effector delta."""
+        if len(self.statistics.low) == self.steps == STEPS:
+            return None
+        return (
+            f"{self.statistics.key} has actions of {len(self.statistics.low)} dimensions and Magma puts out "
+            f"{self.steps} tokens; Act2Answer needs {STEPS} of both. Choose another -M unnorm_key"
+        )
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, 1, tokens): the middle of the bin that each token names, without units."""
+        return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
+
+    def _tokens(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
+        """(B, tokens) ids; one inference. Rows that put out something else than one action are flagged."""
+        self.check(seen, seeds)
+        choose = chooser(self.temperature, seeds)
+        prompts = [self.prompt(observation.instruction).ids for observation in seen]
+        decoded = self.generate(prompts, [self.picture(observation.image) for observation in seen], choose)
+        ids: NDArray[np.int64] = decoded.ids.cpu().numpy()
+        self.flagged = ~self._whole(ids, decoded, choose)
+        return ids
 
     def _whole(self, ids: NDArray[np.int64], decoded: Decoded, choose: Choose) -> NDArray[np.bool_]:
         """(B,) which rows put out seven tokens that name bins, and then the end of the turn."""

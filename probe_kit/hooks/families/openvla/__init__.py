@@ -3,6 +3,7 @@
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 
 FAMILIES = (
     Family(
@@ -29,6 +30,24 @@ FAMILIES = (
             Option("centre_crop", bool, "Show 0.9 of the area: fine-tunes with augmentation.", "false"),
             TOKENIZER,
             BITS,
+            Option("temperature", float, "0: the likeliest; above: drawn among tokens of actions.", "0"),
+            Option(
+                "resize",
+                str,
+                "tensor: in bfloat16, as Act2Answer's evaluation.",
+                "pil",
+                choices=("pil", "tensor"),
+            ),
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "gen-robot/openvla-7b-rlvla-sft_16k",
+                execute=1,
+                dtype="bfloat16",
+                options={"temperature": 0.6, "resize": "tensor", "centre_crop": False},
+                of_checkpoint={"unnorm_key": "sft"},
+                unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
+            )
+        },
     ),
 )

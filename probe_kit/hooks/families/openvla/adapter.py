@@ -5,21 +5,25 @@ greedy tokens follow, one per dimension; iteration k of the stream `action` is t
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.families.sampling import chooser
 from probe_kit.hooks.model import Policy
-from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.models.prismatic import CROP_AREA, centre_crop
+from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
 _SLOT = "{instruction}"
@@ -33,6 +37,7 @@ PROMPTS = {
 _LLAMA_VOCABULARY = 32000
 _LLAMA_PROMPT = [1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304]
 _GRIPPER_OPEN = 0.5
+_DIMENSIONS = 7
 
 
 class OpenVLA(PrismaticModel, Policy):
@@ -48,9 +53,12 @@ class OpenVLA(PrismaticModel, Policy):
         prompt: str,
         crop: bool,
         tokenizer: str | None = None,
+        temperature: float = 0.0,
+        resize: str = "pil",
     ) -> None:
         super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
         self.statistics, self.template, self.crop = statistics, prompt, crop
+        self.temperature, self.resize = temperature, resize
         self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)
         self.card = replace(
             self.card,
@@ -64,6 +72,8 @@ class OpenVLA(PrismaticModel, Policy):
                 "action_statistics": self.statistics.sha256,
                 "prompt": self.template,
                 "centre_crop": str(self.crop),
+                **({"temperature": repr(temperature)} if temperature else {}),
+                **({"resize": resize} if resize != "pil" else {}),
             },
         )
 
@@ -71,6 +81,8 @@ class OpenVLA(PrismaticModel, Policy):
         notes = [f"actions in the units and at the rate of {self.statistics.key}", f"prompt: {self.template!r}"]
         if self.crop:
             notes.append(f"pictures: middle {CROP_AREA:.0%} of the area")
+        if self.temperature:
+            notes.append(f"action tokens drawn at temperature {self.temperature:g}")
         if tokenizer == BYTES:
             notes.append("development tokenizer: bytes, which no model was trained with")
         return tuple(notes)
@@ -78,22 +90,47 @@ class OpenVLA(PrismaticModel, Policy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One action per observation; decoding is greedy, so the seeds change nothing. See the contract."""
-        self.check(seen, seeds)
-        if self.steps != 7:
-            raise CheckpointError(
-                f"{self.statistics.key} has actions of {self.steps} dimensions; Act2Answer needs a 7-DoF "
-                "end-effector delta. Choose another -M unnorm_key"
-            )
-        rows = [self.prompt(observation.instruction) for observation in seen]
-        pixels = self.pixel_values(self._look(observation.image) for observation in seen)
-        ids = self.generate(pixels, rows).ids.cpu().numpy()
-        self.flagged = ~np.asarray(self.action_tokens.known(ids).all(axis=1))
-        if self.flagged.any():
+        """One action per observation; seeds count only at a temperature. See the contract."""
+        if (reason := self.misfit()) is not None:
+            raise CheckpointError(reason)
+        ids = self._tokens(seen, seeds)
+        if self.flagged is not None and self.flagged.any():
             self._say_unknown()
         actions = self.statistics.restore(self.action_tokens.values(ids))
         actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
         return actions[:, None].astype(np.float32)
+
+    def misfit(self) -> str | None:
+        """Other actions than an end-effector delta."""
+        if self.steps == _DIMENSIONS:
+            return None
+        return (
+            f"{self.statistics.key} has actions of {self.steps} dimensions; Act2Answer needs a 7-DoF end-effector "
+            "delta. Choose another -M unnorm_key"
+        )
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, 1, tokens): the middle of the bin that each token names, without units."""
+        return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
+
+    def _tokens(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
+        """(B, tokens) ids; one inference."""
+        self.check(seen, seeds)
+        rows = [self.prompt(observation.instruction) for observation in seen]
+        pixels = self.pixel_values(self._look(observation.image) for observation in seen)
+        tokens = self.action_tokens
+        named = range(tokens.vocabulary - tokens.bins, tokens.vocabulary)
+        choose = chooser(self.temperature, seeds, top=None, among=named)
+        ids: NDArray[np.int64] = self.generate(pixels, rows, choose).ids.cpu().numpy()
+        self.flagged = ~np.asarray(self.action_tokens.known(ids).all(axis=1))
+        return ids
+
+    def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3 per tower, S, S) float32, resized as asked. Raises ObservationError."""
+        if self.resize == "pil":
+            return super().pixel_values(images)
+        rows = [prepare_tensor(checked_picture(image), self.pictures) for image in images]
+        return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     def _look(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return centre_crop(image, self.config.towers[0].image_size) if self.crop else image
@@ -138,6 +175,8 @@ def load_openvla(
     centre_crop: bool = False,
     tokenizer: str | None = None,
     bits: int | None = None,
+    temperature: float = 0.0,
+    resize: str = "pil",
     weights_seed: int = 0,
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
@@ -146,13 +185,17 @@ def load_openvla(
     prompt: `openvla`, `openvla-v01` or a template with {instruction}; default the one of the checkpoint's
     generation. centre_crop: show the middle 0.9 of the picture's area, as fine-tunes with augmentation expect.
     tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
+    temperature: 0 for the likeliest token; above, drawn among the ids that name actions. resize: `pil`, or
+    `tensor` in bfloat16 as Act2Answer's evaluation.
     Raises UsageError, and what `load_checkpoint` raises.
     """
+    chooser(temperature, ())
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
     statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)
-    return OpenVLA(loaded, statistics, _template(prompt, loaded), centre_crop, tokenizer)
+    template = _template(prompt, loaded)
+    return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize)
 
 
 def _template(prompt: str | None, loaded: LoadedPrismatic) -> str:

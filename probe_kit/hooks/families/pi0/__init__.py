@@ -3,6 +3,7 @@
 from probe_kit.hooks.families.lerobot_evaluation import PICTURES
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.state_layout import OPENNESS
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
@@ -63,5 +64,18 @@ FAMILIES = (
             Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
             Option("unread", str, "Settings of an old config.json that change nothing, comma-separated.", "none"),
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "juexzz/INTACT-pi0-finetune-bridge",
+                execute=1,
+                dtype="bfloat16",
+                options={"picture": "squashed", "openness": "release"},
+                of_checkpoint={"statistics": "bridge"},
+                unmatched=(
+                    OWN_SEEDS,
+                    "the shipped statistics could not be compared with the evaluation's own file",
+                ),
+            )
+        },
     ),
 )

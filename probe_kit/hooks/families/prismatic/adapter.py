@@ -22,6 +22,7 @@ from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.families.sampling import Choose, greedy
 from probe_kit.hooks.families.vlm_decoding import Prefill
 from probe_kit.hooks.model import Model, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
@@ -129,12 +130,16 @@ class PrismaticModel(Model):
 
     # -- running -----------------------------------------------------------------------------------------
 
-    def generate(self, pixel_values: Tensor | None, rows: Sequence[Sequence[int]]) -> Decoded:
-        """`steps` greedy tokens behind every prompt; one inference, as `capture` counts it."""
+    def generate(
+        self, pixel_values: Tensor | None, rows: Sequence[Sequence[int]], choose: Choose = greedy
+    ) -> Decoded:
+        """`steps` tokens behind every prompt, greedy by default; one inference, as `capture` counts it."""
         packed = self.pack(rows)
         device = self.loaded.device
         with torch.inference_mode():
-            return self.network.decode(packed.ids.to(device), packed.mask.to(device), pixel_values, self.steps)
+            return self.network.decode(
+                packed.ids.to(device), packed.mask.to(device), pixel_values, self.steps, choose
+            )
 
     # -- listening ---------------------------------------------------------------------------------------
 

@@ -11,7 +11,10 @@ FAMILIES = (
         streams="backbone 17 layers, expert 17 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
-        notes="Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+        notes=(
+            "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
+            "be listened to (--listen); to act here it needs a fine-tune for end-effector deltas"
+        ),
         verifier="probe_kit.hooks.families.lerobot_verify:verify_smolvla",
         config_types=("smolvla",),
         full_size="probe_kit.models.smolvla:full_size_smolvla",

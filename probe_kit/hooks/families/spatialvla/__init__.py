@@ -3,6 +3,7 @@
 from probe_kit.hooks.families.prismatic import TOKENIZER
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow
 
 FAMILIES = (
     Family(
@@ -29,5 +30,15 @@ FAMILIES = (
             Option("ensemble", bool, "Average the plans of overlapping chunks, the newest most.", "false"),
             TOKENIZER,
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "IPEC-COMMUNITY/spatialvla-4b-224-pt",
+                execute=1,
+                dtype="bfloat16",
+                options={"prompt": "bare", "lowercase": False, "ensemble": False},
+                of_checkpoint={"unnorm_key": "bridge_orig/1.0.0"},
+                unmatched=("pictures are resized from bytes, not from floats of 0 to 255",),
+            )
+        },
     ),
 )

@@ -2,6 +2,8 @@
 
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
+from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow
+from probe_kit.hooks.state_layout import OPENNESS
 
 FAMILIES = (
     Family(
@@ -19,6 +21,17 @@ FAMILIES = (
             Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),
             Option("steps", int, "Euler steps of the flow.", "5"),
             Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
+            Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
         ),
+        protocols={
+            ACT2ANSWER: ProtocolRow(
+                "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",
+                execute=4,
+                dtype="bfloat16",
+                options={"steps": 5, "openness": "release"},
+                of_checkpoint={"robot": "bridge_delta"},
+                unmatched=("noise comes from the episode's seed, not from a hash of the inputs",),
+            )
+        },
     ),
 )

@@ -26,6 +26,7 @@ from probe_kit.hooks.model import Tap
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.roles import Roles
 from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.weights import read_weights
 from probe_kit.models.qwen import QwenInputs
 from probe_kit.models.xiaomi import (
@@ -40,6 +41,7 @@ from probe_kit.models.xiaomi import (
     robot_of,
 )
 from probe_kit.models.xiaomi.network import STEPS
+from probe_kit.models.xiaomi.robots import DEFAULT_ROBOT
 
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 EXECUTE = 4
@@ -65,8 +67,10 @@ class Xiaomi(QwenVLA):
         robot: str | None,
         steps: int,
         tokenizer: str | None,
+        openness: str = "measured",
     ) -> None:
         super().__init__(filled.network.vlm, folder, tokenizer, device)
+        self.openness = openness
         self.network, self.config, self.steps = filled.network, config, steps
         self._robot = robot
         layers = len(self.network.dit.layers)
@@ -112,7 +116,12 @@ class Xiaomi(QwenVLA):
             execute=min(EXECUTE, chunk),
             notes=(note,),
             audit=filled.audit.to_json(),
-            settings={**content_hashes(files), **settings, "steps": str(self.steps)},
+            settings={
+                **content_hashes(files),
+                **settings,
+                "steps": str(self.steps),
+                **({"openness": self.openness} if self.openness != "measured" else {}),
+            },
             weights_seed=filled.weights_seed,
         )
 
@@ -134,8 +143,12 @@ class Xiaomi(QwenVLA):
 
     @cached_property
     def robot(self) -> Robot:
-        """How its scene is shown. Raises UsageError for one that Act2Answer's arm cannot stand in for."""
-        return robot_of(self.units.robot)
+        """How its scene is shown; the default one's way where no statistics name a robot.
+
+        Raises UsageError for one that Act2Answer's arm cannot stand in for.
+        """
+        units = self._units_or_reason()
+        return robot_of(DEFAULT_ROBOT if isinstance(units, str) else units.robot)
 
     def text(self, instruction: str) -> str:
         """The released prompt."""
@@ -149,21 +162,33 @@ class Xiaomi(QwenVLA):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
-        self.check(seen, seeds)
         units = self.units
-        shape = units.mean.shape
-        noise = seeded_noise(seeds, (shape[0], shape[1]), self.device)
-        used = torch.from_numpy(units.used).expand_as(noise.cpu()).to(self.device)
-        chunk = self.infer(self.inputs(seen), self.state(seen), used, noise)
-        actions = units.restore(chunk.cpu().numpy())[..., :_USED]
+        actions = units.restore(self.listen(seen, seeds))[..., :_USED]
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
+
+    def misfit(self) -> str | None:
+        """No statistics."""
+        units = self._units_or_reason()
+        return units if isinstance(units, str) else None
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, chunk, action numbers) as the flow puts them out, without units; all where nothing says which."""
+        self.check(seen, seeds)
+        units = self._units_or_reason()
+        numbers = self.config.action_dim
+        used = np.ones((self.card.chunk, numbers), np.float32) if isinstance(units, str) else units.used
+        noise = seeded_noise(seeds, (self.card.chunk, numbers), self.device)
+        meant = torch.from_numpy(used).expand_as(noise.cpu()).to(self.device)
+        output: NDArray[np.float32] = self.infer(self.inputs(seen), self.state(seen), meant, noise).cpu().numpy()
+        return output
 
     def state(self, seen: Sequence[Observation]) -> Tensor:
         """(B, 1, state numbers) float32: the robot's own layout, filled up with zeros. Raises ObservationError."""
         rows = torch.zeros(len(seen), self.config.state_length, self.config.state_dim)
         for row, observation in zip(rows, seen, strict=True):
-            numbers = self.robot.state(np.asarray(observation.state, np.float32))
+            own = laid_out(np.asarray(observation.state, np.float32), ARM_NUMBERS, self.openness)
+            numbers = self.robot.state(own)
             if len(numbers) > self.config.state_dim:
                 raise ObservationError(
                     f"the state has {len(numbers)} numbers; this checkpoint reads {self.config.state_dim}"
@@ -219,12 +244,13 @@ def load_xiaomi(
     robot: str | None = None,
     steps: int = STEPS,
     tokenizer: str | None = None,
+    openness: str = "measured",
     weights_seed: int = 0,
 ) -> Xiaomi:
     """Load Xiaomi-Robotics-R0 from a folder or hub id.
 
     robot: of preprocessor_config.json, or how just one of its names begins; default bridge_delta or the only one.
-    steps: Euler steps. tokenizer: folder of another one.
+    steps: Euler steps. tokenizer: folder of another one. openness: the state's last number, see `state_layout`.
     Raises CheckpointError, WeightsError, and UsageError for a robot or a number of steps that cannot be.
     """
     if steps < 1:
@@ -243,4 +269,4 @@ def load_xiaomi(
         tied = _TIED if config.vlm.tie_word_embeddings else ()
         filled = fill(build, lambda: read_weights(folder), dtype or stored, lambda _: tied)
     filled.network.to(device)
-    return Xiaomi(filled, config, folder, name, device, robot, steps, tokenizer)
+    return Xiaomi(filled, config, folder, name, device, robot, steps, tokenizer, openness)

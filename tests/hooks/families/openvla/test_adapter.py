@@ -56,7 +56,8 @@ class TestFusedLlama(AdapterContract):
     @pytest.fixture
     def other_options(self, tmp_path: Path) -> dict[str, Any]:
         words = str(write_tokenizer(tmp_path))
-        return {"unnorm_key": "other", "prompt": "openvla-v01", "centre_crop": True, "tokenizer": words}
+        return {"unnorm_key": "other", "prompt": "openvla-v01", "centre_crop": True, "tokenizer": words,
+                "temperature": 0.6, "resize": "tensor"}  # fmt: skip
 
     @pytest.fixture
     def policy(self, fused: OpenVLA) -> OpenVLA:
@@ -252,3 +253,31 @@ def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path, observation
 def test_an_option_of_another_family_is_refused() -> None:
     with pytest.raises(UsageError, match="pi0-tiny has no model option unnorm_key; it has none"):
         load_policy("pi0-tiny", unnorm_key="bridge_orig")
+
+
+def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, observation: Observation) -> None:
+    """At a temperature random weights, which put out any token when greedy, choose among the 256 of actions."""
+    policy = load_openvla(str(folder), tokenizer="bytes", temperature=0.6)
+    chunks = [policy.act([observation], [seed]) for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(chunks[0], chunks[1])
+    assert np.abs(chunks[0] - chunks[2]).max() > 0
+    assert policy.flagged is not None
+    assert not policy.flagged.any()
+    other = replace(observation, instruction="Put the cube on the star")
+    both = policy.act([other, observation], [5, 1])
+    np.testing.assert_array_equal(both[1], chunks[0][0])
+    with pytest.raises(UsageError, match="temperature"):
+        load_openvla(str(folder), tokenizer="bytes", temperature=-1.0)
+
+
+def test_pictures_resized_as_tensors_are_near_those_of_pil_and_not_the_same(
+    folder: Path, observation: Observation
+) -> None:
+    """bfloat16 keeps eight bits; the filter is the same."""
+    smooth = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
+    pil, tensor = (load_openvla(str(folder), tokenizer="bytes", resize=way) for way in ("pil", "tensor"))
+    ours, theirs = (policy.pixel_values([smooth]).numpy() for policy in (pil, tensor))
+    assert ours.shape == theirs.shape
+    difference = np.abs(ours - theirs).max()
+    assert 0 < difference < 0.08
+    assert tensor.act([observation], [0]).shape == (1, 1, 7)

@@ -37,7 +37,7 @@ class TestXiaomi(AdapterContract):
 
     @pytest.fixture
     def other_options(self, folder: Path) -> dict[str, Any]:
-        return {"robot": "fractal", "steps": 3, "tokenizer": str(folder)}
+        return {"robot": "fractal", "steps": 3, "tokenizer": str(folder), "openness": "release"}
 
     @pytest.fixture
     def policy(self, loaded: Xiaomi) -> Xiaomi:
@@ -236,3 +236,11 @@ def test_bfloat16_is_the_files_weights_rounded_and_acts(folder: Path, observatio
 def test_no_step_is_refused(folder: Path) -> None:
     with pytest.raises(UsageError, match="0 Euler steps"):
         load_xiaomi(str(folder), steps=0)
+
+
+def test_the_releases_openness_is_one_minus_the_fingers_in_metres(folder: Path, observation: Observation) -> None:
+    loaded, released = load_xiaomi(str(folder)), load_xiaomi(str(folder), openness="release")
+    measured, said = (policy.state([observation])[0, 0].numpy() for policy in (loaded, released))
+    assert measured[7] == 1.0
+    assert said[7] == pytest.approx(1 - 0.037)
+    np.testing.assert_array_equal(measured[:7], said[:7])

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.families.magma.sampling import TOP, chooser
+from probe_kit.hooks.families.sampling import TOP, chooser
 
 
 def logits(rows: int) -> torch.Tensor:
@@ -31,6 +31,16 @@ def test_draws_follow_the_distribution_among_the_likeliest() -> None:
     expected = torch.softmax(row[0][best] / 0.7, dim=0)
     spread = (expected * (1 - expected) / 4000).sqrt()
     assert ((counts[best] / 4000 - expected).abs() < 5 * spread + 1e-9).all()
+
+
+def test_draws_among_some_ids_only_never_leave_them_and_follow_their_distribution() -> None:
+    row, among = logits(1), range(300, 316)
+    draw = chooser(0.6, [6], top=None, among=among)
+    counts = torch.bincount(torch.cat([draw(row) for _ in range(4000)]), minlength=400)
+    assert int(counts[300:316].sum()) == 4000
+    expected = torch.softmax(row[0, 300:316] / 0.6, dim=0)
+    spread = (expected * (1 - expected) / 4000).sqrt()
+    assert ((counts[300:316] / 4000 - expected).abs() < 5 * spread + 1e-9).all()
 
 
 @pytest.mark.parametrize("temperature", [-0.1, float("inf"), float("nan")])

@@ -1,0 +1,172 @@
+"""Published protocols: what was not given is as the protocol has it, and what was given is told apart from it."""
+
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import UsageError
+from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow, as_text
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.family import Family
+
+SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
+"""Scene preset by protocol."""
+
+
+class Asked(Protocol):
+    """What is looked at of the settings of an extraction."""
+
+    @property
+    def model(self) -> str:
+        """A family, or a script."""
+
+    @property
+    def protocol(self) -> str | None:
+        """The protocol's name."""
+
+    @property
+    def checkpoint(self) -> str | None:
+        """Folder or hub id."""
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Of the family."""
+
+    @property
+    def execute(self) -> int | None:
+        """Actions per inference."""
+
+    @property
+    def dtype(self) -> str | None:
+        """Of the network."""
+
+    @property
+    def listen(self) -> bool:
+        """Whether nothing is carried out."""
+
+    @property
+    def scene(self) -> SceneSpec:
+        """What is played."""
+
+
+def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any) -> SceneSpec:
+    """The preset `name`, else the protocol's, else the default one, with fields replaced.
+
+    Raises UsageError for an unknown protocol, SceneError for an unknown preset or field.
+    """
+    if protocol is not None:
+        check_protocol(protocol)
+        name = name or SCENES[protocol]
+    return SceneSpec.preset(name or "bridge", **changes)
+
+
+def check_protocol(name: str) -> None:
+    """Raise UsageError for a protocol that nobody knows here."""
+    if name not in SCENES:
+        near = get_close_matches(name, SCENES, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise UsageError(f"unknown protocol {name!r}; available: {', '.join(SCENES)}.{hint}")
+
+
+def protocol_identity(settings: Asked) -> dict[str, Any]:
+    """What a run says of the protocol it follows, under `protocol`; empty without one.
+
+    differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
+    protocol has and what the run has. unmatched: what cannot be done here.
+    """
+    if settings.protocol is None:
+        return {}
+    row, used = protocol_row(settings.model, settings.protocol), _used(settings)
+    protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
+    default = {**({} if row is None else _defaults(settings, row)), **_scene(SceneSpec())}
+    if settings.listen:
+        protocol.pop("execute", None)
+        default.pop("execute", None)
+    return {
+        "protocol": {
+            "name": settings.protocol,
+            "differs_from_default": _different(protocol, default, protocol),
+            "deviations": _different(protocol, used, {**used, **protocol}),
+            "unmatched": [] if row is None else list(row.unmatched),
+        }
+    }
+
+
+def deviations(settings: Asked) -> dict[str, list[str | None]]:
+    """By setting, what the protocol has and what was asked for instead."""
+    found: dict[str, list[str | None]] = protocol_identity(settings).get("protocol", {}).get("deviations", {})
+    return found
+
+
+def protocol_row(model: str, protocol: str | None) -> ProtocolRow | None:
+    """The protocol's row of a model; None without a protocol, and for scripts.
+
+    Raises UsageError for a model that the protocol does not use.
+    """
+    family = _families().get(model)
+    if protocol is None or family is None:
+        return None
+    if protocol not in family.protocols:
+        using = [name for name, one in _families().items() if protocol in one.protocols]
+        raise UsageError(
+            f"the protocol {protocol} does not use {model}; it uses {', '.join(using)}. Leave --protocol out, and "
+            f"take its scene with --scene {SCENES[protocol]}"
+        )
+    return family.protocols[protocol]
+
+
+def _families() -> "dict[str, Family]":
+    from probe_kit.hooks.registry import known_families
+
+    return known_families()
+
+
+def _used(settings: Asked) -> dict[str, str]:
+    """What the run is made with, under the names of `ProtocolRow.settings`."""
+    used = {f"-M {name}": _told(as_text(value)) for name, value in settings.options.items()}
+    plain = {"checkpoint": settings.checkpoint, "execute": settings.execute, "dtype": settings.dtype}
+    used |= {name: _told(str(value)) for name, value in plain.items() if value is not None}
+    return {**used, **({"acts": "listened to"} if settings.listen else {}), **_scene(settings.scene)}
+
+
+def _told(value: str) -> str:
+    """Files and folders by their last name: where they lie on this machine is no part of a run."""
+    return Path(value).name if Path(value).expanduser().exists() else value
+
+
+def _defaults(settings: Asked, row: ProtocolRow) -> dict[str, str]:
+    """What the same settings are without a protocol, in the words of `probe-kit models`."""
+    family = _families()[settings.model]
+    known = {f"-M {option.name}": option.default for option in family.options}
+    known |= {
+        "checkpoint": family.default_checkpoint or "embedded",
+        "execute": "the checkpoint's",
+        "dtype": "the checkpoint's",
+    }
+    return {name: known[name] for name in row.settings()}
+
+
+def _scene(scene: SceneSpec) -> dict[str, str]:
+    derived = {"name"} | ({"epsilon"} if scene.epsilon is None else set())
+    return {f"scene {name}": as_text(value) for name, value in _leaves(scene.to_json()) if name not in derived}
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _different(
+    protocol: Mapping[str, str], other: Mapping[str, str], names: Iterable[str]
+) -> dict[str, list[str | None]]:
+    return {
+        name: [protocol.get(name), other.get(name)]
+        for name in dict.fromkeys(names)
+        if protocol.get(name) != other.get(name)
+    }

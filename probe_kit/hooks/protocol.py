@@ -1,0 +1,47 @@
+"""A published protocol as one family follows it: one row of a table, declared by the family. Imports no torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+
+@dataclass(frozen=True)
+class ProtocolRow:
+    """What a protocol uses a family with.
+
+    execute: actions carried out per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
+    ones that only the protocol's own checkpoint needs. unmatched: what of the protocol cannot be done here.
+    """
+
+    checkpoint: str
+    execute: int
+    dtype: str
+    options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    of_checkpoint: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    unmatched: tuple[str, ...] = ()
+
+    def options_for(self, checkpoint: str | None) -> dict[str, Any]:
+        """The options with `checkpoint`, None for the protocol's own."""
+        own = self.of_checkpoint if checkpoint in (None, self.checkpoint) else {}
+        return {**own, **self.options}
+
+    def settings(self) -> dict[str, str]:
+        """Every setting by name, as text; those of the family with -M in front."""
+        return {
+            "checkpoint": self.checkpoint,
+            "execute": str(self.execute),
+            "dtype": self.dtype,
+            **{f"-M {name}": as_text(value) for name, value in self.options_for(None).items()},
+        }
+
+
+def as_text(value: Any) -> str:
+    """An option's value as it is given on the command line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+ACT2ANSWER = "act2answer"
+OWN_SEEDS = "draws come from the episode's seed; the release seeds once per process"

@@ -1,0 +1,147 @@
+"""Runs of models that are listened to and do not act: activations as ever, and no success rate anywhere."""
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
+from probe_kit.retention import retention
+from probe_kit.retention.differences import group_differences
+from probe_kit.retention.displays.gallery import gallery
+from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
+from probe_kit.retention.report import write_report
+from probe_kit.retention.run_rows import RowSettings, run_rows
+from probe_kit.retention.success import success_rate
+from probe_kit.suite import Suite
+from probe_kit.train import load_results, train_probes
+from tests.pi0_checkpoints import write_intact
+
+
+@pytest.fixture(scope="module")
+def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The random twin again, as in `recorded_run`, but only listened to; then probed."""
+    settings = ExtractSettings(
+        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), listen=True
+    )
+    run = extract_run(settings, tmp_path_factory.mktemp("listened") / "run")
+    train_probes(run, views=["mean"], permutations=19, controls=())
+    return open_run(run.path)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A pi0 of 32 unnamed dimensions, as its base model."""
+    folder = write_intact(tmp_path_factory.mktemp("base") / "pi0")
+    config = json.loads((folder / "config.json").read_text())
+    config["input_features"]["observation.state"]["shape"] = [32]
+    config["output_features"]["action"]["shape"] = [32]
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def test_what_is_heard_is_what_the_acting_model_thought_first(heard: Run, recorded_run: Run) -> None:
+    """The same scenes, seeds and weights: bit for bit the first inference of the run that acted."""
+    assert list(heard.episodes["episode_id"]) == list(recorded_run.episodes["episode_id"])
+    assert heard.streams == recorded_run.streams
+    for stream in heard.streams:
+        for site in heard.sites(stream):
+            np.testing.assert_array_equal(heard.column(site), recorded_run.column(site), err_msg=str(site))
+
+
+def test_nothing_moved_and_the_run_says_so(heard: Run) -> None:
+    assert set(heard.episodes["outcome"]) == {"listened"}
+    assert not {"cube_x", "never_moved", "side_placed", "distance_correct"} & set(heard.episodes)
+    assert heard.listened
+    assert not heard.has_trajectories
+    assert "LISTENED TO" in repr(heard)
+    assert heard.settings["listen"] is True
+    assert verify_run(heard.path, deep=True).ok
+    assert heard.certificate["hooks_on_equals_hooks_off"]
+
+
+def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run, tmp_path: Path) -> None:
+    table = retention([heard, recorded_run])
+    rows = [row for row in json.loads(table.to_json()) if row["listened"]]
+    assert {row["category"] for row in rows} == {"color", "shape", "mean"}
+    for row in rows:
+        assert [row[name] for name in ("sr", "sr_ci", "regime", "p_oob", "gap", "normalised_score")] == [None] * 6
+        assert row["prefix_accuracy"] is not None
+    acting = [row for row in json.loads(table.to_json()) if not row["listened"]]
+    assert all(row["sr"] is not None for row in acting)
+    screen = StringIO()
+    Console(file=screen, width=240).print(table.to_rich())
+    for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
+        assert "n/a" in text
+        assert "listened to" in text
+    assert table.to_frame()["sr"].isna().sum() == 3
+    assert any("was listened to and did not act" in note for note in table.notes)
+    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text()
+    assert "did not act" in page
+
+
+def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(heard: Run, recorded_run: Run) -> None:
+    both = retention({"heard": [heard], "acting": [recorded_run]})
+    assert both.differences == []  # the acting run was not probed, and the other has no success rate
+    rows = run_rows(heard, load_results(heard), RowSettings(None, "all", (), 0))
+    same = group_differences({"one": rows, "other": rows})
+    assert {row.category for row in same} == {"color", "shape", "mean"}
+    assert all(row.sr is None and row.paired and row.prefix_accuracy == 0 for row in same)
+
+
+def test_questions_about_acting_are_refused(heard: Run) -> None:
+    with pytest.raises(UsageError, match="was listened to"):
+        success_rate(heard.episodes)
+    with pytest.raises(UsageError, match="was listened to"):
+        PairedLayoutsDisplay.from_run(heard)
+
+
+def test_a_checkpoint_of_another_arm_is_refused_for_acting_with_the_way_out(
+    base: Path, small_suite: Suite
+) -> None:
+    settings = ExtractSettings("pi0", str(base), suite=small_suite.folder, items=2)
+    with pytest.raises(CheckpointError, match=r"acts in 32 dimensions.*add --listen"):
+        prepare(settings)
+
+
+def test_a_checkpoint_of_another_arm_is_listened_to(base: Path, small_suite: Suite, tmp_path: Path) -> None:
+    settings = ExtractSettings("pi0", str(base), suite=small_suite.folder, items=2, listen=True, batch=3)
+    run = extract_run(settings, tmp_path / "run")
+    assert run.settings["zeros_for"] == ["state"]
+    assert len(run.episodes) == 8
+    assert np.isfinite(run.column(run.sites("backbone")[-1])).all()
+
+
+def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
+    settings = ExtractSettings(
+        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4)
+    )
+    acting = prepare(settings).identity()
+    assert "listen" not in acting
+    assert {key: value for key, value in heard.settings.items() if key != "listen"} == json.loads(
+        json.dumps(acting)
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        (ExtractSettings("pi0-tiny", listen=True, execute=2), "--execute means nothing"),
+        (ExtractSettings("pi0-tiny", listen=True, captured_calls=2, video="first"), "--captured-calls, --video"),
+        (ExtractSettings("expert", listen=True), "--listen means nothing"),
+    ],
+)
+def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractSettings, complaint: str) -> None:
+    with pytest.raises(UsageError, match=complaint):
+        prepare(settings)
+
+
+def test_a_report_of_a_listened_run_alone_draws_probes_and_no_behaviour(heard: Run) -> None:
+    subjects = [exhibit.subject for exhibit in gallery([heard], retention([heard]))]
+    assert "probes" in subjects
+    assert "behaviour" not in subjects

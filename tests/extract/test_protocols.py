@@ -1,0 +1,161 @@
+"""`--protocol`: one row per family, what is given wins, and every difference is written down."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import UsageError
+from probe_kit.extract import ExtractSettings, extract_run, prepare
+from probe_kit.extract.protocols import check_protocol, deviations, protocol_identity, protocol_scene
+from probe_kit.extract.settings import run_label
+from probe_kit.hooks.options import check_options
+from probe_kit.hooks.registry import known_families
+from probe_kit.retention.report.provenance import provenance
+from probe_kit.suite import Suite
+from tests.pi0_checkpoints import write_intact
+
+# Section 4 of what is known of the release, in the words of the command line.
+RELEASED = {
+    "pi0": {
+        "checkpoint": "juexzz/INTACT-pi0-finetune-bridge", "execute": "1", "dtype": "bfloat16",
+        "-M statistics": "bridge", "-M picture": "squashed", "-M openness": "release",
+    },
+    "openvla": {
+        "checkpoint": "gen-robot/openvla-7b-rlvla-sft_16k", "execute": "1", "dtype": "bfloat16",
+        "-M unnorm_key": "sft", "-M temperature": "0.6", "-M resize": "tensor", "-M centre_crop": "false",
+    },
+    "spatialvla": {
+        "checkpoint": "IPEC-COMMUNITY/spatialvla-4b-224-pt", "execute": "1", "dtype": "bfloat16",
+        "-M unnorm_key": "bridge_orig/1.0.0", "-M prompt": "bare", "-M lowercase": "false", "-M ensemble": "false",
+    },
+    "magma": {
+        "checkpoint": "microsoft/Magma-8B", "execute": "1", "dtype": "bfloat16", "-M unnorm_key": "bridge_orig",
+        "-M prompt": "act2answer", "-M temperature": "0.7", "-M shrink": "256",
+    },
+    "xiaomi-r0": {
+        "checkpoint": "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX", "execute": "4", "dtype": "bfloat16",
+        "-M robot": "bridge_delta", "-M steps": "5", "-M openness": "release",
+    },
+    "internvla-m1": {
+        "checkpoint": "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "execute": "1", "dtype": "bfloat16",
+        "-M unnorm_key": "bridge_dataset", "-M steps": "10", "-M guidance": "1.5",
+    },
+}  # fmt: skip
+
+
+def test_every_model_of_the_release_that_is_here_has_its_row() -> None:
+    rows = {name: family.protocols["act2answer"].settings() for name, family in known_families().items()
+            if "act2answer" in family.protocols}  # fmt: skip
+    assert rows == RELEASED
+
+
+@pytest.mark.parametrize("name", RELEASED)
+def test_the_options_of_a_row_are_the_familys_own(name: str) -> None:
+    """What a loader would refuse is refused here, without one."""
+    family = known_families()[name]
+    for row in family.protocols.values():
+        given = row.options_for(None)
+        assert check_options(name, family.options, given) == given
+
+
+@pytest.mark.parametrize("name", RELEASED)
+def test_what_is_not_given_is_as_released(name: str) -> None:
+    settings = ExtractSettings(name, protocol="act2answer").followed()
+    assert settings.scene == SceneSpec.preset("act2answer")
+    assert deviations(settings) == {}
+    assert run_label(settings) == f"{name} · act2answer"
+    assert settings.followed() == settings
+
+
+def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
+    given = ExtractSettings(
+        "magma", options={"temperature": "0", "tokenizer": "words"}, execute=1, dtype="float32",
+        protocol="act2answer", scene=protocol_scene("act2answer", tile_side=0.2033),
+    )  # fmt: skip
+    settings = given.followed()
+    assert settings.options["temperature"] == "0"
+    assert settings.options["prompt"] == "act2answer"
+    assert deviations(settings) == {
+        "dtype": ["bfloat16", "float32"],
+        "-M temperature": ["0.7", "0"],
+        "-M tokenizer": [None, "words"],
+        "scene tile_side": ["0.1452", "0.2033"],
+    }
+    assert "scene tile_side=0.2033" in run_label(settings)
+
+
+def test_another_scene_that_is_asked_for_is_kept_and_told() -> None:
+    bridge = protocol_scene("act2answer", "bridge")
+    settings = ExtractSettings("magma", protocol="act2answer", scene=bridge).followed()
+    assert settings.scene == SceneSpec()
+    assert deviations(settings)["scene arm"] == ["widowx", "panda"]
+    assert protocol_scene(None) == SceneSpec()
+
+
+def test_how_a_protocol_differs_from_the_default_is_in_the_run() -> None:
+    said = protocol_identity(ExtractSettings("magma", protocol="act2answer").followed())["protocol"]
+    assert said["name"] == "act2answer"
+    assert said["differs_from_default"]["-M temperature"] == ["0.7", "0"]
+    assert said["differs_from_default"]["scene tile_side"] == ["0.1452", "0.11"]
+    assert "-M unnorm_key" not in said["differs_from_default"]
+    assert said["unmatched"]
+    assert protocol_identity(ExtractSettings("magma")) == {}
+
+
+def test_options_of_the_protocols_checkpoint_do_not_follow_another_one() -> None:
+    own = ExtractSettings("openvla", "my/fine-tune", protocol="act2answer").followed()
+    assert "unnorm_key" not in own.options
+    assert own.options["temperature"] == 0.6
+    assert set(deviations(own)) == {"checkpoint", "-M unnorm_key"}
+
+
+def test_a_script_follows_the_scene_alone() -> None:
+    settings = ExtractSettings("idle", protocol="act2answer").followed()
+    assert settings.scene == SceneSpec.preset("act2answer")
+    assert (settings.checkpoint, dict(settings.options), deviations(settings)) == (None, {}, {})
+
+
+def test_protocols_that_are_not_there_are_refused() -> None:
+    with pytest.raises(UsageError, match="Did you mean act2answer"):
+        check_protocol("act2anwser")
+    with pytest.raises(UsageError, match="available: act2answer"):
+        ExtractSettings("pi0", protocol="simpler")
+    with pytest.raises(UsageError, match="does not use smolvla; it uses pi0, openvla"):
+        prepare(ExtractSettings("smolvla", protocol="act2answer"))
+
+
+def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite: Suite, tmp_path: Path) -> None:
+    """A tiny checkpoint of the protocol's kind, in the protocol's scene; two actions instead of eighty."""
+    pytest.importorskip("rtbdata", reason="the extra widowx is not installed")
+    settings = ExtractSettings(
+        "pi0", str(write_intact(tmp_path / "pi0")), options={"statistics": "bridge"}, protocol="act2answer",
+        dtype="float32", suite=small_suite.folder, categories=("color",), items=2,
+        scene=protocol_scene("act2answer", max_steps=2), env_workers=0,
+    )  # fmt: skip
+    run = extract_run(settings, tmp_path / "run")
+    said = run.settings["protocol"]
+    assert set(said["deviations"]) == {"checkpoint", "dtype", "scene max_steps"}
+    assert run.settings["execute"] == 1
+    assert run.settings["policy"]["openness"] == "release"
+    assert run.label == "pi0 · act2answer · checkpoint=pi0 · dtype=float32 · scene max_steps=2"
+    assert len(run.episodes) == 4
+    facts = dict(provenance("pi0", run, None).facts)
+    assert facts["protocol"] == "act2answer"
+    assert "scene max_steps 2 instead of 80" in facts["deviates from it in"]
+    assert "-M openness release instead of measured" in facts["it differs from the default in"]
+    again = prepare(replace(settings, workers=0), tmp_path / "run")
+    assert json.loads(json.dumps(again.identity())) == run.settings
+
+
+def test_the_documented_table_is_that_of_the_registry() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text()
+    for name, family in known_families().items():
+        for row in family.protocols.values():
+            options = " ".join(f"{key}={value}" for key, value in row.settings().items() if key.startswith("-M"))
+            line = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+            assert f"`{row.checkpoint}` | {row.execute}" in line
+            for pair in options.replace("-M ", "").split():
+                assert pair in line, (name, pair)
