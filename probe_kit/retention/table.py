@@ -190,9 +190,9 @@ def retention(
 
 
 def _wordings(run: RunReader, label: str) -> list[WordingPair]:
-    """The wordings of a run against each other; none for a run in its items' own words."""
+    """The wordings of a run against each other; none for a run in its items' own words, or that did not act."""
     names: Sequence[str] = getattr(run, "wordings", ())
-    if len(names) < 2:
+    if len(names) < 2 or _heard(run):
         return []
     whole: RunReader = getattr(run, "whole", run)
     return wording_pairs(whole.episodes, names, str(run.location), label)
