@@ -75,12 +75,12 @@ def write_qwen3_vl(folder: Path, seed: int = 1, tied: bool = True, **fields: Any
     return _write(folder, values, network, seed, (), picture_settings(16, 4096, 65536), ID["<|im_end|>"])
 
 
-def write_internvl(folder: Path, seed: int = 1, **fields: Any) -> Path:
-    """Tiles of 28 pixels, of four patches each, one position per tile."""
+def write_internvl(folder: Path, seed: int = 1, large: bool = False, **fields: Any) -> Path:
+    """Tiles of 28 pixels, of four patches each, one position per tile. large: the kind of tower that 38B has."""
     vision = {
         "model_type": "internvl_vision", "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2,
         "num_attention_heads": 2, "image_size": [28, 28], "patch_size": [14, 14], "layer_scale_init_value": 0.5,
-        "attention_bias": True, "use_qk_norm": False,
+        "attention_bias": not large, "use_qk_norm": large, "norm_type": "rms_norm" if large else "layer_norm",
     }  # fmt: skip
     number = 256 + INTERNVL_SPECIAL.index("<IMG_CONTEXT>")
     text = {**_TEXT, "model_type": "qwen3", "head_dim": 8, "eos_token_id": ID["<|im_end|>"]}

@@ -41,4 +41,5 @@ def full_size_internvl(size: str) -> Any:
         "patch_size": [14, 14],
         "use_mean_pooling": True,
     }
-    return build_internvl(InternVLConfig(text_config=text, vision_config=vision), torch.float32)
+    config = InternVLConfig(text_config=text, vision_config=vision, tie_word_embeddings=False)
+    return build_internvl(config, torch.float32)

@@ -40,6 +40,17 @@ def test_nothing_stays_on_the_meta_device(tmp_path: Path) -> None:
         assert {tensor.dtype for tensor in frequencies} == {torch.float32}
 
 
+def test_the_larger_internvl_has_another_tower(tmp_path: Path) -> None:
+    reader = load_model("internvl", str(write_internvl(tmp_path, large=True)))
+    names = {name.rpartition("encoder.layer.0.")[2] for name in reader.network.state_dict()}
+    assert "attention.q_norm.weight" in names
+    assert "attention.q_proj.bias" not in names
+    seen = example_observations(["Why?"])[0]
+    reading = reader.read([Question(seen, "Why?", ("A", "B"))])
+    other = reader.read([Question(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
+    assert np.abs(reading.option_logits - other.option_logits).max() > 0
+
+
 def test_a_tied_tensor_that_the_file_holds_twice_must_be_equal(tmp_path: Path) -> None:
     folder = write_qwen3_vl(tmp_path, tied=True)
     tensors = load_file(folder / "model.safetensors")

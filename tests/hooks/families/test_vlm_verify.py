@@ -79,13 +79,12 @@ def _lists(golden: Path) -> list[tuple[str, Path]]:
     ("family", "file", "keys"),
     [
         ("paligemma", "paligemma/hub_keys.3B-pt-224.json.gz", "603 keys"),
-        ("qwen2.5-vl", "qwen2_5_vl/hub_keys.3B.json.gz", "824 keys of 3B"),
         ("internvl", "internvl/hub_keys.8B.json.gz", "841 keys of 8B"),
         ("ovis2.5", "ovis2_5/real_keys.9B.json.gz", "840 keys"),
     ],
 )
 def test_full_size_keys_are_equal_through_the_renames(family: str, file: str, keys: str, golden_vlm: Path) -> None:
-    """Tied output weights are in none of the first two lists."""
+    """Tied output weights are not in the first list. Every list of every size: the slow test below."""
     verification = verify_keys(family, golden_vlm / file)
     assert verification.passed
     assert verification.comparisons[0].output == keys
@@ -101,12 +100,12 @@ def test_every_list_of_keys_is_that_of_a_released_size(golden_vlm: Path) -> None
 
 
 def test_a_list_without_a_key_that_nothing_else_holds_is_refused(golden_vlm: Path, tmp_path: Path) -> None:
-    content = json.loads(gzip.decompress((golden_vlm / "qwen3_vl/real_keys.8B.json.gz").read_bytes()))
-    gone = ("model.visual.blocks.3.norm1.weight", "lm_head.weight")
+    content = json.loads(gzip.decompress((golden_vlm / "internvl/real_keys.8B.json.gz").read_bytes()))
+    gone = ("model.vision_tower.encoder.layer.3.lambda_1", "lm_head.weight")
     for name in gone:
         del content["keys"][name]
     file = tmp_path / "keys.json"
     file.write_text(json.dumps(content))
-    verification = verify_keys("qwen3-vl", file)
+    verification = verify_keys("internvl", file)
     assert not verification.passed
     assert all(f"{name}: not recorded" in verification.comparisons[0].note for name in gone)
