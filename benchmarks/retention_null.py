@@ -131,7 +131,7 @@ def joined_coverage(draws: int) -> tuple[float, float]:
     for seed in range(draws):
         generator = np.random.default_rng(seed)
         mean, other = (
-            average([estimate(world, generator, category) for category in range(4)]) for world in worlds
+            average([estimate(world, generator, category) for category in range(4)]).centred for world in worlds
         )
         covered.append([covers(mean, 0.8), covers(mean - other, 0.3)])
     of_mean, of_difference = np.mean(covered, axis=0)
