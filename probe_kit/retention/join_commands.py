@@ -17,6 +17,9 @@ def join(
     with_side_words: Annotated[
         bool, typer.Option("--with-side-words", help="Count items such as 'no left turn sign' too.")
     ] = False,
+    wording: Annotated[
+        str | None, typer.Option(help="Of an acting run with several wordings: which one; default its first.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """Join what a model knows, what a policy encodes and what it does, question by question.
@@ -30,7 +33,8 @@ def join(
     from probe_kit.retention.known_tables import rich_join
     from probe_kit.train import load_results
 
-    reader, policy = scored(open_run(asked), score, with_side_words), open_run(acted)
+    reader = scored(open_run(asked), score, with_side_words)
+    policy = open_run(acted).in_wording(wording)
     try:
         results = load_results(policy, probes)
     except NoProbesError:

@@ -185,6 +185,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     parts += [f"{probes.token_permutations} for tokens"] * (probes.token_permutations > 0)
     parts += [f"seed {probes.seed}"]
     parts += [f"captured inference {probes.call}"] * (probes.call > 0)
+    parts += [f"wording {probes.wording}"] * bool(probes.wording)
     parts += [f"only {', '.join(probes.categories)}"] * (probes.categories != found.categories)
     parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
     return "; ".join([*parts, fitted])

@@ -18,7 +18,8 @@ class StoredProbes:
 
     created: when they were fitted. controls: baselines and, last, `twin: NAME`. state: `used` if `retention` reads
     them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others by now,
-    `other version` if this version cannot read them.
+    `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
+    run is in its items' own words.
     """
 
     key: str
@@ -32,6 +33,7 @@ class StoredProbes:
     seed: int = 0
     call: int = 0
     controls: tuple[str, ...] = ()
+    wording: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,9 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
     if not _readable(header):
         return StoredProbes(key, "other version", created)
     settings = settings_of(header)
-    current = any(is_current(settings, run) for run in readers)
+    current = [run for run in readers if is_current(settings, run)]
     state = "used" if key in used else "other" if current else "other episodes"
+    wording = getattr(current[0], "wording", None) if current else None
     return StoredProbes(
         key=key,
         state=state,
@@ -125,6 +128,7 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
         seed=settings.seed,
         call=settings.call,
         controls=_controls(bundle),
+        wording=wording or "",
     )
 
 

@@ -12,6 +12,7 @@ from probe_kit.extract.plan import plan_episodes
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import build_suite
+from probe_kit.train.inventory import inventory
 
 SHORT = SceneSpec(max_steps=2)
 LADDER = ("knowledge", "named", "side", "neutral")
@@ -89,6 +90,10 @@ def test_one_wording_of_a_run_is_read_like_a_run(ladder):
 def test_a_wording_that_was_not_asked_is_refused_by_name(ladder):
     with pytest.raises(UsageError, match=r"no wording 'side'; it has knowledge, named"):
         ladder.in_wording("side")
+
+
+def test_the_inventory_says_how_many_episodes_each_wording_has(ladder):
+    assert inventory(ladder).wordings == {"knowledge": 4, "named": 4}
 
 
 def test_retention_shows_one_wording_and_all_of_them_against_each_other(ladder):
