@@ -7,7 +7,7 @@ import pytest
 
 from tests.faults import Stored, draw_fault
 
-FAST, SLOW, BLOCK = 100, 5000, 500
+FAST, SLOW, BLOCK = 100, 5000, 100
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def assert_nothing_is_silent(stored: Stored, seeds: range) -> None:
         found[verdict.partition(" ")[0].rstrip(":")] += 1
         if verdict not in ("found", "harmless"):
             wrong.append(f"seed {seed}: {fault.words}: {verdict}")
-    print(f"seeds {seeds.start} to {seeds.stop - 1}: {dict(found)}")
+    print(f"seeds {seeds.start} to {seeds.stop - 1}: {dict(found)}", flush=True)
     assert not wrong, "\n".join(wrong)
 
 

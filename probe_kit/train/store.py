@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -186,9 +187,16 @@ def read_probes(run: Location) -> dict[str, Bundle]:
 
 
 def settings_of(header: Mapping[str, Any]) -> ProbeSettings:
-    """The settings of results of this version's format."""
+    """The settings of results of this version's format. Raises RunDamagedError."""
     stored = header["settings"]
-    return ProbeSettings(**{**stored, "categories": tuple(stored["categories"]), "views": tuple(stored["views"])})
+    try:
+        lists = {name: tuple(stored[name]) for name in ("categories", "views")}
+        return ProbeSettings(**{**stored, **lists})
+    except (KeyError, TypeError) as error:
+        raise RunDamagedError(
+            f"stored probes of format {FORMAT} have settings that cannot be theirs: {error}. Remove the folder in "
+            f"{PROBES}/ whose settings.json says {str(stored)[:80]} …, and run the same `probe-kit train` again"
+        ) from error
 
 
 def read_controls(bundle: Bundle) -> Controls:
@@ -199,8 +207,14 @@ def read_controls(bundle: Bundle) -> Controls:
 def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     settings = settings_of(bundle.head)
     _refuse_foreign(run, bundle, settings)
-    with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
-        curves = _unpack(arrays)
+    try:
+        with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
+            curves = _unpack(arrays)
+    except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder}/{DECISIONS} cannot be read: {error}. Remove {bundle.folder} and run "
+            "the same `probe-kit train` again"
+        ) from error
     return ProbeResults(
         settings,
         curves,

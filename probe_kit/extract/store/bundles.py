@@ -14,7 +14,16 @@ from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 from probe_kit.errors import RunDamagedError, RunNotFoundError
-from probe_kit.extract.store.hashes import HASH, Sum, as_record, digest_of, is_record, read_plain, read_record
+from probe_kit.extract.store.hashes import (
+    HASH,
+    Sum,
+    as_record,
+    digest_of,
+    expect,
+    is_record,
+    read_plain,
+    read_record,
+)
 from probe_kit.extract.store.layout import PROBES
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.root import read_root
@@ -24,6 +33,8 @@ BUNDLES = (PROBES,)
 HEAD, PARTIAL = "settings.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8
+_PARTS = {"settings": dict, "created": str}
+"""Of heads that nothing protects."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +154,9 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
         raise RunDamagedError(f"{name} is missing, though the folder is there. {advice}") from None
     run = _identity(location)
     if not is_record(raw) and run is None:
-        return Bundle(location, home, key, read_plain(raw, name, advice), None)
+        plain = read_plain(raw, name, advice)
+        expect(plain, _PARTS, name, advice)
+        return Bundle(location, home, key, plain, None)
     head = read_record(raw, name, advice)
     if (head["key"], head["run"]) != (key, run):
         raise RunDamagedError(f"{name} is {head['key']} of run {head['run']}; this is run {run}. {advice}")

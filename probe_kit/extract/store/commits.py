@@ -7,7 +7,7 @@ from typing import Any
 import google_crc32c
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.hashes import HASH, Sum, as_record, read_plain, read_record, read_sums
+from probe_kit.extract.store.hashes import HASH, Sum, as_record, expect, read_plain, read_record, read_sums
 from probe_kit.extract.store.layout import COMMITS, DATA, FAILED
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.root import Root
@@ -16,6 +16,7 @@ from probe_kit.identity import canonical_json, sha256_json
 Commit = dict[str, Any]
 CHECKSUM = "crc32c"
 """What commits of former versions carry instead of a hash."""
+_PARTS = {"episode_id": str, "outcome": dict, "roles": list, "objects": dict}
 _NUMBERED = re.compile(r"(\d{8})\.json")
 
 
@@ -77,8 +78,11 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     """One commit. Raises RunDamagedError if it was changed, or belongs to another episode or run."""
     name = f"{root.location}/{key}"
     if not root.protected:
-        return read_plain(raw, name, redo(number))
+        commit = read_plain(raw, name, redo(number))
+        expect(commit, _PARTS, name, redo(number))
+        return commit
     commit = read_record(raw, name, redo(number))
+    expect(commit, _PARTS, name, redo(number))
     planned = root.planned.get(number)
     if planned is None:
         raise RunDamagedError(
@@ -136,6 +140,7 @@ def read_failures(root: Root) -> dict[str, str]:
     for number, key, raw in numbered(root.location, FAILED):
         name = f"{root.location}/{key}"
         failure = read_record(raw, name, advice) if root.protected else read_plain(raw, name, advice)
+        expect(failure, {"episode_id": str, "reason": str}, name, advice)
         if root.protected and (failure["run"], failure["episode"]) != (root.identity, number):
             raise RunDamagedError(f"{name} belongs to another run or episode. {advice}")
         reasons[failure["episode_id"]] = failure["reason"]

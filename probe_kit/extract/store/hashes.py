@@ -15,6 +15,7 @@ from hashlib import blake2b
 from typing import Any, BinaryIO, NamedTuple
 
 from probe_kit.errors import RunDamagedError
+from probe_kit.foreign_json import parse_json
 
 HASH = "blake2b"
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
@@ -99,16 +100,23 @@ def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     whole = is_record(raw) and raw[start + _HEX :].startswith(_AFTER)
     if not whole or digest(b"{" + rest).encode() != carried:
         raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
-    content: dict[str, Any] = json.loads(raw)
-    return content
+    return read_plain(raw, name, advice)
 
 
 def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     """What JSON without a hash says, as runs of former versions have it. Raises RunDamagedError if it is none."""
     try:
-        content = json.loads(raw)
+        content = parse_json(raw)
     except ValueError as error:
         raise RunDamagedError(f"{name} cannot be read: {error}. {advice}") from error
     if not isinstance(content, dict):
         raise RunDamagedError(f"{name} holds a {type(content).__name__}, not an object. {advice}")
     return content
+
+
+def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, advice: str) -> None:
+    """Raise RunDamagedError unless `content` has these parts, each of its type."""
+    for part, kind in parts.items():
+        if not isinstance(content.get(part), kind):
+            seen = type(content[part]).__name__ if part in content else "nothing"
+            raise RunDamagedError(f"{name} has {seen} as {part!r}; expected {kind.__name__}. {advice}")

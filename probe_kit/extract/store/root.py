@@ -14,6 +14,7 @@ from probe_kit.extract.store.hashes import (
     HASH,
     Sum,
     as_record,
+    expect,
     is_record,
     read_plain,
     read_record,
@@ -24,6 +25,8 @@ from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.summary import what_to_open
 from probe_kit.identity import sha256_json
 
+_PARTS = {"settings": dict, "settings_sha256": str, "streams": list}
+_EPISODE = {"episode": int, "episode_id": str}
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
@@ -64,9 +67,12 @@ class Root:
     @cached_property
     def plan(self) -> list[dict[str, Any]]:
         """The planned episodes in order."""
-        plan: list[dict[str, Any]] = read_plain(self.read(PLAN_FILE), f"{self.location}/{PLAN_FILE}", RESTORE)[
-            "episodes"
-        ]
+        name = f"{self.location}/{PLAN_FILE}"
+        content = read_plain(self.read(PLAN_FILE), name, RESTORE)
+        expect(content, {"episodes": list}, name, RESTORE)
+        plan: list[dict[str, Any]] = content["episodes"]
+        for episode in plan:
+            expect(episode if isinstance(episode, dict) else {}, _EPISODE, name, RESTORE)
         return plan
 
     @cached_property
@@ -113,6 +119,7 @@ def read_root(location: Location) -> Root:
             f"{location} has schema {schema}; this version of probe_kit reads {', '.join(map(str, READABLE))}. "
             "Update it"
         )
+    expect(card, _PARTS, name, RESTORE)
     identity = card.get(HASH)
     if identity is None and schema >= PROTECTED_SINCE:
         raise RunDamagedError(f"{name} has lost the hash it was written with. {RESTORE}")

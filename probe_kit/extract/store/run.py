@@ -31,7 +31,7 @@ from probe_kit.extract.store.commits import (
     stamp_of,
 )
 from probe_kit.extract.store.hashes import Sum
-from probe_kit.extract.store.layout import DATA, StoredStream
+from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import PROVENANCE, Provenance, differences, read_provenances
@@ -84,7 +84,12 @@ class Run:
         card = self.root.card
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
-        self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
+        try:
+            self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
+        except (TypeError, KeyError) as error:
+            raise RunDamagedError(
+                f"{location}/{RUN_FILE} describes its streams wrongly: {error!r}. {RESTORE}"
+            ) from error
 
     def __repr__(self) -> str:
         return run_text(self)

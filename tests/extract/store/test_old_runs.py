@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 import tarfile
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
-from probe_kit.errors import SettingsMismatchError
+from probe_kit.cli import app
+from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.store.locate import locate
@@ -18,6 +21,7 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
+from probe_kit.train.inventory import inventory
 
 STORED = Path(__file__).parents[2] / "golden" / "run-schema-1"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((STORED / "expected.json").read_text())
@@ -79,6 +83,31 @@ def test_an_old_run_still_makes_a_table(runs: Path) -> None:
     table = retention([run])
     assert {row.category for row in table.rows} == {"color"}
     assert table.rows[0].n_episodes == len(EXPECTED["pooled"]["outcomes"])
+
+
+def test_an_old_run_is_marked_as_not_protected(runs: Path) -> None:
+    run = open_run(runs / "pooled")
+    assert not run.protected
+    assert "not protected" in repr(run)
+    assert "not protected" in run._repr_html_()
+    assert not inventory(run).protected
+    assert not verify_run(runs / "pooled").protected
+    said = CliRunner().invoke(app, ["run", "verify", str(runs / "pooled")])
+    assert (said.exit_code, "not protected" in said.output) == (0, True)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[" * 99_999, b"[]", b"{}", b"\xff\xfe", b'{"schema_version": 1}',
+                b'{"schema_version": "x"}', b'{"schema_version": 2, "settings": 3, "settings_sha256": "", "streams": []}']
+)  # fmt: skip
+@pytest.mark.parametrize("file", ["run.json", "plan.json", "commits/00000001.json"])
+def test_damaged_json_of_an_old_run_is_named(runs: Path, tmp_path: Path, file: str, content: bytes) -> None:
+    """By whoever reads it; `run verify` never ends in a traceback either."""
+    copy = Path(shutil.copytree(runs / "expert", tmp_path / "run"))
+    (copy / file).write_bytes(content)
+    with pytest.raises(RunDamagedError):
+        open_run(copy)
+    assert not verify_run(copy, deep=True).ok
 
 
 def test_an_old_run_is_not_continued(runs: Path, small_suite: Suite) -> None:
