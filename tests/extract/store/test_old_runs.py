@@ -97,9 +97,18 @@ def test_an_old_run_is_marked_as_not_protected(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"[" * 99_999, b"[]", b"{}", b"\xff\xfe", b'{"schema_version": 1}',
-                b'{"schema_version": "x"}', b'{"schema_version": 2, "settings": 3, "settings_sha256": "", "streams": []}']
-)  # fmt: skip
+    "content",
+    [
+        b"",
+        b"[" * 99_999,
+        b"[]",
+        b"{}",
+        b"\xff\xfe",
+        b'{"schema_version": 1}',
+        b'{"schema_version": "x"}',
+        b'{"schema_version": 2, "settings": 3, "settings_sha256": "", "streams": []}',
+    ],
+)
 @pytest.mark.parametrize("file", ["run.json", "plan.json", "commits/00000001.json"])
 def test_damaged_json_of_an_old_run_is_named(runs: Path, tmp_path: Path, file: str, content: bytes) -> None:
     """By whoever reads it; `run verify` never ends in a traceback either."""
