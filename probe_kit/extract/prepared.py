@@ -81,11 +81,11 @@ def load(
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     location: where it will be written, if that is known, so that it is looked at before the model is loaded.
-    reader: the model of these `AskSettings`, if it is loaded already.
+    reader: the model of these `AskSettings`, if it is loaded already; it may be one of your own.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
-    suite = check_run(settings, location)
+    suite = check_run(settings, location, loaded=reader is not None)
     if not rehearsed:
         rehearse(settings.scene, plan_episodes(suite, settings.seed))
     wordings = settings.asked_wordings
@@ -106,9 +106,13 @@ def as_protocol(settings: RunSettings) -> RunSettings:
     return settings.followed() if isinstance(settings, ExtractSettings) else settings
 
 
-def check_run(settings: RunSettings, location: Location | None = None) -> Suite:
-    """The suite of a run, once everything was checked that can be without scene and model. Raises as `load`."""
-    check_model(settings, tuple(SCRIPTED))
+def check_run(settings: RunSettings, location: Location | None = None, loaded: bool = False) -> Suite:
+    """The suite of a run, once everything was checked that can be without scene and model. Raises as `load`.
+
+    loaded: the model is there already, and may be one that no name leads to.
+    """
+    if not loaded:
+        check_model(settings, tuple(SCRIPTED))
     refuse_meaningless(settings)
     suite = _suite(settings)
     if isinstance(settings, AskSettings):
