@@ -102,8 +102,10 @@ def _spell_test(one: Comparison) -> str:
 def _table(title: str, caption: str, rows: Sequence[Joined], parts: Sequence[tuple[str, Columns]]) -> FittingTable:
     found = []
     for question, columns in parts:
-        cells = tuple(tuple(Cell(cell(row)) for _, cell in columns) for row in rows)
-        found.append(Part(question, tuple(name for name, _ in columns), cells))
+        shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]
+        cells = tuple(tuple(Cell(cell(row)) for _, cell in shown) for row in rows)
+        if shown:
+            found.append(Part(question, tuple(name for name, _ in shown), cells))
     return FittingTable(
         title=title,
         caption=caption,
