@@ -47,6 +47,7 @@ READS_ONLY = (
     "probe_kit.hooks.views",
     "probe_kit.env.outcome",
     "probe_kit.env.events",
+    "probe_kit.env.rules",
 )
 """All that probes and tables may know of the rooms that hold models and simulators."""
 

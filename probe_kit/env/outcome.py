@@ -20,6 +20,10 @@ SENSITIVITY_RADII = (0.055, 0.065, 0.081)
 """Half a tile side, the rule of VL-Think, half a diagonal plus 3 mm: metres, for the default tile."""
 
 
+REST_SPEED = 0.002
+"""Speed of the cube in m/s below which it lies still."""
+
+
 def distance(a: XY, b: XY) -> float:
     """Distance in the plane, in the unit of the arguments."""
     return float(np.hypot(a[0] - b[0], a[1] - b[1]))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from probe_kit.env.controller import DeltaController
-from probe_kit.env.outcome import Ending, Outcome, distance, zone
+from probe_kit.env.outcome import REST_SPEED, Ending, Outcome, distance, zone
 from probe_kit.env.question import Question
 from probe_kit.env.rotations import Array
 from probe_kit.env.scene import Scene
@@ -12,8 +12,6 @@ from probe_kit.suite.items import other_side
 
 FALLEN_BELOW = -0.05
 """Height of the cube, metres, at which it has left the table."""
-REST_SPEED = 0.002
-"""Speed of the cube in m/s below which it lies still."""
 REST_STEPS = 5
 """Actions it must lie still, once released, for an early stop."""
 

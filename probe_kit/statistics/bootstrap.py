@@ -60,6 +60,26 @@ def bootstrap_means(
     return means
 
 
+def bootstrap_ratios(
+    values: NDArray[np.floating], weights: NDArray[np.floating], groups: ArrayLike, seed: int, draws: int = DRAWS
+) -> Matrix:
+    """A conditional share in every draw of whole groups: (draws,) sums of values over sums of weights, (E,) each.
+
+    values: at most the weights. NaN in a draw without weight. Draws that all agree come from what `unseen` groups
+    may hold, as in `bootstrap_means`.
+    """
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    tops, bottoms = (np.bincount(group_of, part, names.size) for part in (values, weights))
+    times = draw_groups(names.size, seed, draws)
+    below = (times @ bottoms).astype(np.float64)
+    ratios: Matrix = np.full(draws, np.nan)
+    np.divide(times @ tops, below, where=below > 0, out=ratios)
+    known = ratios[below > 0]
+    if constant(known[:, None])[0]:
+        return unseen(float(known[0]), int((bottoms > 0).sum()), seed, draws)
+    return ratios
+
+
 def constant(draws: Matrix) -> NDArray[np.bool_]:
     """(S,) whether all (B, S) draws agree, up to rounding."""
     agree: NDArray[np.bool_] = np.ptp(draws, axis=0) < 1e-12

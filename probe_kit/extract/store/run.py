@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from zarr.abc.store import Store
 
+from probe_kit.env.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
     RunDamagedError,
@@ -31,6 +33,7 @@ from probe_kit.extract.store.commits import (
     stamp_of,
 )
 from probe_kit.extract.store.hashes import Sum
+from probe_kit.extract.store.judging import behaviour_table, judged, with_outcomes
 from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
@@ -39,7 +42,7 @@ from probe_kit.extract.store.root import RESTORE, read_root
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.summary import run_html, run_text
 from probe_kit.extract.store.trajectories import NAME as TRAJECTORY
-from probe_kit.extract.store.trajectories import Trajectories, has_trajectories
+from probe_kit.extract.store.trajectories import Trajectories, has_trajectories, names_trajectory
 from probe_kit.hooks.sites import Site, Stream
 from probe_kit.hooks.views import resolve_view
 
@@ -74,8 +77,12 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
 class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
+    rule, last_steps: by which outcomes are given, see `under`; `disc` at the last step is what was stored.
     wording: the only one whose episodes are shown, None for all; see `in_wording`.
     """
+
+    rule: str = DEFAULT_RULE
+    last_steps: int = 1
 
     def __init__(self, location: Location, wording: str | None = None) -> None:
         self.location, self.wording = location, wording
@@ -198,12 +205,12 @@ class Run:
         if chosen not in self.wordings:
             there = ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
             raise UsageError(f"{self.location} has no wording {chosen!r}; it has {there}")
-        return Run(self.location, chosen)
+        return Run(self.location, chosen).under(self.rule, self.last_steps)
 
     @property
     def whole(self) -> "Run":
         """The same run with the episodes of all wordings."""
-        return self if self.wording is None else Run(self.location)
+        return self if self.wording is None else Run(self.location).under(self.rule, self.last_steps)
 
     @cached_property
     def _commits(self) -> dict[int, Commit]:
@@ -254,8 +261,11 @@ class Run:
 
     @cached_property
     def has_trajectories(self) -> bool:
-        """Whether episodes keep what happened in them step by step; runs made before it was stored do not."""
-        return has_trajectories(self.root)
+        """Whether episodes keep what happened in them step by step.
+
+        Runs made before it was stored do not, nor those whose model did not act.
+        """
+        return has_trajectories(self.root) and all(map(names_trajectory, self._commits.values()))
 
     @cached_property
     def trajectories(self) -> Trajectories:
@@ -275,6 +285,32 @@ class Run:
         keeps none, UsageError for an unknown episode, RunDamagedError if stored bytes are missing or changed.
         """
         return self.trajectories[self._position(episode)]
+
+    def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
+        """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
+
+        rule: a name of `probe_kit.env.rules.RULES`. last_steps: control steps at the end that count; the released
+        evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
+        """
+        return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
+
+    def under(self, rule: str, last_steps: int = 1) -> "Run":
+        """The same run with its outcomes by another rule, for tables and figures; see `judged`."""
+        if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
+            return self
+        judged = copy(self)
+        judged.rule, judged.last_steps = rule, last_steps
+        judged.__dict__["episodes"] = with_outcomes(self.episodes, self.judged(rule, last_steps))
+        return judged
+
+    @cached_property
+    def behaviour(self) -> pd.DataFrame:
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.behaviour`.
+
+        Raises NoTrajectoryError if the run keeps no trajectories.
+        """
+        table = behaviour_table(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
+        return table.assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
         """The instruction of one episode as the policy was delivered it; None where nothing was stored."""

@@ -5,7 +5,7 @@
 Frames and channels are those of `probe_kit.env.trajectory`. Runs made before there were any have no such array.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -44,6 +44,11 @@ def has_trajectories(root: Root) -> bool:
     """Whether the run was begun with room for them."""
     metadata = f"{NAME}/zarr.json"
     return metadata in root.metadata if root.protected else root.location.exists(f"{DATA}/{metadata}")
+
+
+def names_trajectory(commit: Mapping[str, Any]) -> bool:
+    """Whether an episode's commit names a trajectory; one that did not act has none."""
+    return any(key.startswith(f"{NAME}/") for key in commit["objects"])
 
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
