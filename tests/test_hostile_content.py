@@ -15,6 +15,7 @@ from probe_kit.suite import Suite
 
 NAME = "[bold]x[red] [no-end] \x1b[31m\u202e\x9b2J"
 SHOWN = "[bold]x[red] [no-end] ␛[31m\ufffd\ufffd2J"
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 GOLDEN = Path(__file__).parent / "golden"
 
 

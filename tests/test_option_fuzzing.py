@@ -16,6 +16,7 @@ from probe_kit.cli import app, commands_of
 from probe_kit.plain_text import UNSAFE
 from probe_kit.suite import Suite
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 GOLDEN = Path(__file__).parent / "golden"
 HOSTILE = (
     "", " ", "-", "--", "-1", "0", "1", "3", "1.5", "nan", "inf", "-inf", "1e309", "9" * 40, "9" * 5000, "²", "٣",

@@ -78,6 +78,16 @@ def load(family: str, checkpoint: Path) -> Any:
         pytest.skip(str(error))
 
 
+def act(family: str, checkpoint: Path) -> Any:
+    """The actions of one inference, as an extraction asks for them."""
+    model = load(family, checkpoint)
+    state = np.zeros(8, np.float32)
+    with acting(family):
+        return model.act(
+            [Observation(np.full((48, 64, 3), 90, np.uint8), state, "Put the cube on the red shape")], [0]
+        )
+
+
 def mappings(value: Any) -> Iterator[dict[str, Any]]:
     """Every object in a JSON value."""
     if isinstance(value, dict):
@@ -152,7 +162,7 @@ def test_statistics_that_would_change_what_actions_mean_are_refused(
                 worse = {
                     "turned around": (np.asarray(one[high]) + 1, -1 - np.abs(one[high])),
                     "NaN": (np.asarray(one[low]) * np.nan, np.asarray(one[high])),
-                    "text": (np.asarray(one[low]).astype(str), np.asarray(one[high])),
+                    "text": (np.full(np.shape(one[low]), "much"), np.asarray(one[high])),
                 }[spoil]
                 one[low], one[high] = (part.tolist() for part in worse)
                 return True
@@ -164,6 +174,8 @@ def test_statistics_that_would_change_what_actions_mean_are_refused(
             return None
         return -old.abs() - 1e3 if spoil == "turned around" else old * torch.nan
 
+    if family == "magma":
+        pytest.skip("the statistics that it uses by default come with probe_kit")
     processors = list(checkpoint.glob("policy_*.safetensors"))
     if processors:
         for file in processors:
@@ -174,7 +186,7 @@ def test_statistics_that_would_change_what_actions_mean_are_refused(
     if processors and spoil == "text":
         pytest.skip("its statistics are tensors")
     with pytest.raises(CheckpointError):
-        load(family, checkpoint)
+        act(family, checkpoint)
 
 
 def test_counts_without_bound_are_refused_before_anything_is_built(family: str, checkpoint: Path) -> None:
@@ -235,14 +247,9 @@ def check(family: str, place: Path, seed: int) -> None:
     """Damage a copy, and find it refused by name or acting with finite numbers."""
     copy = copied(family, place / str(seed))
     what = damage(copy, Random(seed))
-    observation = Observation(
-        np.full((48, 64, 3), 90, np.uint8), np.zeros(8, np.float32), "Put the cube on the red shape"
-    )
     refusal, actions = family, np.zeros(1)
     try:
-        model = load(family, copy)
-        with acting(family):
-            actions = model.act([observation], [0])
+        actions = act(family, copy)
     except ProbeKitError as error:
         refusal = str(error)
     assert np.isfinite(actions).all(), (family, seed, what)
@@ -250,6 +257,7 @@ def check(family: str, place: Path, seed: int) -> None:
     shutil.rmtree(place / str(seed))
 
 
+@pytest.mark.slow  # a family whose sizes were damaged may build a large network before it is refused
 @pytest.mark.parametrize("seed", [1, 2])
 def test_any_accident_is_refused_by_name_or_harmless(family: str, tmp_path: Path, seed: int) -> None:
     check(family, tmp_path, seed)

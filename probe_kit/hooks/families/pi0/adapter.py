@@ -27,6 +27,20 @@ from probe_kit.models.pi0_tiny import embedded_checkpoint
 _TOKENIZER = "google/paligemma-3b-pt-224"
 
 
+LEAST_BYTES = 1_000_000_000
+"""Of weights in the released size, which have 3.5 billion parameters."""
+
+
+def _refuse_small_weights(folder: Path) -> None:
+    """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
+    found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+    if 0 < found < LEAST_BYTES:
+        raise CheckpointError(
+            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; pi0 in its released size has several "
+            "GB. Put the dims.json beside its config.json, or download the checkpoint again"
+        )
+
+
 class Pi0(EvaluatedPi0):
     """A loaded pi0."""
 
@@ -41,6 +55,8 @@ class Pi0(EvaluatedPi0):
     def build(cls, config: Any, folder: Path) -> nn.Module:
         """lerobot's policy at the size `dims.json` gives, or at the released size."""
         sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
+        if not sizes:
+            _refuse_small_weights(folder)
         network: nn.Module = build_pi0(config, Pi0Size.from_file(sizes[0]) if sizes else None)
         return network
 
