@@ -36,8 +36,8 @@ def _refuse_small_weights(folder: Path) -> None:
     found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
     if 0 < found < LEAST_BYTES:
         raise CheckpointError(
-            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; pi0 in its released size has several "
-            "GB. Put the dims.json beside its config.json, or download the checkpoint again"
+            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; pi0 in its released size has "
+            "several GB. Put the dims.json beside its config.json, or download the checkpoint again"
         )
 
 
