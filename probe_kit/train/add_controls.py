@@ -86,14 +86,17 @@ def _baseline_scores(
 
 def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
     """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
-    if run.location.address == twin.location.address or run.settings_sha256 == twin.settings_sha256:
-        copy = "" if run.location.address == twin.location.address else f", of which {twin.location} is a copy,"
-        raise UsageError(f"{run.location}{copy} cannot be its own twin; give another run of the same episodes")
+    if run.location.address == twin.location.address:
+        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
     here, there = (_labels_by_episode(one, settings) for one in (run, twin))
     if here != there:
         raise UsageError(
             f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
             "are not the same. Extract both from the same suite."
+        )
+    if run.settings_sha256 == twin.settings_sha256:
+        raise UsageError(
+            f"{twin.location} is a copy of {run.location}, which cannot be its own twin; give other weights"
         )
 
 
