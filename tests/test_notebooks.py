@@ -14,7 +14,10 @@ from probe_kit.extract import open_run
 from probe_kit.retention import retention
 from probe_kit.train import load_results
 
-NAMES = ("01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions")
+NAMES = (
+    "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
+    "06-vlm-against-vla",
+)  # fmt: skip
 BESIDE_EACH_OTHER = (NAMES[:3], NAMES[3:])
 """The first three share a run; the others need none of them."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
@@ -99,6 +102,15 @@ def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     assert "0 errors" in shown
     assert "InstructionError" in shown
     assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 24
+
+
+def test_the_readers_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[str, NotebookNode]]) -> None:
+    runs = [open_run(made[0] / "work" / "runs" / name) for name in ("looking", "habit", "pi0-tiny-asked")]
+    looking, habit, acted = runs
+    assert (habit.episodes["side_placed"] == "left").all()
+    assert retention([habit]).rows[0].sr == 0.5
+    assert (looking.episodes["outcome_debiased"] == "correct").mean() > 0.5
+    assert looking.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
 
 
 @pytest.mark.parametrize("name", NAMES)
