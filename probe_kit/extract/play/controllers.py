@@ -172,7 +172,8 @@ class PolicyController:
             with self._edited(observations):
                 chunks = self._infer(observations, seeds)
         self.flagged = self.policy.flagged
-        _check_chunks(chunks, len(turns))
+        if not self.listens:
+            _check_chunks(chunks, len(turns))
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
