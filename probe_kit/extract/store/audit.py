@@ -132,7 +132,7 @@ def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]
 
 def _provenance_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
     try:
-        stored = read_provenances(root.location)
+        stored = read_provenances(root)
     except RunDamagedError as error:
         yield str(error)
         return

@@ -80,6 +80,24 @@ class CheckedStore(WrapperStore[Store]):
         """One after another."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
+    async def list(self) -> AsyncIterator[str]:
+        """Keys of all that is known."""
+        for key in self._sums:
+            yield key
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Those that begin so."""
+        for key in self._sums:
+            if key.startswith(prefix):
+                yield key
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names of what is known right in a folder."""
+        inside = f"{prefix.rstrip('/')}/" if prefix.strip("/") else ""
+        names = (key.removeprefix(inside).partition("/")[0] for key in self._sums if key.startswith(inside))
+        for name in dict.fromkeys(names):
+            yield name
+
     async def _get_many(
         self, requests: Iterable[tuple[str, BufferPrototype, ByteRequest | None]]
     ) -> AsyncGenerator[tuple[str, Buffer | None], None]:

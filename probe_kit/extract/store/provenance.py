@@ -17,8 +17,9 @@ from typing import Any
 import probe_kit.version
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract.store.commits import create_once
-from probe_kit.extract.store.hashes import HASH, is_record, read_plain, read_record
+from probe_kit.extract.store.hashes import HASH, read_plain, read_record
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.root import Root
 from probe_kit.identity import sha256_json, sha256_text
 
 Provenance = Mapping[str, Any]
@@ -83,17 +84,18 @@ def keep_provenance(location: Location, provenance: Provenance) -> None:
     create_once(location, f"{PROVENANCE}/{name_of(provenance)}.json", provenance)
 
 
-def read_provenances(location: Location) -> dict[str, Provenance]:
+def read_provenances(root: Root) -> dict[str, Provenance]:
     """Every provenance of a run by its name; a run made before there was any has none.
 
     Raises RunDamagedError if one is not what its name says.
     """
     found: dict[str, Provenance] = {}
+    location, read = root.location, read_record if root.protected else read_plain
     for file, raw in location.read_all(PROVENANCE, ".json").items():
         if not _NAMED.fullmatch(file):
             continue  # a copy that somebody made
         where, name = f"{location}/{PROVENANCE}/{file}", file.removesuffix(".json")
-        content = read_record(raw, where, _RESTORE) if is_record(raw) else read_plain(raw, where, _RESTORE)
+        content = read(raw, where, _RESTORE)
         content.pop(HASH, None)
         if name_of(content) != name:
             raise RunDamagedError(f"{where} was changed after it was written. {_RESTORE}")

@@ -172,7 +172,7 @@ class Run:
 
         Empty for a run of schema 1. Raises RunDamagedError if a commit names one that is not there.
         """
-        stored = read_provenances(self.location)
+        stored = read_provenances(self.root)
         named = sorted({commit["provenance"] for commit in self.commits() if "provenance" in commit})
         if missing := [name for name in named if name not in stored]:
             raise RunDamagedError(

@@ -132,7 +132,7 @@ class RunWriter:
         allowed.
         """
         if not allow_mixed:
-            stored = read_provenances(self.location).values()
+            stored = read_provenances(self.root).values()
             refuse_other_provenance(stored, self.provenance, str(self.location))
         self._say_who_plays()
 
