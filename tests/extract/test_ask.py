@@ -164,7 +164,7 @@ def answers(settings: AskSettings, reader: Reader | None = None) -> pd.DataFrame
     """What the run's episodes would hold, their frames being noise: no scene is needed to see whom a reader is."""
     assert settings.suite is not None
     suite = load_suite(settings.suite).select(settings.categories, settings.items)
-    blank = example_observations(settings.scene, suite)[0]
+    blank = example_observations(settings.scene, [suite.items[0].instruction])[0]
     controller = AskController(load_reader(settings) if reader is None else reader, settings, suite, blank)
     noise = np.random.default_rng(0)
     turns = [
