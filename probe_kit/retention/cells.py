@@ -42,8 +42,35 @@ def with_limits(value: str, limits: Limits | None, write: Callable[[float | None
 
 
 def success_interval(row: RetentionRow) -> str:
-    """SR in percent with its interval; n/a for a model that did not act."""
-    return NOT_ACTED if row.listened else with_limits(percent(row.sr), row.sr_ci, percent)
+    """SR in percent with its interval; n/a for a model that did not act, or for a rule that needs trajectories."""
+    return NOT_ACTED if row.sr is None else with_limits(percent(row.sr), row.sr_ci, percent)
+
+
+def _judged(cell: Callable[[RetentionRow], str]) -> Callable[[RetentionRow], str]:
+    """Nothing for a run that keeps no trajectories."""
+    return lambda row: "–" if row.sr_idle is None else cell(row)
+
+
+RULE_COLUMNS: list[Column] = [
+    ("answered", _judged(lambda row: percent(row.p_answered))),
+    (
+        "SR of answered [95 %]",
+        _judged(lambda row: with_limits(percent(row.sr_answered), row.sr_answered_ci, percent)),
+    ),
+    (
+        "SR of grasped [95 %]",
+        _judged(lambda row: with_limits(percent(row.sr_grasped), row.sr_grasped_ci, percent)),
+    ),
+    ("answers that never left the start", _judged(lambda row: percent(row.p_answers_unmoved))),
+    ("doing nothing scores", _judged(lambda row: percent(row.sr_idle))),
+    ("in both zones", _judged(lambda row: percent(row.p_both) if row.p_both else "–")),
+]
+"""What stands beside a success rate, because an outcome rule may give it away; in percent."""
+
+
+def rule_name(rows: Sequence[RetentionRow]) -> str:
+    """The outcome rule of a table, as its title names it."""
+    return f"outcome rule {', '.join(dict.fromkeys(row.rule for row in rows))}"
 
 
 def retention_value(row: RetentionRow) -> str:

@@ -45,6 +45,14 @@ def retention(
     wording: Annotated[
         str | None, typer.Option(help="Of runs with several wordings: the one tables are of; default their first.")
     ] = None,
+    rule: Annotated[
+        str,
+        typer.Option(help="What counts as an answer: disc, box (the released evaluation's) or released-on-tile."),
+    ] = "disc",
+    last_steps: Annotated[
+        int,
+        typer.Option(help="Control steps at the end that are judged; the released evaluation averages 11."),
+    ] = 1,
     html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
     score: Annotated[
@@ -63,10 +71,15 @@ def retention(
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
     from probe_kit.env.outcome import SENSITIVITY_RADII
+    from probe_kit.env.rules import check_rule
     from probe_kit.extract import open_run
     from probe_kit.retention import retention as make_table
     from probe_kit.retention.asked import scored
+    from probe_kit.retention.ruled import check_epsilons
 
+    check_epsilons(check_rule(rule), epsilons is not None)
+    if last_steps < 1:
+        raise UsageError(f"--last-steps {last_steps}: expected at least 1")
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
     if bool(runs) == bool(group):
@@ -83,7 +96,8 @@ def retention(
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
     table = make_table(
-        opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii,
+        opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii, rule=rule,
+        last_steps=last_steps,
         score=score, gap=gap, with_side_words=with_side_words,
     )  # fmt: skip
     if style == "table":

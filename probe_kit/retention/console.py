@@ -11,6 +11,7 @@ from probe_kit.retention.cells import (
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
     FURTHER_RETENTION,
+    RULE_COLUMNS,
     WORDING_COLUMNS,
     Column,
     action_place,
@@ -35,6 +36,7 @@ from probe_kit.retention.cells import (
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.ruled import rule_sentence
 from probe_kit.retention.success import Regime
 from probe_kit.retention.wordings import WordingPair
 from probe_kit.statistics.significance import detectable
@@ -75,7 +77,7 @@ def rich_tables(
         if is_asked(found[0]):
             tables.append(_of_run("Accuracy of answers", once, _ANSWERS, [_ANSWER_LEGEND]))
         else:
-            tables.append(_of_run("Success rate", once, _SUCCESS, [_OUTCOME_LEGEND]))
+            tables.append(_of_run("Success rate", once, _SUCCESS, [_OUTCOME_LEGEND, rule_sentence(once[-1])]))
         for view, of_view in groupby(probed(found), key=lambda row: row.view):
             shown = list(of_view)
             reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
@@ -118,9 +120,9 @@ def _judged(rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _regime(row: RetentionRow) -> str:
-    if row.regime is None:
-        return "did not act" if row.listened else f"score {number(row.normalised_score, 1)}"
-    return _REGIMES[row.regime]
+    if row.sr is None:
+        return "did not act" if row.listened else "n/a"
+    return f"score {number(row.normalised_score, 1)}" if row.regime is None else _REGIMES[row.regime]
 
 
 def _sides(row: RetentionRow) -> str:
@@ -178,6 +180,7 @@ _SUCCESS: dict[str, Sequence[Column]] = {
         ("outside", lambda row: percent(row.p_oob)),
         ("never moved", lambda row: percent(row.p_never_moved)),
     ],
+    "What the outcome rule makes of it": RULE_COLUMNS,
 }
 _RETENTION: dict[str, Sequence[Column]] = {
     "In the backbone": [

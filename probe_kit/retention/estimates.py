@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import Crossfit
 from probe_kit.retention.measure import Peak, Retention
-from probe_kit.retention.success import units_of
+from probe_kit.retention.success import shares_of, units_of
 from probe_kit.statistics.bootstrap import (
     GAINS,
     bootstrap_means,
@@ -93,7 +93,7 @@ def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
     """SR of a table of episodes, whole groups of items drawn."""
     groups = units_of(episodes)
     units = units_seed(groups, suite)
-    correct = (episodes["outcome"] == "correct").to_numpy()
+    correct = shares_of(episodes, "correct")
     draws = bootstrap_means(correct[:, None], groups, units)
     return Estimate(float(correct.mean()), draws[:, 0], units, np.unique(groups).size)
 

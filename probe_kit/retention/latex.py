@@ -22,12 +22,14 @@ from probe_kit.retention.cells import (
     prefix_place,
     probed,
     retention_value,
+    rule_name,
     title,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.heat import HEAT
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.ruled import rule_sentence
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
@@ -62,7 +64,8 @@ def latex(
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
         parts.append(_plain_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
     parts += [_plain_table(f"{own.title} ({own.note})", own.columns, own.cells) for own in further]
-    return "\n".join([*parts, *(f"% {note}" for note in notes)])
+    sentences = dict.fromkeys(rule_sentence(row) for row in rows if row.category == MEAN and not is_asked(row))
+    return "\n".join([*parts, *(f"% {note}" for note in (*sentences, *notes))])
 
 
 def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -101,7 +104,7 @@ def _retention_table(rows: Sequence[RetentionRow]) -> str:
             "% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}",
             *colours,
             r"\begin{table}",
-            rf"\caption{{{escape(title(what, rows))}}}",
+            rf"\caption{{{escape(title(f'{what} ({rule_name(rows)})', rows))}}}",
             rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in _COLUMNS)}}}",
             r"\toprule",
             " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in _COLUMNS)
@@ -127,7 +130,7 @@ _COLUMNS: list[tuple[str, Callable[[RetentionRow], str], str]] = [
     ("Call", call_value, "r"),
     ("Category", lambda row: row.category, "l"),
     ("$n$", lambda row: str(row.n_episodes), "r"),
-    ("SR", lambda row: NOT_ACTED if row.listened else percent(row.sr), "r"),
+    ("SR", lambda row: NOT_ACTED if row.sr is None else percent(row.sr), "r"),
     (r"$\Delta$", margin_value, "r"),
     (r"$\Delta$ (paper)", paper_margin, "r"),
     ("Prefix", lambda row: percent(row.prefix_accuracy), "r"),

@@ -8,6 +8,7 @@ from probe_kit.retention.cells import (
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
     FURTHER_RETENTION,
+    RULE_COLUMNS,
     WORDING_COLUMNS,
     Column,
     action_place,
@@ -25,6 +26,7 @@ from probe_kit.retention.cells import (
     prefix_place,
     probed,
     retention_value,
+    rule_name,
     success_interval,
     title,
     with_limits,
@@ -32,7 +34,8 @@ from probe_kit.retention.cells import (
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.plain_tables import PlainTable, is_asked
-from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.ruled import rule_sentence
 from probe_kit.retention.wordings import WordingPair
 
 
@@ -52,7 +55,7 @@ SUCCESS_COLUMNS: list[Column] = [
     ("flagged steps %", lambda row: percent(row.p_flagged)),
     ("original / swapped %", lambda row: f"{percent(row.sr_original)} / {percent(row.sr_swapped)}"),
     ("left / right %", lambda row: f"{percent(row.sr_left)} / {percent(row.sr_right)}"),
-    ("regime", lambda row: row.regime or ("did not act" if row.listened else _score(row))),
+    ("regime", lambda row: _regime(row)),
     ("n (items)", lambda row: f"{row.n_episodes} ({row.n_items})"),
 ]
 
@@ -85,9 +88,15 @@ def markdown(
     further: Sequence[PlainTable] = (),
 ) -> str:
     """Success rates and, where there are any, retention, controls, differences, wordings, more and notes."""
-    asked = any(is_asked(row) for row in rows)
+    asked, behaviour = any(is_asked(row) for row in rows), once_per_category(rows)
     columns = [(_of_both(name) if asked else name, cell) for name, cell in SUCCESS_COLUMNS]
-    parts = [_rows_table("SR / accuracy" if asked else "Success rate", once_per_category(rows), columns)]
+    what = "SR / accuracy" if asked else f"Success rate by {rule_name(rows)}"
+    parts = [_rows_table(what, behaviour, columns)]
+    if any(row.sr_idle is not None for row in rows):
+        columns = [*SUCCESS_COLUMNS[:3], *((f"{name} %", cell) for name, cell in RULE_COLUMNS)]
+        parts.append(_rows_table(f"What the {rule_name(rows)} makes of it", behaviour, columns))
+    acted = [row for row in behaviour if row.category == MEAN and not is_asked(row)]
+    parts += [f"> {sentence}\n" for sentence in dict.fromkeys(map(rule_sentence, acted))]
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
@@ -107,6 +116,12 @@ def markdown(
 def _of_both(heading: str) -> str:
     """A heading over policies that acted and readers that were asked."""
     return {"SR % [95 %]": "SR / accuracy % [95 %]", "outside %": "outside / unread %"}.get(heading, heading)
+
+
+def _regime(row: RetentionRow) -> str:
+    if row.sr is None:
+        return "did not act" if row.listened else "n/a"
+    return row.regime or _score(row)
 
 
 def _rows_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:

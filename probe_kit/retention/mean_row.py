@@ -6,6 +6,7 @@ from typing import Any
 
 from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, average
 from probe_kit.retention.rows import MEAN, RetentionRow
+from probe_kit.retention.ruled import mean_part
 from probe_kit.retention.run_rows import Drawn
 from probe_kit.retention.success import normalised_score
 
@@ -49,6 +50,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         listened=first.listened,
         normalised_score=normalised_score([row.sr for row in rows if row.sr is not None]) if acted else None,
         sr=_mean(rows, "sr"),
+        **vars(mean_part(rows, {name: _limits(estimates, name) for name in ("sr_answered", "sr_grasped")})),
         sr_ci=_limits(estimates, "sr"),
         prefix_ci=_limits(estimates, "prefix_accuracy"),
         action_ci=_limits(estimates, "action_accuracy"),

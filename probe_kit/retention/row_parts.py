@@ -35,7 +35,8 @@ class Behaviour:
     """What the policy did; `sr` is None where it was listened to and did not act.
 
     delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
-    which decides `regime`. sr_by_epsilon: SR by zone radius in metres.
+    which decides `regime`. sr_by_epsilon: SR by zone radius in metres. sr and all that follows from it is None
+    where the outcome rule needs trajectories that the run does not keep.
     """
 
     n_episodes: int

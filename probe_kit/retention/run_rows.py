@@ -5,13 +5,15 @@ from dataclasses import dataclass
 from math import isnan
 from typing import TYPE_CHECKING
 
+from probe_kit.env.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
 from probe_kit.retention.asked import ask_of
-from probe_kit.retention.estimates import UNBOUNDED, Estimates, Limits, probe_estimates, sr_estimate
+from probe_kit.retention.estimates import UNBOUNDED, Estimate, Estimates, Limits, probe_estimates, sr_estimate
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.row_parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
 from probe_kit.retention.rows import Part, RetentionRow
+from probe_kit.retention.ruled import Judged, Ruled
 from probe_kit.retention.success import SuccessRate, listened, sensitivity, success_rate, units_of
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
@@ -34,12 +36,18 @@ class Drawn:
 
 @dataclass(frozen=True)
 class RowSettings:
-    """What a table is asked to show. epsilons: zone radii in metres for `sr_by_epsilon`. seed: of the splits."""
+    """What a table is asked to show.
+
+    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. seed: of the splits.
+    rule, last_steps: see `probe_kit.env.rules.judge`.
+    """
 
     views: Sequence[str] | None
     iterations: Iterations
     epsilons: Sequence[float]
     seed: int
+    rule: str = DEFAULT_RULE
+    last_steps: int = 1
 
 
 def run_rows(
@@ -53,15 +61,16 @@ def run_rows(
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
+    judged = Judged.of(run, settings.rule, settings.last_steps)
     return [
-        _row(run, results, settings, group, str(category), episodes, view)
-        for category, episodes in run.episodes.groupby("category", sort=False)
+        _row(judged, results, settings, group, str(category), episodes, view)
+        for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
 
 
 def _row(
-    run: RunReader,
+    judged: Judged,
     results: ProbeResults | None,
     settings: RowSettings,
     group: str | None,
@@ -69,12 +78,17 @@ def _row(
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> Drawn:
-    success = None if listened(episodes) else success_rate(episodes, units_seed(units_of(episodes), run.suite))
-    behaviour = (
-        _unmoved(episodes) if success is None else _behaviour(success, sensitivity(episodes, settings.epsilons))
-    )
-    parts: list[Part] = [_source(run, results, success is None), _asked(run, episodes), behaviour]
-    estimates = {} if success is None else {"sr": sr_estimate(episodes, run.suite)}
+    run, heard = judged.run, listened(episodes)
+    parts: list[Part] = [_source(run, results, heard), _asked(run, episodes)]
+    estimates: dict[str, Estimate] = {}
+    success = None
+    if judged.scored and not heard:
+        success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
+        radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
+        parts += [judged.part(episodes), _behaviour(success, sensitivity(episodes, radii))]
+        estimates = {"sr": sr_estimate(episodes, run.suite), **judged.estimates(episodes)}
+    else:
+        parts += [Ruled(rule=judged.rule, rule_words=judged.words), _unmoved(episodes, heard)]
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
         probed = _Probed(results.controls, category, view, curve, _peaks(curve, settings.iterations))
@@ -128,9 +142,12 @@ def _asked(run: RunReader, episodes: "pd.DataFrame") -> Asked:
     )
 
 
-def _unmoved(episodes: "pd.DataFrame") -> Behaviour:
-    """Of a model that was listened to."""
-    return Behaviour(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), sr=None)
+def _unmoved(episodes: "pd.DataFrame", heard: bool) -> Behaviour:
+    """Of a model that was listened to, or whose run keeps nothing to judge by."""
+    reason = None if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
+    return Behaviour(
+        n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), sr=None, regime_reason=reason
+    )
 
 
 def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviour:

@@ -7,6 +7,8 @@ from math import comb
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from probe_kit.env.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.layout import LISTENED
@@ -15,7 +17,6 @@ from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.reader import refuse_several_wordings
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
     from numpy.typing import NDArray
 
@@ -114,24 +115,37 @@ def _refuse_listened(episodes: "pd.DataFrame") -> None:
         )
 
 
+def shares_of(episodes: "pd.DataFrame", outcome: str) -> "NDArray[np.float64]":
+    """(E,) how much of each episode had this outcome: 0 or 1, or a share where several last steps were judged."""
+    name = f"share_{outcome}"
+    if name in episodes:
+        return episodes[name].to_numpy(dtype=np.float64)
+    return (episodes["outcome"] == outcome).to_numpy().astype(np.float64)
+
+
+def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
+    return episodes[[]].assign(correct=shares_of(episodes, "correct"))["correct"]
+
+
 def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
     episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
-    and `group_id` where items share pictures. Raises UsageError for a table that is empty or of several
-    wordings, and for episodes in which the model did not act.
+    and `group_id` where items share pictures; `share_correct` and so on where the last steps of an episode were
+    averaged, which items' pairs take no notice of. Raises UsageError for a table that is
+    empty or of several wordings, and for episodes in which the model did not act.
     """
     refuse_several_wordings(episodes)
     _refuse_listened(episodes)
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
-    correct = episodes["outcome"] == "correct"
-    sr, p_wrong = float(correct.mean()), float((episodes["outcome"] == "wrong").mean())
-    p_oob = float((episodes["outcome"] == "oob").mean())
+    correct = _correct(episodes)
+    sr, p_wrong = float(correct.mean()), float(shares_of(episodes, "wrong").mean())
+    p_oob = float(shares_of(episodes, "oob").mean())
     n_items = int(episodes["item_id"].nunique())
     delta_regime = chance_margin(independent_items(episodes))
     name, reason = regime(sr, delta_regime, p_wrong, p_oob, "parse" in episodes)
-    low, high = group_bootstrap(correct.to_numpy(bool)[:, None], units_of(episodes), seed)
+    low, high = group_bootstrap(correct.to_numpy()[:, None], units_of(episodes), seed)
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
     return SuccessRate(
@@ -176,7 +190,7 @@ def independent_items(episodes: "pd.DataFrame") -> float:
     The number of items over how much more the success rate varies between groups than it would if their items had
     nothing in common.
     """
-    correct = (episodes["outcome"] == "correct").astype(float)
+    correct = _correct(episodes)
     residual = correct - correct.mean()
     by_item = float((residual.groupby(episodes["item_id"]).sum() ** 2).sum())
     by_group = float((residual.groupby(units_of(episodes)).sum() ** 2).sum())
@@ -220,5 +234,5 @@ def _sign_test(successes: int, trials: int) -> float:
     return float(sum(comb(trials, heads) for heads in range(successes, trials + 1)) / 2**trials)
 
 
-def _rate(values: "pd.Series[bool]") -> float | None:
+def _rate(values: "pd.Series[bool] | pd.Series[float]") -> float | None:
     return float(values.mean()) if len(values) else None

@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.env.outcome import SENSITIVITY_RADII
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.env.rules import DEFAULT_RULE, check_rule
+from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.asked import ask_of, left_out, scored
 from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.frames import frame_of
@@ -17,6 +18,7 @@ from probe_kit.retention.measure import Iterations
 from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_settings
 from probe_kit.retention.plain_tables import ANSWERS, PlainTable, answer_table, gap_tables, size_table
 from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.ruled import by_rule, can_be_judged, check_epsilons
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.retention.success import listened
 from probe_kit.retention.wordings import WordingPair, wording_pairs
@@ -58,6 +60,16 @@ class RetentionTable:
         from probe_kit.retention.notebook import table_html
 
         return table_html(self.all_rows, self.differences)
+
+    @property
+    def rule(self) -> str:
+        """The outcome rule by which episodes were judged."""
+        return self.rows[0].rule if self.rows else DEFAULT_RULE
+
+    @property
+    def last_steps(self) -> int:
+        """How many control steps at the end it judged."""
+        return self.rows[0].last_steps if self.rows else 1
 
     @property
     def all_rows(self) -> list[RetentionRow]:
@@ -141,18 +153,24 @@ def retention(
     score: str = "text",
     with_side_words: bool = False,
     gap: bool = False,
+    rule: str = DEFAULT_RULE,
+    last_steps: int = 1,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
     runs: a list, or lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared
     with each other. views: those that were probed by default. iterations: which expert iterations take part.
     keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
-    metres at which SR is scored again. A run without activations or probes shows success rates only.
+    metres at which SR is scored again, for the rule `disc`. rule: by which episodes are judged, a name of
+    `probe_kit.env.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
+    trajectories has no success rate by another rule than `disc`. A run without activations or probes shows success
+    rates only.
     score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
     their items in whose name a side stands. gap: compare every asked run with every acting one, see `vlm_gaps`.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, or for a run that is given twice, SceneError for overlapping zones.
     """
+    check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
@@ -162,7 +180,11 @@ def retention(
     order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
     listed, chosen = [listed[at] for at in order], [chosen[at] for at in order]
     results, notes = _read_probes([run for _, run in listed], chosen)
-    settings = RowSettings(views, iterations, epsilons, seed)
+    unscored = [note for _, run in listed if (note := _not_scored(run, rule, last_steps))]
+    if unscored and isinstance(runs, Mapping):
+        raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
+    notes += unscored
+    settings = RowSettings(views, iterations, epsilons, seed, rule, last_steps)
     drawn: list[Drawn] = []
     means: list[RetentionRow] = []
     for name, run in listed:
@@ -179,7 +201,8 @@ def retention(
     rows, means = (
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
-    pairs = [pair for _, run in listed for pair in _wordings(run, names[str(run.location)])]
+    judged = [by_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
+    pairs = [pair for run in judged for pair in _wordings(run, names[str(run.location)])]
     gaps = vlm_gaps([run for _, run in listed], names) if gap else []
     if gap and not gaps:
         raise UsageError(
@@ -196,6 +219,16 @@ def _wordings(run: RunReader, label: str) -> list[WordingPair]:
         return []
     whole: RunReader = getattr(run, "whole", run)
     return wording_pairs(whole.episodes, names, str(run.location), label)
+
+
+def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:
+    """A sentence about a run that has no success rate by this rule."""
+    if can_be_judged(run, rule, last_steps):
+        return None
+    return (
+        f"{run.location} keeps no trajectories, so that its success rate by the rule {rule} is n/a. Extract it "
+        "again to have it."
+    )
 
 
 def _distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:

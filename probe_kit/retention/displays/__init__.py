@@ -18,6 +18,7 @@ from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, ite
 from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
 from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
+from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
 
@@ -31,6 +32,7 @@ __all__ = [
     "KnowledgeActionDisplay",
     "LayerCurveDisplay",
     "ModelDepthDisplay",
+    "OutcomeRulesDisplay",
     "PairedLayoutsDisplay",
     "RetentionTableDisplay",
     "RoleCurvesDisplay",

@@ -34,7 +34,8 @@ class Certificate:
     @classmethod
     def of_run(cls, run: RunReader) -> Self:
         """Of a run's behaviour."""
-        n = f"n = {len(run.episodes)} episodes"
+        rule = getattr(run, "rule", "disc")
+        n = f"n = {len(run.episodes)} episodes" + ("" if rule == "disc" else f" by the rule {rule}")
         return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
     @classmethod

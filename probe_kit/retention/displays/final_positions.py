@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.env.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
@@ -32,7 +33,7 @@ class FinalPositionsDisplay(Shown):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
     xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and
-    sizes, zone radius and the start of the cube, as stored with the run.
+    sizes, zone radius and the start of the cube, as stored with the run. rule: by which outcomes are.
     """
 
     category: str | None
@@ -41,6 +42,7 @@ class FinalPositionsDisplay(Shown):
     never_moved: int
     scene: Mapping[str, Any]
     certificate: Certificate
+    rule: str = DEFAULT_RULE
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -68,6 +70,7 @@ class FinalPositionsDisplay(Shown):
             never_moved=int(unmoved),
             scene=scene,
             certificate=Certificate.of_run(run),
+            rule=getattr(run, "rule", DEFAULT_RULE),
         )
 
     @property
@@ -78,8 +81,9 @@ class FinalPositionsDisplay(Shown):
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         axes, figure = axes_for(ax, 4.6, 4.4)
-        low, high = _window(self.scene)
-        _draw_table(axes, self.scene)
+        rule = rule_of(self.rule, self.scene)
+        low, high = _window(self.scene, _reach(rule))
+        _draw_table(axes, self.scene, rule)
         inside = ((self.xy >= low) & (self.xy <= high)).all(axis=1)
         for name, (label, colour, marker) in _OUTCOMES.items():
             chosen = (self.outcome == name) & inside
@@ -115,15 +119,23 @@ def final_positions(run: RunReader) -> "Figure":
     return figure
 
 
-def _window(scene: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _reach(rule: OutcomeRule) -> float:
+    """How far a zone reaches from the middle of its picture, metres."""
+    if isinstance(rule, Disc):
+        return rule.radius
+    assert isinstance(rule, Box | ReleasedOnTile)
+    return rule.half
+
+
+def _window(scene: Mapping[str, Any], zone: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners (x, y) of what is shown."""
-    reach = max(scene["epsilon"], scene["tile_side"] * 0.75)
+    reach = max(zone, scene["tile_side"] * 0.75)
     places = np.array([scene["tile_left"], scene["tile_right"], scene["cube_xy"]], float)
     margin = np.array([[reach], [reach], [_MARGIN]])
     return (places - margin).min(axis=0), (places + margin).max(axis=0)
 
 
-def _draw_table(axes: "Axes", scene: Mapping[str, Any]) -> None:
+def _draw_table(axes: "Axes", scene: Mapping[str, Any], rule: OutcomeRule) -> None:
     from matplotlib.patches import Circle, Rectangle
 
     turn = np.degrees(scene["tile_yaw"])
@@ -135,7 +147,15 @@ def _draw_table(axes: "Axes", scene: Mapping[str, Any]) -> None:
             corner, 2 * half, 2 * half, angle=turn, rotation_point="center", fc="0.95", ec="0.7", lw=0.8
         )
         axes.add_patch(tile)
-        axes.add_patch(Circle((-y, x), scene["epsilon"], fill=False, ec="0.45", lw=0.8, ls="--"))
+        if isinstance(rule, Disc):
+            axes.add_patch(Circle((-y, x), rule.radius, fill=False, ec="0.45", lw=0.8, ls="--"))
+        else:
+            reach, turned = _reach(rule), 0.0 if isinstance(rule, Box) else turn
+            square = Rectangle(
+                (-y - reach, x - reach), 2 * reach, 2 * reach, angle=turned, rotation_point="center", fill=False,
+                ec="0.45", lw=0.8, ls="--",
+            )  # fmt: skip
+            axes.add_patch(square)
     x, y = scene["cube_xy"]
     half = scene["cube_side"] / 2
     start = Rectangle(

@@ -22,9 +22,11 @@ from probe_kit.retention.displays.iteration_maps import iteration_maps
 from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
 from probe_kit.retention.displays.layer_curves import layer_curve
 from probe_kit.retention.displays.model_depth import model_depths
+from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.ruled import by_rule, can_be_judged
 from probe_kit.retention.success import listened
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.calls import load_calls
@@ -77,9 +79,10 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
     if strangers := [str(run.location) for run in runs if str(run.location) not in known]:
         raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
     results = [table.results.get(str(run.location)) for run in runs]
-    exhibits = _of_table(table, [one for one in results if one is not None])
+    exhibits = [*_of_table(table, [one for one in results if one is not None]), *_of_rules(runs)]
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
-        exhibits += _of_run(name, position, run)
+        if can_be_judged(run, table.rule, table.last_steps):
+            exhibits += _of_run(name, position, by_rule(run, table.rule, table.last_steps))
         if probed is not None:
             exhibits += _of_probes(name, position, probed, table.iterations)
             exhibits += _of_calls(name, position, run, probed)
@@ -154,6 +157,20 @@ def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Ex
     return exhibits
 
 
+def _of_rules(runs: Sequence[RunReader]) -> list[Exhibit]:
+    runs = [run for run in runs if getattr(run, "has_trajectories", False) and not run.episodes.empty]
+    if not runs:
+        return []
+    return [
+        Exhibit(
+            "outcome-rules", "The same episodes by every outcome rule", "behaviour",
+            "What counts as an answer decides the success rate. A black mark is what a policy that does nothing "
+            "would score by that rule: where there is one, the untouched cube already counts as put on a picture.",
+            None, lambda: _figure(OutcomeRulesDisplay.from_runs(runs)),
+        )
+    ]  # fmt: skip
+
+
 def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
     if listened(run.episodes):
         return []
@@ -171,7 +188,7 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
             Exhibit(
                 f"{name}-final-positions", "Where the cube ended", "behaviour",
                 "The table from above, the robot below the picture. An episode counts as an answer if the middle "
-                "of the cube ends inside a dashed circle; “unmoved” means that the cube was never carried "
+                "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried "
                 "anywhere.",
                 position, partial(final_positions, run),
             )
@@ -256,7 +273,9 @@ def _suffix(view: str, views: Sequence[str]) -> str:
     return "" if view == views[0] else f"-{view.replace(':', '-')}"
 
 
-def _figure(display: "HeatTableDisplay | KnowledgeActionDisplay | PairedLayoutsDisplay") -> "Figure":
+def _figure(
+    display: "HeatTableDisplay | OutcomeRulesDisplay | KnowledgeActionDisplay | PairedLayoutsDisplay",
+) -> "Figure":
     from matplotlib.figure import Figure
 
     axes = display.plot().ax_

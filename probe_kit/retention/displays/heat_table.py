@@ -6,7 +6,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.cells import model_name, once_per_category
+from probe_kit.retention.cells import model_name, once_per_category, rule_name
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import axes_for, caption, spell
@@ -37,6 +37,7 @@ class HeatTableDisplay(Shown):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
+    ruled: what the title says of the outcome rule.
     """
 
     rows: tuple[str, ...]
@@ -48,7 +49,16 @@ class HeatTableDisplay(Shown):
     note: ClassVar[str] = ""
     scale: ClassVar[float] = 100.0
     digits: ClassVar[int] = 1
+    ruled: str = ""
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def _ruled(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
+        """Of success rates, which belong to an outcome rule."""
+        rows = once_per_category(table.all_rows)
+        found = cls._of(rows, cell)
+        found.ruled = f", {rule_name(rows)}"
+        return found
 
     @classmethod
     def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
@@ -80,9 +90,9 @@ class HeatTableDisplay(Shown):
                 self._draw_cell(axes, column, number, cell)
         self._draw_names(axes)
         if figure is None:
-            axes.set_title(self.title, fontsize=10, loc="left", pad=34)
+            axes.set_title(self.title + self.ruled, fontsize=10, loc="left", pad=34)
         else:
-            figure.suptitle(self.title, x=0.01, ha="left", fontsize=10)
+            figure.suptitle(self.title + self.ruled, x=0.01, ha="left", fontsize=10)
             self._draw_key(figure)
         caption(figure, *self.certificates)
         self.ax_ = axes
@@ -135,10 +145,7 @@ class SuccessTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._of(
-            once_per_category(table.all_rows),
-            lambda row: Cell((row.sr,), row.regime == Regime.KNOWLEDGE),
-        )
+        return cls._ruled(table, lambda row: Cell((row.sr,), row.regime == Regime.KNOWLEDGE))
 
 
 class SideTableDisplay(HeatTableDisplay):
@@ -152,7 +159,7 @@ class SideTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._of(once_per_category(table.all_rows), lambda row: Cell((row.sr_left, row.sr_right)))
+        return cls._ruled(table, lambda row: Cell((row.sr_left, row.sr_right)))
 
 
 class RetentionTableDisplay(HeatTableDisplay):

@@ -22,6 +22,7 @@ from probe_kit.retention.report.tables import (
     plain_tables,
     retention_table,
 )
+from probe_kit.retention.ruled import by_rule
 from probe_kit.retention.table import RetentionTable, retention
 from probe_kit.train.reader import RunReader
 from probe_kit.version import __version__
@@ -70,7 +71,7 @@ def report_html(
     if not runs:
         raise UsageError("a report needs at least one run")
     table = table or retention(runs)
-    names = run_names(runs)
+    names, as_judged = run_names(runs), [by_rule(run, table.rule, table.last_steps) for run in runs]
     exhibits = [exhibit for exhibit in gallery(runs, table) if not exhibit.is_table]
     sentence, bibtex = citation(runs)
     rows = table.all_rows
@@ -89,7 +90,7 @@ def report_html(
         pictures={
             subject: _pictures(exhibits, subject, names) for subject in ("behaviour", "probes", "retention")
         },
-        grid=episode_grid(runs, names, pictures),
+        grid=episode_grid(as_judged, names, pictures),
         several=len(runs) > 1,
         provenance=[
             provenance(name, run, table.results.get(str(run.location)))

@@ -156,7 +156,11 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
 def read_row(row: RetentionRow) -> list[str]:
     """One category in sentences."""
     if row.sr is None:
-        found = [f"Listened to in {row.n_episodes} episodes; it did not act."]
+        found = [
+            f"Listened to in {row.n_episodes} episodes; it did not act."
+            if row.listened
+            else f"Success rate {row.regime_reason}."
+        ]
     else:
         right = round(row.sr * row.n_episodes)
         found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]

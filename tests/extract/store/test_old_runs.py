@@ -124,3 +124,12 @@ def test_an_old_run_is_not_continued(runs: Path, small_suite: Suite) -> None:
     plan = Plan(small_suite, (), tuple(run.stored(name) for name in run.streams), 0)
     with pytest.raises(SettingsMismatchError, match="schema_version: stored 1, asked 3"):
         RunWriter(run.location, plan, run.settings)
+
+
+def test_an_old_run_has_no_success_rate_by_rules_that_need_trajectories(runs: Path) -> None:
+    run = open_run(runs / "pooled")
+    assert not run.has_trajectories
+    table = retention([run], rule="box")
+    assert (table.rows[0].sr, table.rows[0].rule) == (None, "box")
+    assert "keeps no trajectories" in " ".join(table.notes)
+    assert retention([run], rule="disc").rows[0].sr is not None

@@ -1,0 +1,105 @@
+"""The same episodes by every outcome rule, side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+from probe_kit.env.rules import DEFAULT_RULE, RULES
+from probe_kit.errors import UsageError
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
+from probe_kit.retention.ruled import Judged
+from probe_kit.retention.success import shares_of
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_PARTS = (
+    ("correct", "right", GREEN, ""),
+    ("wrong", "wrong", VERMILION, "///"),
+    ("oob", "neither", "#D9D9D9", ""),
+)
+
+
+@dataclass(frozen=True)
+class RuleBar:
+    """One run by one rule: shares of episodes, and what doing nothing would score; None where it is n/a."""
+
+    run: str
+    rule: str
+    shares: Mapping[str, float] | None
+    idle: float | None
+
+
+@dataclass
+class OutcomeRulesDisplay(Shown):
+    """A bar per run and outcome rule: how often the same episodes are called right, wrong or neither."""
+
+    bars: tuple[RuleBar, ...]
+    certificates: tuple[Certificate, ...]
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_runs(cls, runs: Sequence[RunReader]) -> Self:
+        """One that keeps no trajectories has a bar by `disc` alone. Raises UsageError without episodes."""
+        if not runs or any(run.episodes.empty for run in runs):
+            raise UsageError("there are no episodes to judge; give runs that have some")
+        bars = [bar for run in runs for bar in _bars(run)]
+        return cls(tuple(bars), tuple(Certificate.of_run(run) for run in runs))
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        runs = list(dict.fromkeys(bar.run for bar in self.bars))
+        axes, figure = axes_for(ax, 6.2, 0.3 * len(self.bars) + 0.15 * len(runs) + 1.35)
+        places = [at + 0.5 * runs.index(bar.run) for at, bar in enumerate(self.bars)]
+        for place, bar in zip(places, self.bars, strict=True):
+            _draw_bar(axes, place, bar)
+        names = [f"{bar.run}  {bar.rule}" if len(runs) > 1 else bar.rule for bar in self.bars]
+        axes.set_yticks(places, names, fontsize=8)
+        axes.set_ylim(places[-1] + 0.6, -0.6)
+        axes.set_xlim(0, 112)
+        axes.set_xticks(range(0, 101, 25))
+        axes.set_xlabel("episodes (%)", fontsize=9)
+        plain(axes)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        if figure is not None:
+            handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+            legend_above(figure, list(handles.values()))
+        caption(figure, *self.certificates)
+        self.ax_ = axes
+        return self
+
+
+def _bars(run: RunReader) -> list[RuleBar]:
+    judged = Judged.of(run, DEFAULT_RULE)
+    if judged.verdicts is None:
+        stored = {name: float(shares_of(run.episodes, name).mean()) for name, *_ in _PARTS}
+        return [RuleBar(run.label, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
+    return [
+        RuleBar(
+            run.label,
+            rule,
+            {name: float(verdicts[name].mean()) for name, *_ in _PARTS},
+            float((verdicts["idle"] == "correct").mean()),
+        )
+        for rule, verdicts in judged.verdicts.items()
+    ]
+
+
+def _draw_bar(axes: "Axes", place: float, bar: RuleBar) -> None:
+    if bar.shares is None:
+        axes.text(1, place, "n/a: the run keeps no trajectories", va="center", fontsize=7.5, color="0.35")
+        return
+    left = 0.0
+    for name, label, colour, hatch in _PARTS:
+        width = 100 * bar.shares[name]
+        axes.barh(place, width, 0.72, left, color=colour, hatch=hatch, ec="white", lw=0.5, label=label)
+        left += width
+    axes.text(101, place, f"{100 * bar.shares['correct']:.1f}", va="center", fontsize=8)
+    if bar.idle:
+        axes.plot(
+            [100 * bar.idle] * 2, [place - 0.44, place + 0.44], color="black", lw=2, label="doing nothing scores"
+        )

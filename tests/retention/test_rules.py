@@ -1,0 +1,154 @@
+"""Success rates by outcome rules: what each of them makes of the same episodes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.env import SceneSpec
+from probe_kit.env.rules import RULES
+from probe_kit.errors import NoTrajectoryError, UsageError
+from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention, success_rate
+from probe_kit.retention.displays import gallery
+from probe_kit.retention.ruled import rule_sentence
+from probe_kit.statistics.bootstrap import bootstrap_means, bootstrap_ratios
+from probe_kit.suite import build_suite
+from probe_kit.train import ArrayRun
+
+from .conftest import outcomes
+
+
+@pytest.fixture(scope="module")
+def idle(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A policy that does nothing, in the released scene: four episodes of two steps."""
+    pytest.importorskip("rtbdata")
+    folder = tmp_path_factory.mktemp("idle")
+    suite = build_suite(folder / "suite", ["color"], 2)
+    scene = SceneSpec.preset("act2answer", max_steps=2)
+    return extract_run(
+        ExtractSettings("idle", suite=suite.folder, scene=scene, env_workers=0, frames="none"), folder / "run"
+    )
+
+
+@pytest.mark.parametrize(("rule", "sr"), [("disc", 0.0), ("box", 0.5), ("released-on-tile", 0.0)])
+def test_doing_nothing_scores_a_half_by_the_released_rule_and_nothing_by_the_others(
+    idle: Run, rule: str, sr: float
+) -> None:
+    result = CliRunner().invoke(app, ["retention", str(idle.path), "--rule", rule, "--format", "json"])
+    assert result.exit_code == 0
+    rows = json.loads(result.stdout)
+    for row in rows:
+        assert (row["rule"], row["sr"], row["sr_idle"]) == (rule, sr, sr)
+        assert row["sr_by_rule"] == {"disc": 0.0, "box": 0.5, "released-on-tile": 0.0}
+        assert (row["n_grasped"], row["sr_grasped"]) == (4, sr)
+        assert row["behaviour"]["moved"] == row["behaviour"]["first_choice_made"] == 0
+    if rule == "box":
+        assert (rows[0]["sr_left"], rows[0]["sr_right"], rows[0]["p_answered"]) == (0, 1, 1)
+        assert (rows[0]["p_answers_unmoved"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (1, "right", 0.5)
+    else:
+        assert (rows[0]["p_answers_unmoved"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (None, "none", None)
+
+
+def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
+    for rule, why in (("box", "already lies in the zone of the right picture"), ("disc", "lies in neither zone")):
+        table = retention([idle], rule=rule)
+        share = "50.0" if rule == "box" else "0.0"
+        sentence = f"a policy that does nothing would score {share} %, as the untouched cube {why}"
+        assert sentence in rule_sentence(table.means[0])
+        for text in (table.to_markdown(), table.to_latex().replace(r"\%", "%")):
+            assert sentence in text
+            assert f"outcome rule {rule}" in text
+
+
+def test_the_mean_over_the_last_steps_is_an_option_of_the_rule(idle: Run) -> None:
+    row = retention([idle], rule="box", last_steps=11).rows[0]
+    assert (row.sr, row.last_steps) == (0.5, 11)
+    assert "mean of the last 11 control steps" in rule_sentence(row)
+
+
+def test_shares_of_an_episode_count_as_shares() -> None:
+    episodes = outcomes(2, 2, 4)
+    episodes["share_correct"] = [1, 0.5, 0, 0, 0.25, 0, 0, 0.25]
+    episodes["share_wrong"] = [0, 0.5, 1, 1, 0, 0, 0, 0]
+    episodes["share_oob"] = 1 - episodes["share_correct"] - episodes["share_wrong"]
+    found = success_rate(episodes)
+    assert (found.sr, found.p_wrong, found.p_oob) == (0.25, 0.3125, 0.4375)
+    assert found.ci[0] < 0.25 < found.ci[1]
+    assert (found.paired.both, found.paired.both_wrong) == (1, 1)
+
+
+def test_a_run_by_another_rule_leaves_the_run_as_it_was(idle: Run) -> None:
+    judged = idle.under("box")
+    assert judged.episodes["side_placed"].tolist() == ["right"] * 4
+    assert judged.episodes["is_success"].sum() == 2
+    assert idle.episodes["outcome"].tolist() == ["oob"] * 4
+    assert judged.under("disc").episodes["outcome"].tolist() == idle.episodes["outcome"].tolist()
+    assert idle.under("disc") is idle
+    assert not judged.episodes["never_moved"].any()
+    assert idle.episodes["never_moved"].all()
+
+
+def test_every_rule_agrees_with_what_was_stored_where_it_is_the_same(recorded_run: Run) -> None:
+    verdicts = recorded_run.judged("disc")
+    assert verdicts["outcome"].tolist() == recorded_run.episodes["outcome"].tolist()
+
+
+def test_rules_stand_side_by_side_on_the_same_episodes(idle: Run) -> None:
+    bars = OutcomeRulesDisplay.from_runs([idle]).bars
+    assert [bar.rule for bar in bars] == list(RULES)
+    assert [bar.shares["correct"] for bar in bars if bar.shares] == [0, 0.5, 0]
+    assert [bar.idle for bar in bars] == [0, 0.5, 0]
+    OutcomeRulesDisplay.from_runs([idle]).plot()
+
+
+def test_figures_follow_the_rule_of_the_table(idle: Run) -> None:
+    names = {exhibit.name: exhibit for exhibit in gallery([idle], retention([idle], rule="box"))}
+    assert "outcome-rules" in names
+    with names["run-final-positions"].drawn() as figure:
+        assert any("2 right · 2 wrong · 0 out" in axes.get_xlabel() for axes in figure.axes)
+        zones = [patch for patch in figure.axes[0].patches if patch.get_linestyle() == "--"]
+        assert [zone.get_width() for zone in zones] == pytest.approx([0.27, 0.27])  # type: ignore[attr-defined]
+    assert FinalPositionsDisplay.from_run(idle).counts["oob"] == 4
+
+
+def test_a_run_without_trajectories_has_no_rate_by_other_rules(tmp_path: Path) -> None:
+    run = ArrayRun(tmp_path / "old", "old", "suite@1#0123456789ab", outcomes(6, 2, 4), {})
+    table = retention([run], rule="box")
+    row = table.rows[0]
+    assert (row.sr, row.regime, row.sr_by_rule, row.n_episodes) == (None, None, {}, 12)
+    assert json.loads(table.to_json())[0]["sr"] is None
+    assert "n/a" in table.to_markdown()
+    assert any("keeps no trajectories" in note for note in table.notes)
+    assert retention([run]).rows[0].sr == 0.5
+    assert retention([run]).rows[0].sr_answered == 0.75
+    assert gallery([run], table) == []
+    with pytest.raises(NoTrajectoryError, match="groups cannot be compared by the rule box"):
+        retention({"a": [run]}, rule="box")
+
+
+def test_radii_belong_to_the_disc(idle: Run) -> None:
+    assert retention([idle], rule="box").rows[0].sr_by_epsilon == {}
+    assert retention([idle]).rows[0].sr_by_epsilon
+    with pytest.raises(UsageError, match="belong to the outcome rule disc"):
+        retention([idle], rule="box", epsilons=(0.05,))
+    for options in (["--rule", "box", "--epsilons", "0.05"], ["--rule", "boxx"], ["--last-steps", "0"]):
+        assert CliRunner().invoke(app, ["retention", "nowhere", *options]).exit_code == 2
+
+
+def test_a_conditional_share_has_the_interval_of_its_own_episodes() -> None:
+    generator = np.random.default_rng(0)
+    groups = np.repeat(np.arange(40), 2)
+    answered = generator.random(80) < 0.5
+    right = answered & (generator.random(80) < 0.6)
+    draws = bootstrap_ratios(right.astype(float), answered.astype(float), groups, 7)
+    alone = bootstrap_means(right[answered][:, None], np.arange(answered.sum()), 7)[:, 0]
+    assert abs(np.mean(draws) - right.sum() / answered.sum()) < 0.02
+    assert 0.7 < np.std(draws) / np.std(alone) < 1.4
+    everyone = bootstrap_ratios(right.astype(float), np.ones(80), groups, 7)
+    np.testing.assert_allclose(everyone, bootstrap_means(right[:, None], groups, 7)[:, 0])
+    certain = bootstrap_ratios(answered.astype(float), answered.astype(float), groups, 7)
+    assert np.percentile(certain, 2.5) < 1, "agreement is no certainty"
