@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.foreign_json import parse_json, read_json
@@ -15,6 +16,7 @@ WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
 # What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
 _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
 _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
+_CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 
 
@@ -29,7 +31,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     except RuntimeError as error:  # ~nobody
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if folder.is_dir():
-        return folder
+        return _possible(folder)
     if checkpoint.count("/") != 1 or checkpoint.startswith((".", "/", "~")):
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist")
     from huggingface_hub import snapshot_download
@@ -37,13 +39,39 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
 
     why = unreachable()
     try:
-        return Path(snapshot_download(checkpoint, allow_patterns=list(patterns), local_files_only=bool(why)))
+        folder = Path(snapshot_download(checkpoint, allow_patterns=list(patterns), local_files_only=bool(why)))
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
         raise CheckpointError(
             f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
             "models, `hf auth login`; or pass a local folder as --checkpoint"
         ) from error
+    return _possible(folder)
+
+
+def _possible(folder: Path) -> Path:
+    """The folder, if no configuration in it asks for a network beyond all sizes. Raises CheckpointError.
+
+    A configuration that is none is left to its loader, which names it.
+    """
+    for file in sorted(path for pattern in _CONFIGURATIONS for path in folder.glob(pattern)):
+        try:
+            check_sizes(_content(file), str(file))
+        except (OSError, ValueError):
+            continue
+    return folder
+
+
+def _content(file: Path) -> Any:
+    """Raises ValueError for what is no JSON or YAML."""
+    if file.suffix == ".json":
+        return parse_json(file.read_bytes())
+    import yaml
+
+    try:
+        return yaml.safe_load(file.read_bytes())
+    except yaml.YAMLError as error:
+        raise ValueError(error) from error
 
 
 def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
@@ -84,7 +112,6 @@ def check_files(
     if not isinstance(found, str) or found not in types:
         way_out = dict(instead).get(str(found), "Pass the right --model")
         raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
-    check_sizes(config, str(file))
     if weights and (lacking := missing_weights(folder)):
         raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
 

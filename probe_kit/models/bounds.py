@@ -11,6 +11,7 @@ from probe_kit.errors import CheckpointError
 MOST_STEPS = 1000
 """Flow or diffusion steps, actions of a chunk, layers: far beyond any model, and no loop without end."""
 LARGEST_SIZE = 1 << 24
+_DEEPEST = 50
 _STEPS = (
     "num_inference_steps", "num_steps", "diffusion_steps", "chunk_size", "n_action_steps", "n_obs_steps",
     "action_chunk_size", "num_hidden_layers", "num_layers", "n_layers", "depth", "num_vlm_layers",
@@ -22,14 +23,15 @@ _SIZES = (
 )  # fmt: skip
 
 
-def check_sizes(config: Mapping[str, Any], source: str, _depth: int = 0) -> None:
+def check_sizes(content: Any, source: str, _depth: int = 0) -> None:
     """Raise CheckpointError for a count in a configuration, at any depth, that is no whole number or absurd.
 
     -1 and null stand for "as the model has it".
     """
-    for name, value in config.items():
-        if isinstance(value, Mapping) and _depth < 20:
-            check_sizes(value, source, _depth + 1)
+    if _depth > _DEEPEST or not isinstance(content, Mapping | list):
+        return
+    for name, value in content.items() if isinstance(content, Mapping) else enumerate(content):
+        check_sizes(value, source, _depth + 1)
         most = MOST_STEPS if name in _STEPS else LARGEST_SIZE if name in _SIZES else None
         if most is None or value is None or isinstance(value, list | Mapping):
             continue

@@ -126,7 +126,7 @@ from probe_kit.extract import open_run
 from probe_kit.hooks.sites import Site
 run = open_run({str(recorded_run.path)!r})
 run.column(Site("backbone", 1)), run.tokens(Site("backbone", 1), "language"), run.gram(Site("backbone", 1))
-print([name for name in ("torch", "pybullet", "lerobot", "transformers", "gymnasium") if name in sys.modules])
+print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])
 """
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert loaded.stdout.strip() == "[]"

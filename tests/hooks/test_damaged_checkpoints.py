@@ -189,7 +189,6 @@ def test_statistics_that_would_change_what_actions_mean_are_refused(
         act(family, checkpoint)
 
 
-@pytest.mark.slow  # for some family it still begins to build
 def test_counts_without_bound_are_refused_before_anything_is_built(family: str, checkpoint: Path) -> None:
     def absurd(one: dict[str, Any]) -> bool:
         found = [name for name in COUNTS if type(one.get(name)) is int]
