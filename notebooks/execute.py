@@ -4,10 +4,14 @@ They run in one temporary folder, in order, so that they share what they make an
 """
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import nbformat
+from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
@@ -23,14 +27,39 @@ def notebooks() -> list[Path]:
     return sorted(FOLDER.glob("*.ipynb"))
 
 
-def executed(path: Path, folder: Path) -> NotebookNode:
+@contextmanager
+def kernel(folder: Path) -> Iterator[KernelManager]:
+    """A kernel in `folder` for several notebooks: what one imported, the next need not import again."""
+    manager = KernelManager()
+    manager.start_kernel(cwd=str(folder))
+    try:
+        yield manager
+    finally:
+        manager.shutdown_kernel(now=True)
+
+
+def _forget_names(manager: KernelManager) -> None:
+    """No notebook sees what another one called something."""
+    client = manager.client()
+    client.start_channels()
+    try:
+        client.wait_for_ready(timeout=120)
+        client.execute("%reset -f", reply=True, timeout=120)
+    finally:
+        client.stop_channels()
+
+
+def executed(path: Path, folder: Path, manager: KernelManager | None = None) -> NotebookNode:
     """The notebook with fresh outputs, run from top to bottom in `folder`.
 
-    Raises CellExecutionError where a cell raises.
+    manager: a `kernel` that is running; None for one of its own. Raises CellExecutionError where a cell raises.
     """
     notebook = nbformat.read(path, as_version=4)
     metadata = dict(notebook.metadata)
-    options = {"timeout": 600, "record_timing": False, "coalesce_streams": True}
+    options: dict[str, Any] = {"timeout": 600, "record_timing": False, "coalesce_streams": True}
+    if manager is not None:
+        _forget_names(manager)
+        options["km"] = manager
     NotebookClient(notebook, resources={"metadata": {"path": str(folder)}}, **options).execute()
     notebook.metadata = metadata
     for cell in notebook.cells:

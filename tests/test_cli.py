@@ -1,5 +1,6 @@
 """The command line as a user meets it: a process, its output, its exit code."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -10,7 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.suite import Suite
 
 # The keys of `retention --format json` are part of the contract (architecture, command line).
@@ -26,11 +29,18 @@ def probe_kit(*arguments: object, cwd: Path | None = None) -> subprocess.Complet
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=300)
 
 
+def in_process(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The same without the seconds in which a process starts; for what neither starts nor ends one."""
+    with contextlib.chdir(cwd or Path.cwd()):
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return subprocess.CompletedProcess(arguments, result.exit_code, result.stdout, result.stderr)
+
+
 def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     made = probe_kit(
         "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
-        "--categories", "color,shape", "--max-steps", 2, "--out", run,
+        "--categories", "color", "--max-steps", 2, "--out", run,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     assert "RANDOM" in made.stderr
@@ -41,17 +51,17 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     printed = probe_kit("retention", run, "--format", "json", *shown)
     assert printed.returncode == 0, printed.stderr
     rows = json.loads(printed.stdout)
-    assert {row["category"] for row in rows} == {"color", "shape", "mean"}
+    assert {row["category"] for row in rows} == {"color", "mean"}
     assert "data:image/svg+xml" in (tmp_path / "report.html").read_text()
     assert {"run-layer-curves.png", "run-final-positions.pdf"} <= {
         p.name for p in (tmp_path / "figures").iterdir()
     }
     assert all(row.keys() >= KEYS for row in rows)
     for style in ("table", "csv", "markdown", "latex"):
-        assert "random" in probe_kit("retention", run, "--format", style).stdout.lower()
+        assert "random" in in_process("retention", run, "--format", style).stdout.lower()
     again = probe_kit(
-        "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder, "--max-steps", 3,
-        "--out", run,
+        "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
+        "--categories", "color", "--max-steps", 3, "--out", run,
     )  # fmt: skip
     assert again.returncode == 3
     assert "scene.max_steps: stored 2, asked 3" in again.stderr
@@ -95,7 +105,7 @@ def test_bad_input_is_a_clear_error_with_the_contracts_exit_code(
 ) -> None:
     if arguments[0] == "extract" and "--suite" not in arguments and "--model" in arguments:
         arguments = [*arguments, "--suite", str(small_suite.folder)]
-    answer = probe_kit(*arguments, cwd=tmp_path)
+    answer = in_process(*arguments, cwd=tmp_path)
     assert answer.returncode == code, answer.stderr
     assert message in answer.stderr
     assert "Traceback" not in answer.stderr
@@ -114,7 +124,7 @@ def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_pat
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]
-    command += ["--suite", str(small_suite.folder)]
+    command += ["--suite", str(small_suite.folder), "--items", "6", "--max-steps", "20"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     while len(list(run.glob("commits/*.json"))) < 3 and time.monotonic() < deadline:
@@ -124,18 +134,15 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     assert process.returncode == 130
     assert "the same command continues" in messages
     kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert 3 <= len(kept) < 48
+    assert 3 <= len(kept) < 24
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0
     now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert len(now) == 48
+    assert len(now) == 24
     assert all(now[name] == stamp for name, stamp in kept.items())
 
 
-def test_help_is_there_in_under_a_second() -> None:
-    start = time.monotonic()
-    answer = probe_kit("--help")
-    assert time.monotonic() - start < 3  # generous for a busy machine; what matters is the next test
-    assert "demo" in answer.stdout
+def test_help_is_there() -> None:
+    assert "demo" in probe_kit("--help").stdout
 
 
 def test_importing_the_command_line_loads_nothing_heavy() -> None:
@@ -173,7 +180,7 @@ def test_the_version_is_that_of_the_package() -> None:
     ],
 )
 def test_an_option_of_another_command_says_which_one_has_it(arguments: list[str], home: str) -> None:
-    answer = probe_kit(*arguments)
+    answer = in_process(*arguments)
     assert answer.returncode == 2
     assert f"but one of `{home}`" in " ".join(answer.stderr.replace("│", " ").split())
 
@@ -181,31 +188,31 @@ def test_an_option_of_another_command_says_which_one_has_it(arguments: list[str]
 def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
     small_suite: Suite, tmp_path: Path
 ) -> None:
-    made = probe_kit(
+    made = in_process(
         "extract", "--model", "expert", "--suite", small_suite.folder, "--items", 2, "--max-steps", 1,
         "--out", tmp_path / "runs" / "mine",
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")
     for command in ("train", "retention", "export --format h5", "run verify", "models --run"):
-        answer = probe_kit(*command.split(), "runs", cwd=tmp_path)
+        answer = in_process(*command.split(), "runs", cwd=tmp_path)
         assert answer.returncode == 2, answer.stderr
         assert "It holds 2 runs: runs/mine, runs/yours" in answer.stderr, command
-    assert "Did you mean runs/mine?" in probe_kit("train", "runs/mien", cwd=tmp_path).stderr
-    assert "Make one with" in probe_kit("train", "elsewhere", cwd=tmp_path).stderr
+    assert "Did you mean runs/mine?" in in_process("train", "runs/mien", cwd=tmp_path).stderr
+    assert "Make one with" in in_process("train", "elsewhere", cwd=tmp_path).stderr
 
 
 def test_models_lists_families_and_scripted_policies_as_json() -> None:
-    rows = json.loads(probe_kit("models", "--json").stdout)
+    rows = json.loads(in_process("models", "--json").stdout)
     assert {row["model"] for row in rows} >= {"pi0-tiny", "pi0", "expert", "expert-mirrored"}
 
 
 def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
-    built = probe_kit("suite", "build", tmp_path / "suite", "--categories", "color", "--n", 4)
+    built = in_process("suite", "build", tmp_path / "suite", "--categories", "color", "--n", 4)
     assert built.returncode == 0, built.stderr
-    listed = probe_kit("suite", "list", tmp_path / "suite", "--json")
+    listed = in_process("suite", "list", tmp_path / "suite", "--json")
     assert json.loads(listed.stdout)["items"] == {"color": 4}
-    shown = probe_kit("suite", "show", tmp_path / "suite", "--out", tmp_path / "sheets")
+    shown = in_process("suite", "show", tmp_path / "suite", "--out", tmp_path / "sheets")
     assert shown.returncode == 0
     assert [Path(line).is_file() for line in shown.stdout.split()] == [True]
 

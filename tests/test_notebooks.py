@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from nbformat import NotebookNode
 
-from notebooks.execute import FOLDER, executed, notebooks
+from notebooks.execute import FOLDER, executed, kernel, notebooks
 from probe_kit.extract import open_run
 from probe_kit.retention import retention
 from probe_kit.train import load_results
@@ -32,7 +32,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Note
     folder = tmp_path_factory.mktemp("notebooks")
 
     def run(names: Sequence[str]) -> list[NotebookNode]:
-        return [executed(FOLDER / f"{name}.ipynb", folder) for name in names]
+        with kernel(folder) as manager:
+            return [executed(FOLDER / f"{name}.ipynb", folder, manager) for name in names]
 
     with ThreadPoolExecutor(2) as pool:
         fresh = [notebook for ran in pool.map(run, BESIDE_EACH_OTHER) for notebook in ran]
