@@ -85,6 +85,7 @@ def test_protocol_and_units_are_part_of_a_runs_identity(acting: Run, small_suite
             extract_run(other, Path(str(acting.location)))
 
 
+@pytest.mark.slow
 def test_it_stands_in_one_table_beside_another_family_with_its_flagged_steps(
     acting: Run, talking: Run, small_suite: Suite, tmp_path: Path
 ) -> None:

@@ -84,6 +84,7 @@ def test_other_options_are_another_run(internvla_settings: ExtractSettings, inte
         )
 
 
+@pytest.mark.slow
 def test_they_stand_in_one_table_beside_another_family(
     xiaomi: Run, internvla: Run, small_suite: Suite, tmp_path: Path
 ) -> None:

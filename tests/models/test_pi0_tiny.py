@@ -32,6 +32,7 @@ def test_the_hand_never_turns(pi0_tiny: Pi0) -> None:
     assert not pi0_tiny.action_units.low[turning].any()
 
 
+@pytest.mark.slow
 def test_color_and_shape_are_answered_far_above_chance(tmp_path: Path) -> None:
     """Sixteen episodes; the bound is three standard errors under the measured rate, and far above one half."""
     suite = build_suite(tmp_path / "suite", ["color", "shape"], 4)

@@ -51,7 +51,13 @@ def in_two_views(run: ArrayRun) -> ArrayRun:
     return run
 
 
-@pytest.fixture(params=["one category", "two categories and two models", "twelve categories and two models"])
+@pytest.fixture(
+    params=[
+        "one category",
+        "two categories and two models",
+        pytest.param("twelve categories and two models", marks=pytest.mark.slow),
+    ]
+)
 def exhibited(request: pytest.FixtureRequest, probed_run: ProbedRun) -> tuple[list[ArrayRun], RetentionTable]:
     if request.param == "one category":
         runs = [in_two_views(probed_run({"color": SIGNAL}, "pi0"))]
