@@ -55,7 +55,7 @@ def test_durations_carry_over(seconds: float, words: str) -> None:
 @pytest.mark.parametrize("terminal", [True, False])
 def test_bars_are_for_terminals_and_lines_for_logs(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.StringIO()
-    monkeypatch.setattr(console, "err", Console(file=shown, force_terminal=terminal, width=80))
+    monkeypatch.setattr(console, "err", Console(file=shown, force_terminal=terminal, width=80, markup=False))
     with console.progress() as bar:
         console.counter(bar, "drawing [items]")(3, 3)
     assert ("━" in shown.getvalue()) is terminal

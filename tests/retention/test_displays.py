@@ -208,7 +208,7 @@ def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_tab
     table = retention([placed_run(tmp_path, outcome_table)])
     with pytest.raises(UsageError, match="no rows"):
         RetentionTableDisplay.from_table(table)
-    with pytest.raises(UsageError, match="no run has probes"):
+    with pytest.raises(UsageError, match="no run that acted has probes"):
         KnowledgeActionDisplay.from_table(table)
 
 

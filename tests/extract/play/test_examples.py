@@ -1,5 +1,4 @@
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +12,11 @@ from probe_kit.hooks import Card
 CARD = Card("mine", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 1, 1)
 
 
-def test_examples_have_the_scenes_picture_size_and_its_intrinsics(small_suite: Any) -> None:
-    examples = example_observations(SceneSpec(picture_size=(320, 120)), small_suite)
+def test_examples_have_the_scenes_picture_size_and_its_intrinsics() -> None:
+    asked = ["Put the cube on the star", "Put the cube on the moon"]
+    examples = example_observations(SceneSpec(picture_size=(320, 120)), asked)
     assert {example.image.shape for example in examples} == {(120, 320, 3)}
-    assert {example.instruction for example in examples} == {item.instruction for item in small_suite.items}
+    assert [example.instruction for example in examples] == asked
 
 
 def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> None:
@@ -29,8 +29,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
     np.testing.assert_allclose(homogeneous[:2].T, expected, rtol=1e-5)
 
 
-def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Any) -> None:
-    example = example_observations(SceneSpec(), small_suite)[0]
+def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused() -> None:
+    (example,) = example_observations(SceneSpec(), ["Put the cube on the star"])
     refuse_unfit(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), 1, example)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
         refuse_unfit(replace(CARD, batch=1), 2, example)
