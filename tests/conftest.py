@@ -53,6 +53,11 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
             config.option.dist = "loadfile"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What tests the tool as a whole comes first: it is long, and no core shall end up alone with it."""
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
 @pytest.fixture(scope="session")
 def golden_pi0() -> Path:
     return _golden("pi0")
