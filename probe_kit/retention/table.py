@@ -124,9 +124,11 @@ class RetentionTable:
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
+        from probe_kit.retention.conditions import condition_tables
         from probe_kit.retention.latex import latex
 
-        return latex(self.all_rows, self.differences, self.notes, self.further_tables)
+        wordings = condition_tables([], self.wordings)
+        return latex(self.all_rows, self.differences, self.notes, [*wordings, *self.further_tables])
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""

@@ -14,6 +14,7 @@ from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention, success_rate
 from probe_kit.retention.displays import gallery
+from probe_kit.retention.report import report_html
 from probe_kit.retention.ruled import rule_sentence
 from probe_kit.statistics.bootstrap import bootstrap_means, bootstrap_ratios
 from probe_kit.suite import build_suite
@@ -59,7 +60,7 @@ def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
         share = "50.0" if rule == "box" else "0.0"
         sentence = f"a policy that does nothing would score {share} %, as the untouched cube {why}"
         assert sentence in rule_sentence(table.means[0])
-        for text in (table.to_markdown(), table.to_latex().replace(r"\%", "%")):
+        for text in (table.to_markdown(), table.to_latex().replace(r"\%", "%"), report_html([idle], table)):
             assert sentence in text
             assert f"outcome rule {rule}" in text
 

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.conditions import condition_tables
 from probe_kit.retention.success import success_rate
 from probe_kit.retention.wordings import wording_pairs
 from probe_kit.train.targets import target_labels
@@ -54,3 +55,10 @@ def test_a_pair_that_shares_no_episode_is_left_out(ladder):
     pairs = wording_pairs(apart, ("knowledge", "named", "side"), "r", "m")
     assert [(p.wording, p.other) for p in pairs] == [("named", "side")]
     assert json.dumps(pairs[0].p)
+
+
+def test_the_wordings_are_a_table_wherever_plain_tables_are(ladder):
+    pairs = wording_pairs(ladder, ("knowledge", "side"), "r", "m")
+    (table,) = condition_tables([], pairs)
+    assert table.cells[0][0] == "color"
+    assert "0 / 6" in table.cells[0]  # what one wording alone got right, and the other

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.conditions import condition_tables, rule_sentences
 from probe_kit.retention.displays.gallery import Exhibit, gallery, run_names
 from probe_kit.retention.heat import heat_key
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
@@ -86,6 +87,8 @@ def report_html(
         more_behaviour=more_behaviour_table(rows),
         retention=retention_table(rows),
         controls=control_table(rows),
+        rules=rule_sentences(rows),
+        conditions=plain_tables(condition_tables(rows, table.wordings)),
         differences=[*difference_tables(table.differences), *plain_tables(table.further_tables)],
         pictures={
             subject: _pictures(exhibits, subject, names) for subject in ("behaviour", "probes", "retention")
