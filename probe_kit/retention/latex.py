@@ -25,11 +25,11 @@ from probe_kit.retention.cells import (
     rule_name,
     title,
 )
+from probe_kit.retention.conditions import rule_sentences
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.heat import HEAT
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
-from probe_kit.retention.ruled import rule_sentence
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
@@ -64,8 +64,7 @@ def latex(
         cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
         parts.append(_plain_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
     parts += [_plain_table(f"{own.title} ({own.note})", own.columns, own.cells) for own in further]
-    sentences = dict.fromkeys(rule_sentence(row) for row in rows if row.category == MEAN and not is_asked(row))
-    return "\n".join([*parts, *(f"% {note}" for note in (*sentences, *notes))])
+    return "\n".join([*parts, *(f"% {note}" for note in (*rule_sentences(rows), *notes))])
 
 
 def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -32,10 +32,10 @@ from probe_kit.retention.cells import (
     with_limits,
     wording_title,
 )
+from probe_kit.retention.conditions import rule_sentences
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.plain_tables import PlainTable, is_asked
-from probe_kit.retention.rows import MEAN, RetentionRow
-from probe_kit.retention.ruled import rule_sentence
+from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.wordings import WordingPair
 
 
@@ -95,8 +95,7 @@ def markdown(
     if any(row.sr_idle is not None for row in rows):
         columns = [*SUCCESS_COLUMNS[:3], *((f"{name} %", cell) for name, cell in RULE_COLUMNS)]
         parts.append(_rows_table(f"What the {rule_name(rows)} makes of it", behaviour, columns))
-    acted = [row for row in behaviour if row.category == MEAN and not is_asked(row)]
-    parts += [f"> {sentence}\n" for sentence in dict.fromkeys(map(rule_sentence, acted))]
+    parts += [f"> {sentence}\n" for sentence in rule_sentences(behaviour)]
     if probed(rows):
         parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
     if controlled(rows):
