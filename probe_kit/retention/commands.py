@@ -111,11 +111,12 @@ def retention(
     if figures is not None:
         _save_figures(shown, table, figures)
     if html is not None:
+        from probe_kit.extract.store.disk import in_units
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):
             written = write_report(shown, html, table)
-        say(f"report: {written}")
+        say(f"report: {written} ({in_units(written.stat().st_size)})")
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +15,10 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.thumbnails import write_thumbnail
+from probe_kit.extract.store.thumbnails import read_thumbnail, write_thumbnail
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.report import report_html, write_report
-from probe_kit.retention.report.episodes import episode_grid
+from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.provenance import citation
 from probe_kit.retention.report.readings import summarise
@@ -34,7 +35,7 @@ def plain_run(folder: Path, episodes: pd.DataFrame, model: str = "pi0") -> Array
 
 
 def cards(page: str) -> list[dict[str, Any]]:
-    found = re.search(r'<script type="application/json" id="cards">(.*?)</script>', page, re.DOTALL)
+    found = re.search(r'<script type="application/json" id="cards"[^>]*>(.*?)</script>', page, re.DOTALL)
     assert found
     listed: list[dict[str, Any]] = json.loads(found[1])
     return listed
@@ -188,8 +189,8 @@ def test_the_glossary_has_a_sentence_for_every_word() -> None:
 
 def framed_run(folder: Path, episodes: pd.DataFrame) -> ArrayRun:
     run = plain_run(folder, episodes)
-    frame = np.full((12, 16, 3), 200, np.uint8)
     for number in range(len(episodes)):
+        frame = np.full((12, 16, 3), 3 * number, np.uint8)
         write_thumbnail(folder, number, (frame, frame))
     return run
 
@@ -198,7 +199,8 @@ def test_all_episodes_have_their_pictures_up_to_the_limit(tmp_path: Path, outcom
     run = framed_run(tmp_path, outcome_table(6, 4, 2))
     grid = episode_grid([run], ["run"], pictures=12)
     assert len(grid.cards) == 12
-    assert all(card["picture"] for card in grid.cards)
+    assert [card["picture"] for card in grid.cards] == list(range(12))
+    assert len(grid.pictures[0]) == 12
     assert grid.note == ""
 
 
@@ -207,10 +209,36 @@ def test_above_the_limit_whole_items_keep_their_pictures_and_the_page_says_so(
 ) -> None:
     run = framed_run(tmp_path, outcome_table(6, 4, 2))
     grid = episode_grid([run], ["run"], pictures=5)
-    kept = [card["id"].split(":")[0] for card in grid.cards if card["picture"]]
+    kept = [card["id"].split(":")[0] for card in grid.cards if card["picture"] is not None]
     assert kept == ["color-0", "color-0", "color-3", "color-3"]
     assert len(grid.cards) == 12
     assert grid.note.startswith("Pictures of 4 of 12 episodes")
+
+
+def test_pictures_of_all_episodes_together_are_bounded_in_bytes(tmp_path: Path, outcome_table: Any) -> None:
+    run = framed_run(tmp_path, outcome_table(6, 4, 2))
+    sizes = [len(read_thumbnail(tmp_path, number) or b"") for number in range(12)]
+    most = sum(sizes[:5])
+    grid = episode_grid([run], ["run"], picture_bytes=most)
+    pictures = [b64decode(picture) for block in grid.pictures for picture in block]
+    assert [card["picture"] is not None for card in grid.cards[:8]] == [True, True, *[False] * 4, True, True]
+    assert [len(picture) for picture in pictures] == [sizes[0], sizes[1], sizes[6], sizes[7]]
+    assert f"{most / 1e6:.0f} MB" in grid.note
+    alone = episode_grid([run], ["run"], picture_bytes=1)
+    assert sum(card["picture"] is not None for card in alone.cards) == 2, "one question is always shown"
+
+
+def test_the_page_holds_pictures_in_blocks_that_cards_point_to(tmp_path: Path, outcome_table: Any) -> None:
+    run = framed_run(tmp_path, outcome_table(BLOCK, 4, 2))
+    page = report_html([run])
+    found = re.findall(r'<script type="application/json" class="pictures">(.*?)</script>', page, re.DOTALL)
+    blocks = [json.loads(block) for block in found]
+    assert [len(block) for block in blocks] == [BLOCK, 6]
+    assert f'data-block="{BLOCK}"' in page
+    for card in cards(page):
+        block, place = divmod(card["picture"], BLOCK)
+        number = int(run.episodes.index[run.episodes["episode_id"] == card["id"]][0])
+        assert b64decode(blocks[block][place]) == read_thumbnail(tmp_path, number)
 
 
 def test_runs_without_frames_say_so(tmp_path: Path, outcome_table: Any) -> None:

@@ -1,6 +1,7 @@
 """Success rates by outcome rules: what each of them makes of the same episodes."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.env.rules import RULES
+from probe_kit.env.trajectory import Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+from probe_kit.extract.store.trajectories import Trajectories
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention, success_rate
 from probe_kit.retention.displays import gallery
 from probe_kit.retention.report import report_html
@@ -91,6 +94,21 @@ def test_a_run_by_another_rule_leaves_the_run_as_it_was(idle: Run) -> None:
     assert idle.under("disc") is idle
     assert not judged.episodes["never_moved"].any()
     assert idle.episodes["never_moved"].all()
+
+
+def test_a_table_with_its_report_reads_every_trajectory_once(idle: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, read = open_run(idle.path), Counter[int]()
+    at = Trajectories.__getitem__
+
+    def counted(trajectories: Trajectories, position: int) -> Trajectory:
+        read[position] += 1
+        return at(trajectories, position)
+
+    monkeypatch.setattr(Trajectories, "__getitem__", counted)
+    table = retention([run], rule="box")
+    report_html([run], table)
+    OutcomeRulesDisplay.from_runs([run])
+    assert read == dict.fromkeys(range(4), 1)
 
 
 def test_every_rule_agrees_with_what_was_stored_where_it_is_the_same(recorded_run: Run) -> None:

@@ -1,13 +1,13 @@
 """The episodes of a run judged by an outcome rule, and what was done in them: tables made from trajectories."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import pandas as pd
 
 from probe_kit.env.behaviour import behaviour_of
-from probe_kit.env.rules import judge, rule_of
+from probe_kit.env.rules import RULES, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.env.trajectory import Trajectory
 from probe_kit.suite.items import Side, other_side
@@ -42,12 +42,26 @@ def with_outcomes(episodes: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFram
     )
 
 
-def behaviour_table(
-    trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any]
-) -> pd.DataFrame:
-    """A row per episode with the fields of `Behaviour`."""
+@dataclass(frozen=True)
+class Watched:
+    """What trajectories say of every episode: `Judgement` by rule, at the last step, and `Behaviour`."""
+
+    verdicts: Mapping[str, pd.DataFrame]
+    behaviour: pd.DataFrame
+
+
+def watch(trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any]) -> Watched:
+    """All of it in one reading of the trajectories, which takes longer than every judgement of them.
+
+    scene: `SceneSpec.to_json()`.
+    """
     default = SceneSpec()
-    side = scene.get("scoring_side", default.scoring_side)
-    half = side / 2 + scene.get("box_margin", default.box_margin)
-    rows = [behaviour_of(seen, own, half, scene["moved"]) for seen, own in zip(trajectories, sides, strict=True)]
-    return pd.DataFrame([asdict(row) for row in rows])
+    half = scene.get("scoring_side", default.scoring_side) / 2 + scene.get("box_margin", default.box_margin)
+    rules = {name: rule_of(name, scene) for name in RULES}
+    verdicts: dict[str, list[dict[str, Any]]] = {name: [] for name in rules}
+    acts: list[dict[str, Any]] = []
+    for seen, side in zip(trajectories, sides, strict=True):
+        for name, rule in rules.items():
+            verdicts[name].append(asdict(judge(seen, rule, side, 1, scene["max_steps"])))
+        acts.append(asdict(behaviour_of(seen, side, half, scene["moved"])))
+    return Watched({name: pd.DataFrame(rows) for name, rows in verdicts.items()}, pd.DataFrame(acts))

@@ -33,7 +33,7 @@ from probe_kit.extract.store.commits import (
     stamp_of,
 )
 from probe_kit.extract.store.hashes import Sum
-from probe_kit.extract.store.judging import behaviour_table, judged, with_outcomes
+from probe_kit.extract.store.judging import Watched, judged, watch, with_outcomes
 from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
@@ -292,6 +292,8 @@ class Run:
         rule: a name of `probe_kit.env.rules.RULES`. last_steps: control steps at the end that count; the released
         evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
+        if last_steps == 1:
+            return self._watched.verdicts[check_rule(rule)].copy()
         return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
 
     def under(self, rule: str, last_steps: int = 1) -> "Run":
@@ -309,8 +311,12 @@ class Run:
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """
-        table = behaviour_table(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
+        table = self._watched.behaviour
         return table.assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
+
+    @cached_property
+    def _watched(self) -> Watched:
+        return watch(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
         """The instruction of one episode as the policy was delivered it; None where nothing was stored."""

@@ -10,34 +10,69 @@ from probe_kit.train.reader import RunReader
 
 PICTURES = 4000
 """Episodes a report shows with pictures, over all runs; one full suite of 3,440 makes about 10 MB of them."""
+PICTURE_BYTES = 16_000_000
+"""Of all pictures of a report together, as WebP; in the page they take a third more."""
+BLOCK = 48
+"""Pictures that the page decodes at a time, when the first of them is looked at."""
 
 
 @dataclass(frozen=True)
 class EpisodeGrid:
-    """cards: one per episode. note: what was left out and why, empty if nothing."""
+    """cards: one per episode; `picture` is its place among the pictures, None if it has none.
+
+    pictures: base64 of the WebPs, in blocks of `BLOCK`. note: what was left out and why, empty if nothing.
+    """
 
     cards: tuple[dict[str, Any], ...]
+    pictures: tuple[tuple[str, ...], ...]
     note: str
+    block: int = BLOCK
 
 
-def episode_grid(runs: Sequence[RunReader], names: Sequence[str], pictures: int = PICTURES) -> EpisodeGrid:
-    """All episodes of all runs; with more than `pictures` of them, only every k-th item keeps its pictures.
+@dataclass(frozen=True)
+class _Listed:
+    """An episode, its item's place among the items of its run, and its picture."""
+
+    card: dict[str, Any]
+    rank: int
+    picture: bytes | None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Which episode of all runs it is."""
+        return self.card["run"], self.card["id"]
+
+
+def episode_grid(
+    runs: Sequence[RunReader],
+    names: Sequence[str],
+    pictures: int = PICTURES,
+    picture_bytes: int = PICTURE_BYTES,
+) -> EpisodeGrid:
+    """All episodes of all runs; with more pictures than that, only every k-th item keeps its own.
 
     Both layouts of an item keep theirs or neither, so that they can be compared.
     """
     total = sum(len(run.episodes) for run in runs)
     stride = max(1, -(-total // pictures))
-    cards = tuple(card for name, run in zip(names, runs, strict=True) for card in _cards(name, run, stride))
-    return EpisodeGrid(cards, _note(cards, total, stride, pictures))
+    listed = [one for name, run in zip(names, runs, strict=True) for one in _listed(name, run, stride)]
+    stride = _fitting(listed, stride, picture_bytes)
+    kept = _with_pictures(listed, stride)
+    places = {one.key: place for place, one in enumerate(kept)}
+    cards = tuple({**one.card, "picture": places.get(one.key)} for one in listed)
+    encoded = [b64encode(one.picture).decode() for one in kept if one.picture is not None]
+    blocks = tuple(tuple(encoded[start : start + BLOCK]) for start in range(0, len(encoded), BLOCK))
+    return EpisodeGrid(cards, blocks, _note(len(kept), total, stride, pictures, picture_bytes))
 
 
-def _cards(name: str, run: RunReader, stride: int) -> Iterator[dict[str, Any]]:
+def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
     episodes = run.episodes
     ranks = {item: rank for rank, item in enumerate(dict.fromkeys(episodes["item_id"]))}
     for position, row in enumerate(episodes.to_dict("records")):
-        shown = ranks[row["item_id"]] % stride == 0
-        picture = _picture(run, int(row.get("episode", position))) if shown else None
-        yield {
+        rank = ranks[row["item_id"]]
+        number = int(row.get("episode", position))
+        picture = read_thumbnail(run.location, number) if rank % stride == 0 else None
+        card = {
             "run": name,
             "id": row["episode_id"],
             "category": row["category"],
@@ -48,25 +83,32 @@ def _cards(name: str, run: RunReader, stride: int) -> Iterator[dict[str, Any]]:
             "answer": row.get("target_concept") or "",
             "other": row.get("distractor_concept") or "",
             "unmoved": bool(row.get("never_moved", False)),
-            "picture": picture,
         }
+        yield _Listed(card, rank, picture)
 
 
-def _picture(run: RunReader, number: int) -> str | None:
-    """Base64 of the WebP, or None if the run keeps none."""
-    encoded = read_thumbnail(run.location, number)
-    return None if encoded is None else b64encode(encoded).decode()
+def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:
+    return [one for one in listed if one.picture is not None and one.rank % stride == 0]
 
 
-def _note(cards: Sequence[dict[str, Any]], total: int, stride: int, pictures: int) -> str:
-    kept = sum(card["picture"] is not None for card in cards)
+def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
+    """The smallest multiple of `step` that keeps at most so many bytes of pictures, or no more than one item's."""
+    last = max((one.rank for one in listed), default=0) + step
+    for stride in range(step, last, step):
+        if sum(len(one.picture or b"") for one in _with_pictures(listed, stride)) <= most:
+            return stride
+    return last
+
+
+def _note(kept: int, total: int, stride: int, pictures: int, picture_bytes: int) -> str:
     if kept == total:
         return ""
     if kept == 0:
         return "The runs keep no frames. By default probe-kit extract stores two of every episode."
     if stride > 1:
         return (
-            f"Pictures of {kept} of {total} episodes: above {pictures} a report keeps those of every "
-            f"{stride}th question, in both layouts, to stay small. The others are listed without."
+            f"Pictures of {kept} of {total} episodes: above {pictures}, or {picture_bytes / 1e6:.0f} MB of them, "
+            f"a report keeps those of every {stride}th question, in both layouts, to stay small. The others are "
+            "listed without."
         )
     return f"Pictures of {kept} of {total} episodes; the others were played without storing frames."

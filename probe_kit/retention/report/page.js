@@ -28,7 +28,11 @@
   // -- episodes: a page of cards at a time, made when they are wanted --------------------------------------------
   const PAGE = 48;
   const OUTCOMES = { correct: "✓ correct", wrong: "✗ wrong picture", oob: "○ on neither" };
-  const cards = JSON.parse(document.getElementById("cards").textContent);
+  const source = document.getElementById("cards");
+  const cards = JSON.parse(source.textContent);
+  const block = Number(source.dataset.block);
+  const blocks = document.querySelectorAll("script.pictures");
+  const parsed = new Map();
   const form = document.getElementById("filters");
   const grid = document.getElementById("grid");
   const more = document.getElementById("more");
@@ -40,12 +44,19 @@
     return made;
   }
 
+  function picture(place) {
+    const at = Math.floor(place / block);
+    if (!parsed.has(at)) parsed.set(at, JSON.parse(blocks[at].textContent));
+    return parsed.get(at)[place % block];
+  }
+
   function draw(card) {
     const frames = element("div", { className: "frames" });
-    if (card.picture) {
+    const shown = card.picture !== null;
+    if (shown) {
       const alt = `first and last frame: ${card.instruction}`;
       frames.append(
-        element("img", { alt, src: `data:image/webp;base64,${card.picture}`, loading: "lazy", decoding: "async" }),
+        element("img", { alt, src: `data:image/webp;base64,${picture(card.picture)}`, loading: "lazy", decoding: "async" }),
         element("i", { textContent: "first" }), element("i", { textContent: "last" }));
     }
     const outcome = OUTCOMES[card.outcome] + (card.unmoved ? ", cube never moved" : "");
@@ -56,7 +67,7 @@
       element("span", { className: "outcome", textContent: outcome }),
       element("br", {}),
       element("small", { textContent: `${answer} · ${where}`, title: `${card.run} ${card.id}` }));
-    const made = element("article", { className: `card ${card.outcome}` }, ...(card.picture ? [frames] : []), text);
+    const made = element("article", { className: `card ${card.outcome}` }, ...(shown ? [frames] : []), text);
     made.dataset.id = card.id;
     return made;
   }
