@@ -5,7 +5,7 @@
     results = pk.train_probes(run)
     print(pk.retention_table([run]).to_markdown())
 
-Data flows one way: suite → env → hooks → extract → train → retention.
+Data flows one way: suite → env → hooks → extract → train → intervene → retention.
 """
 
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from probe_kit.errors import ProbeKitError
     from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
+    from probe_kit.intervene import Follow, Source, intervene_on, load_effects
     from probe_kit.retention import retention as retention_table
     from probe_kit.retention.displays import (
         FinalPositionsDisplay,
@@ -35,6 +36,7 @@ __all__ = [
     "Act2AnswerEnv",
     "ExtractSettings",
     "FinalPositionsDisplay",
+    "Follow",
     "IterationMapDisplay",
     "KnowledgeActionDisplay",
     "LayerCurveDisplay",
@@ -43,12 +45,15 @@ __all__ = [
     "Run",
     "SceneSpec",
     "Site",
+    "Source",
     "Suite",
     "build_suite",
     "capture",
     "default_suite",
     "extract_run",
+    "intervene_on",
     "layer_curve",
+    "load_effects",
     "load_policy",
     "load_results",
     "load_suite",
@@ -65,6 +70,7 @@ __getattr__ = lazy_names(
         "Act2AnswerEnv": "env",
         "ExtractSettings": "extract",
         "FinalPositionsDisplay": "retention.displays",
+        "Follow": "intervene",
         "IterationMapDisplay": "retention.displays",
         "KnowledgeActionDisplay": "retention.displays",
         "LayerCurveDisplay": "retention.displays",
@@ -73,12 +79,15 @@ __getattr__ = lazy_names(
         "Run": "extract",
         "SceneSpec": "env",
         "Site": "hooks",
+        "Source": "intervene",
         "Suite": "suite",
         "build_suite": "suite",
         "capture": "hooks",
         "default_suite": "suite",
         "extract_run": "extract",
+        "intervene_on": "intervene",
         "layer_curve": "retention.displays",
+        "load_effects": "intervene",
         "load_policy": "hooks",
         "load_results": "train",
         "load_suite": "suite",

@@ -23,6 +23,7 @@ from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
+from probe_kit.intervene.commands import intervene
 from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
 from probe_kit.retention.join_commands import join
@@ -31,8 +32,8 @@ from probe_kit.train.commands import show, train
 from probe_kit.train.power_commands import power
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "retention", "join", "export",
-    "verify",
+    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "intervene", "retention",
+    "join", "export", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -134,7 +135,21 @@ def _before_commands(
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 run_app.command()(show)
-for command in (extract, ask, export, demo, models, verify, new_adapter, train, power, retention, join, doctor):
+for command in (
+    extract,
+    ask,
+    export,
+    demo,
+    models,
+    verify,
+    new_adapter,
+    train,
+    power,
+    intervene,
+    retention,
+    join,
+    doctor,
+):
     app.command()(command)
 
 

@@ -41,6 +41,10 @@ class NoProbesError(UsageError):
     """The run has activations but no probe results yet, or no activations at all."""
 
 
+class NoInterventionsError(UsageError):
+    """Nothing of this kind was changed in the run's policy yet, or only in other episodes than it has now."""
+
+
 class NoTrajectoryError(UsageError):
     """The run keeps no trajectories, because it was made before they were stored."""
 

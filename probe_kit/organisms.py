@@ -8,11 +8,12 @@ its backbone and never trained into an action (*encoded, unused*); nothing was t
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, cast
 
 from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.intervene import Follow, Source, Verdict, intervene_on
 from probe_kit.retention import RetentionRow, retention
-from probe_kit.retention.cells import beats, bounded_value, margin_value, number, percent
+from probe_kit.retention.cells import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
 from probe_kit.retention.success import Regime
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -20,7 +21,6 @@ from probe_kit.train import ProbeResults, train_probes
 if TYPE_CHECKING:
     from probe_kit.fitting_tables import Cell, FittingTable
 
-Verdict = Literal["used", "encoded, unused", "absent", "acted on, not found"]
 NamedProgress = Callable[[str], Callable[..., None]]
 
 
@@ -68,10 +68,13 @@ class Finding:
 def verdict(row: RetentionRow) -> Verdict:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
-    In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the SR is
-    in the regime of knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument
-    missed what the policy plainly reads.
+    In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the action
+    follows the pictures when these are exchanged; without a stored intervention, the SR is in the regime of
+    knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument missed what the
+    policy plainly reads.
     """
+    if row.used is not None:
+        return cast("Verdict", row.used)
     if row.regime == Regime.KNOWLEDGE:
         return "used" if row.prefix_signal else "acted on, not found"
     return "encoded, unused" if row.prefix_signal else "absent"
@@ -85,9 +88,10 @@ def probed(
     stage: NamedProgress,
     twin: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
-    """The organism's run on `suite`, in `folder`, and its probes, held against binding; finished work is reused.
+    """The organism's run on `suite`, in `folder`, and its probes, held against binding.
 
-    stage: gives a progress callback (done, total, …) for a stage of this name. twin: a run to hold it against too.
+    What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
+    total, …) for a stage of this name. twin: a run to hold it against too.
     """
     settings = ExtractSettings(
         organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
@@ -97,6 +101,7 @@ def probed(
     results = train_probes(
         run, permutations=permutations, controls=("binding",), suite=suite.folder, twin=twin, progress=progress
     )
+    intervene_on(run, Follow(), Source(suite.folder), progress=stage(f"exchanging pictures, {organism.name}"))
     return run, results
 
 
@@ -133,7 +138,7 @@ def to_rich(findings: Sequence[Finding]) -> "FittingTable":
             ),
             Part(
                 "What they rest on",
-                ("SR %", "± Δ", "backbone", "p", "beats", "action", "retention [95 %]"),
+                ("SR %", "± Δ", "follows / against", "backbone", "p", "beats", "action", "retention [95 %]"),
                 tuple(map(_number_cells, findings)),
             ),
         ),
@@ -152,7 +157,8 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.sr), margin_value(row), percent(row.prefix_accuracy), number(row.prefix_p_fwe, 3),
+        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.prefix_accuracy),
+        number(row.prefix_p_fwe, 3),
         beats(row), percent(row.action_accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

@@ -51,7 +51,7 @@ class Stored:
                 parts = path.relative_to(home).parts
                 array = "/".join(parts[1:3]) if parts[0] in ("data.zarr", "columns.zarr") else ""
                 metadata = path.name if path.name == "zarr.json" else ""
-                probes = path.name if parts[0] == "probes" else ""
+                probes = path.name if parts[0] in ("probes", "interventions") else ""
                 kinds.setdefault(f"{parts[0]} {metadata or array} {probes}", []).append(path)
         return kinds
 

@@ -14,6 +14,11 @@ from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.identity import derive_seed
+from probe_kit.intervene import Answers, Follow
+from probe_kit.intervene.effects import effects_csv
+from probe_kit.intervene.following import following
+from probe_kit.intervene.settings import key_of, settings_of
+from probe_kit.intervene.stored import save
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 
@@ -86,6 +91,31 @@ def write_little_run(
         writer.write(episode(plan, number, seed))
     seal(where)
     return open_run(where)
+
+
+def intervene_on_little_run(run: Run) -> None:
+    """A stored intervention on its episodes, with answers drawn instead of inferred."""
+    settings, episodes = settings_of(Follow(), run), run.episodes
+    draw = np.random.default_rng(derive_seed("little", run.settings_sha256))
+    names = {"episodes": "episode_id", "items": "item_id", "groups": "group_id", "categories": "category"}
+    lateral = draw.normal(size=(2, len(episodes)))
+    answers = Answers(
+        conditions=("plain", "exchanged"),
+        **{own: episodes[name].to_numpy(dtype=str) for own, name in names.items()},
+        sides=episodes["side_correct"].to_numpy(dtype=str),
+        lateral=lateral,
+        changed=np.abs(lateral - lateral[0]),
+        ledger=np.zeros((*lateral.shape, 5)),
+        apart=np.zeros(len(episodes)),
+    )
+    rows = following(answers, run.suite)
+    check = {
+        "episodes": len(episodes),
+        "compared": len(episodes),
+        "equal": len(episodes),
+        "largest_difference": 0.0,
+    }
+    save(run.location, settings, key_of(settings), answers, effects_csv(rows), {"replay": check})
 
 
 def probe_little_run(run: Run) -> None:

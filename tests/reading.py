@@ -11,6 +11,7 @@ import numpy as np
 
 from probe_kit.extract import open_run
 from probe_kit.extract.store.run import NotSealedWarning, Run
+from probe_kit.intervene import load_effects, stored_interventions
 from probe_kit.train import load_results
 from probe_kit.train.inventory import inventory
 
@@ -25,7 +26,7 @@ def readings(where: Path | str, first: str = "", allow_partial: bool = False) ->
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotSealedWarning)  # said aloud, and the numbers are the same
         run = open_run(where, allow_partial)
-        questions = _of_run(run) | _of_probes(run)
+        questions = _of_run(run) | _of_probes(run) | _of_interventions(run)
         return {name: _hash(questions[name]()) for name in sorted(questions, key=lambda name: first not in name)}
 
 
@@ -57,6 +58,13 @@ def _of_probes(run: Run) -> Readings:
     for key in (None, *(one.key for one in inventory(run).probes)):
         asked[f"probes {key}"] = partial(_results, run, key)
     return asked
+
+
+def _of_interventions(run: Run) -> Readings:
+    def effects() -> Any:
+        return [load_effects(run, one.key).to_json() for one in stored_interventions(run)]
+
+    return {"interventions": effects}
 
 
 def _results(run: Run, key: str | None) -> Any:

@@ -18,6 +18,7 @@ from probe_kit.extract.store.layout import ILLUSTRATIONS
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.strays import known_keys
+from probe_kit.intervene import stored_following
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
@@ -428,6 +429,45 @@ def stop_after(run: Run, permutations: int, sites: int) -> None:
 
     with pytest.raises(EnoughError):
         train_probes(run, permutations=permutations, progress=stop)
+
+
+# -- interventions -----------------------------------------------------------------------------------------
+
+
+def stored_intervention(run: Path) -> Path:
+    (folder,) = (run / "interventions").iterdir()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda head: head.update(created="2999-01-01T00:00:00+00:00"),
+        lambda head: head["settings"].update(stamp="0" * 64),
+        lambda head: head["files"].pop("certificate.json"),
+        lambda head: head.pop("blake2b"),
+    ],
+    ids=["made in the future", "of other episodes", "a file less", "no hash"],
+)
+def test_changed_settings_of_interventions_are_found(run: Path, change: Edit) -> None:
+    edit(stored_intervention(run) / "settings.json", change)
+    assert_found(run, "settings.json")
+    with pytest.raises(RunDamagedError, match="probe-kit intervene"):
+        stored_following(open_run(run))
+
+
+def test_changed_or_lost_answers_are_found(run: Path, other: Path) -> None:
+    path = stored_intervention(run) / "episodes.npz"
+    shutil.copy(stored_intervention(other) / "episodes.npz", path)
+    assert_found(run, "episodes.npz", deep=True)
+    path.unlink()
+    assert_found(run, "episodes.npz is missing")
+
+
+def test_interventions_of_another_run_are_found(run: Path, other: Path) -> None:
+    shutil.rmtree(run / "interventions")
+    shutil.copytree(other / "interventions", run / "interventions")
+    assert_found(run, "interventions/")
 
 
 # -- nothing -----------------------------------------------------------------------------------------------

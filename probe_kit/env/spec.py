@@ -258,6 +258,27 @@ class SceneSpec:
                 del plain[name]
         return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], files: Mapping[str, Path] = MappingProxyType({})) -> Self:
+        """The record that `to_json` wrote, as a run stores it.
+
+        files: by field, where the files lie that it names by their hash. Raises SceneError if one is not given or
+        holds something else, and for a field of another version.
+        """
+        parts = {"camera": CameraSpec, "light": LightSpec, "physics": PhysicsSpec, "limits": LimitSpec}
+        unknown = sorted(set(values) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise SceneError(
+                f"a stored scene has the field {unknown[0]!r}, which this version does not know; read it with the "
+                "version that wrote it"
+            )
+        given: dict[str, Any] = {name: _as_tuple(value) for name, value in values.items()}
+        for name in ("arm_urdf", "background"):
+            if given.get(name) is not None:
+                given[name] = _file_of(name, str(given[name]), files)
+        given |= {name: part(**_as_tuples(values[name])) for name, part in parts.items() if name in values}
+        return cls(**given)
+
     def _check_values(self) -> None:
         positive = {
             "tile_side": self.tile_side,
@@ -325,6 +346,25 @@ _LATER = (
     "box_margin",
     "box_height",
 )
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+
+
+def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _as_tuple(value) for name, value in values.items()}
+
+
+def _file_of(name: str, wanted: str, files: Mapping[str, Path]) -> Path:
+    """The file that a stored scene names by its hash."""
+    if name not in files:
+        raise SceneError(f"the scene was made with a file as {name}, {wanted[:19]}…; give that file again")
+    if (found := _content_sha256(files[name])) != wanted:
+        raise SceneError(
+            f"{files[name]} is {found[:19]}…; the scene was made with {wanted[:19]}… as {name}. Give that file"
+        )
+    return files[name]
 
 
 def _content_sha256(path: Path) -> str:

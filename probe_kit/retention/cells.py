@@ -68,6 +68,21 @@ RULE_COLUMNS: list[Column] = [
 """What stands beside a success rate, because an outcome rule may give it away; in percent."""
 
 
+FOLLOWED_COLUMNS: list[Column] = [
+    (
+        "follows / against",
+        lambda row: "–" if row.follows is None else f"{percent(row.follows)} / {percent(row.against)}",
+    ),
+    ("used", lambda row: row.used or "–"),
+]
+"""What stored interventions say beside a success rate; shares in percent."""
+
+
+def followed(rows: Sequence[RetentionRow]) -> bool:
+    """Whether any row was intervened on."""
+    return any(row.follows is not None for row in rows)
+
+
 def rule_name(rows: Sequence[RetentionRow]) -> str:
     """The outcome rule of a table, as its title names it."""
     return f"outcome rule {', '.join(dict.fromkeys(row.rule for row in rows))}"

@@ -10,6 +10,7 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_PARTS,
     DIFFERENCE_COLUMNS,
+    FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
     RULE_COLUMNS,
     WORDING_COLUMNS,
@@ -174,6 +175,7 @@ _SUCCESS: dict[str, Sequence[Column]] = {
         ("paper's Δ", paper_margin),
         ("regime", _regime),
         ("left / right", _sides),
+        *FOLLOWED_COLUMNS,
     ],
     "Where the cube ended": [
         ("wrong", lambda row: percent(row.p_wrong)),

@@ -7,6 +7,7 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
     NOT_ACTED,
     action_place,
@@ -15,6 +16,7 @@ from probe_kit.retention.cells import (
     controlled,
     difference_title,
     first_iteration,
+    followed,
     margin_value,
     model_name,
     paper_margin,
@@ -92,11 +94,14 @@ def _coloured(cell: str) -> str:
 def _retention_table(rows: Sequence[RetentionRow]) -> str:
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
     body: list[str] = []
+    columns = _columns(rows)
     asked = any(is_asked(row) for row in rows)
     for place, row in enumerate(rows):
         if place and is_asked(rows[place - 1]) and not is_asked(row):
             body += [r"\midrule"]
-        body += [r"\midrule"] * (row.category == MEAN) + [_line(row)] + [r"\midrule"] * (row.category == MEAN)
+        body += (
+            [r"\midrule"] * (row.category == MEAN) + [_line(row, columns)] + [r"\midrule"] * (row.category == MEAN)
+        )
     what = "SR / accuracy and retention" if asked else "Success rate and retention"
     return "\n".join(
         [
@@ -104,9 +109,9 @@ def _retention_table(rows: Sequence[RetentionRow]) -> str:
             *colours,
             r"\begin{table}",
             rf"\caption{{{escape(title(f'{what} ({rule_name(rows)})', rows))}}}",
-            rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in _COLUMNS)}}}",
+            rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in columns)}}}",
             r"\toprule",
-            " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in _COLUMNS)
+            " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in columns)
             + r" \\",
             r"\midrule",
             *body[:-1],
@@ -123,7 +128,8 @@ def escape(text: str) -> str:
     return "".join(_SPECIAL.get(character, character) for character in text)
 
 
-_COLUMNS: list[tuple[str, Callable[[RetentionRow], str], str]] = [
+_Columns = list[tuple[str, Callable[[RetentionRow], str], str]]
+_COLUMNS: _Columns = [
     ("Model", model_name, "l"),
     ("View", lambda row: row.view or "–", "l"),
     ("Call", call_value, "r"),
@@ -144,8 +150,17 @@ _COLUMNS: list[tuple[str, Callable[[RetentionRow], str], str]] = [
 """Heading in LaTeX, content as text, alignment."""
 
 
-def _line(row: RetentionRow) -> str:
-    cells = [_coloured_retention(cell, row) for _, cell, _ in _COLUMNS]
+def _columns(rows: Sequence[RetentionRow]) -> _Columns:
+    """Behind the SR, what interventions say, if any row was intervened on."""
+    if not followed(rows):
+        return _COLUMNS
+    place = next(number for number, (heading, _, _) in enumerate(_COLUMNS) if heading == "SR") + 1
+    more: _Columns = [(escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
+    return [*_COLUMNS[:place], *more, *_COLUMNS[place:]]
+
+
+def _line(row: RetentionRow, columns: _Columns) -> str:
+    cells = [_coloured_retention(cell, row) for _, cell, _ in columns]
     return " & ".join(cells) + r" \\"
 
 

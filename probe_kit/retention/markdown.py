@@ -7,6 +7,7 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
     RULE_COLUMNS,
     WORDING_COLUMNS,
@@ -17,6 +18,7 @@ from probe_kit.retention.cells import (
     controlled,
     difference_title,
     first_iteration,
+    followed,
     margin_value,
     model_name,
     number,
@@ -90,6 +92,7 @@ def markdown(
     """Success rates and, where there are any, retention, controls, differences, wordings, more and notes."""
     asked, behaviour = any(is_asked(row) for row in rows), once_per_category(rows)
     columns = [(_of_both(name) if asked else name, cell) for name, cell in SUCCESS_COLUMNS]
+    columns[3:3] = FOLLOWED_COLUMNS if followed(rows) else []
     what = "SR / accuracy" if asked else f"Success rate by {rule_name(rows)}"
     parts = [_rows_table(what, behaviour, columns)]
     if any(row.sr_idle is not None for row in rows):

@@ -91,6 +91,23 @@ class Asked:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Followed:
+    """What the exchange of the two pictures did, if `probe-kit intervene` was run; see `intervene.Following`.
+
+    follows, against: shares of episodes; follows_net: their difference, follows_p: exact, one-sided. used: the
+    verdict of that and the row's own probes; used_note: what it rests on, or why there is none.
+    """
+
+    follows: float | None = None
+    against: float | None = None
+    follows_net: float | None = None
+    follows_net_ci: Limits | None = None
+    follows_p: float | None = None
+    used: str | None = None
+    used_note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class BackbonePeak:
     """The backbone's best site, the first one on ties.
 

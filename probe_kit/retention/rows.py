@@ -4,18 +4,27 @@ from dataclasses import dataclass
 from typing import Self
 
 from probe_kit.hooks.sites import label_of
-from probe_kit.retention.row_parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
+from probe_kit.retention.row_parts import (
+    ActionPeak,
+    Asked,
+    BackbonePeak,
+    Background,
+    Behaviour,
+    Followed,
+    Kept,
+    Source,
+)
 from probe_kit.retention.ruled import Ruled
 from probe_kit.train.controls import signal
 
 MEAN = "mean"
 """Category of the rows that average over categories."""
 
-Part = Source | Behaviour | Asked | Ruled | BackbonePeak | ActionPeak | Kept | Background
+Part = Source | Behaviour | Followed | Asked | Ruled | BackbonePeak | ActionPeak | Kept | Background
 
 
 @dataclass(frozen=True, kw_only=True)
-class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Behaviour, Source):
+class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Followed, Behaviour, Source):
     """One line of the retention table: its parts, side by side under their own names.
 
     In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.

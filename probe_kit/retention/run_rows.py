@@ -1,15 +1,17 @@
 """The rows of one run, with the estimates that averages and differences are made of."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan
 from typing import TYPE_CHECKING
 
 from probe_kit.env.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
+from probe_kit.intervene.following import stored_following
 from probe_kit.retention.asked import ask_of
 from probe_kit.retention.estimates import UNBOUNDED, Estimate, Estimates, Limits, probe_estimates, sr_estimate
+from probe_kit.retention.followed import with_following
 from probe_kit.retention.measure import Iterations, Peak, Retention, best_site, measure_retention
 from probe_kit.retention.row_parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
 from probe_kit.retention.rows import Part, RetentionRow
@@ -61,12 +63,13 @@ def run_rows(
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
-    judged = Judged.of(run, settings.rule, settings.last_steps)
-    return [
+    judged, found = Judged.of(run, settings.rule, settings.last_steps), stored_following(run)
+    drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
+    return [replace(one, row=with_following(one.row, found)) for one in drawn]
 
 
 def _row(

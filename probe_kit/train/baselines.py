@@ -66,6 +66,21 @@ def suite_of(run: RunReader, folder: Path) -> "Suite":
     return suite
 
 
+def embedded_suite_of(run: RunReader) -> Path | None:
+    """Folder of the embedded suite, if it was built here and the run's pictures come from it."""
+    from probe_kit.suite.build import default_folder
+    from probe_kit.suite.generators.couples import SUITE_NAME
+
+    folder = default_folder()
+    if not run.suite.startswith(f"{SUITE_NAME}@") or not folder.is_dir():
+        return None
+    try:
+        suite_of(run, folder)
+    except SuiteError:  # drawn with another seed or version
+        return None
+    return folder
+
+
 def _layout(episodes: "pd.DataFrame") -> Features:
     """(E, 1): +1 in the original layout, −1 in the swapped one."""
     original = (episodes["layout"] == "original").to_numpy()

@@ -81,13 +81,14 @@ def train(
     """
     from probe_kit.extract import open_run
     from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes
+    from probe_kit.train.baselines import embedded_suite_of
 
     asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
     units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
     rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     beside = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
-    pictures = suite or _embedded_suite(opened)
+    pictures = suite or embedded_suite_of(opened)
     for number in _calls(call, opened):
         with progress() as bar:
             results = train_probes(
@@ -216,23 +217,6 @@ def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":
 
 def _default_controls(suite: Path | None) -> "tuple[Baseline, ...]":
     return () if suite is None else ("binding",)
-
-
-def _embedded_suite(run: "RunReader") -> Path | None:
-    """Folder of the embedded suite, if it was built here and the run's pictures come from it."""
-    from probe_kit.errors import SuiteError
-    from probe_kit.suite.build import default_folder
-    from probe_kit.suite.generators.couples import SUITE_NAME
-    from probe_kit.train.baselines import suite_of
-
-    folder = default_folder()
-    if not run.suite.startswith(f"{SUITE_NAME}@") or not folder.is_dir():
-        return None
-    try:
-        suite_of(run, folder)
-    except SuiteError:  # drawn with another seed or version
-        return None
-    return folder
 
 
 def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:

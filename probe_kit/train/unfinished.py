@@ -2,55 +2,43 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
-from zipfile import ZipFile
 
-import numpy as np
-
-from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.bundles import PARTIAL
-from probe_kit.extract.store.hashes import DIGEST_BYTES, digest
 from probe_kit.extract.store.layout import PROBES
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.pieces import Pieces
 from probe_kit.hooks.sites import Site
 from probe_kit.train.probe import SiteProbe
-
-_HEX = 2 * DIGEST_BYTES
 
 
 @dataclass(frozen=True)
 class Unfinished:
     """Probes of single sites, kept until the sweep they belong to is complete."""
 
-    run: Location
-    folder: str
-    stamp: str
+    pieces: Pieces
 
     @classmethod
     def of(cls, run: Location, key: str, stamp: str = "") -> "Unfinished":
         """Those of the sweep that will be stored as `key`. stamp: hash of the commits that it reads."""
-        return cls(run, f"{PROBES}/.{key}{PARTIAL}", stamp)
+        return cls(Pieces.of(run, PROBES, key, stamp, "the same `probe-kit train` then probes the site again"))
+
+    @property
+    def folder(self) -> str:
+        """Where they lie in the run."""
+        return self.pieces.folder
 
     def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
         """The probes of a site by category, or None if the sweep did not get that far.
 
         Raises RunDamagedError if they were changed, or are of another site or of other commits.
         """
-        try:
-            stored = self.run.read(self._key(view, site))
-        except FileNotFoundError:
+        arrays = self.pieces.read(f"{view}+{site}")
+        if arrays is None:
             return None
-        content, bound = stored[:-_HEX], stored[-_HEX:]
-        if self._bound(content, view, site) != bound:
-            raise RunDamagedError(
-                f"{self.run}/{self._key(view, site)} was changed after it was written, or is of another site or "
-                "of other episodes. Remove it; the same `probe-kit train` then probes the site again"
-            )
-        with np.load(BytesIO(stored), allow_pickle=False) as arrays:
-            return {
-                category: SiteProbe(**{part: arrays[f"{category}/{part}"] for part in SiteProbe.__annotations__})
-                for category in dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays)
-            }
+        return {
+            category: SiteProbe(**{part: arrays[f"{category}/{part}"] for part in SiteProbe.__annotations__})
+            for category in dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays)
+        }
 
     def keep(self, view: str, site: Site, probes: Mapping[str, SiteProbe]) -> None:
         """Store the probes of a site by category."""
@@ -59,23 +47,11 @@ class Unfinished:
             for category, probe in probes.items()
             for part, array in vars(probe).items()
         }
-        file = BytesIO()
-        np.savez(file, allow_pickle=False, **arrays)
-        with ZipFile(file, "a") as archive:
-            archive.comment = bytes(_HEX)  # a zip file may end in a comment: that is where the hash goes
-        content = file.getvalue()[:-_HEX]
-        self.run.write(self._key(view, site), content + self._bound(content, view, site))
-
-    def _bound(self, content: bytes, view: str, site: Site) -> bytes:
-        """Hash of the file and of what it is, _HEX bytes."""
-        return digest(f"{self._key(view, site)} {self.stamp} ".encode() + content).encode()
+        self.pieces.keep(f"{view}+{site}", arrays)
 
     def discard(self) -> None:
         """Remove everything: the sweep is complete."""
-        self.run.remove(self.folder)
-
-    def _key(self, view: str, site: Site) -> str:
-        return f"{self.folder}/{view}+{site}.npz"
+        self.pieces.discard()
 
 
 def unfinished_sweeps(run: Location) -> dict[str, int]:

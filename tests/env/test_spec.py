@@ -1,5 +1,6 @@
 import json
 from dataclasses import FrozenInstanceError, fields, replace
+from pathlib import Path
 
 import pytest
 
@@ -126,3 +127,31 @@ def test_the_record_names_a_photo_by_what_it_shows_and_not_by_where_it_lies(tmp_
 def test_the_record_cannot_be_changed():
     with pytest.raises(FrozenInstanceError):
         SceneSpec().epsilon = 0.08
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_stored_scene_is_built_again(name: str) -> None:
+    """As it comes back from JSON, in which tuples are lists."""
+    spec = SceneSpec.preset(name, light_level=0.7, picture_size=(224, 224))
+    stored = json.loads(json.dumps(spec.to_json()))
+    again = SceneSpec.from_json(stored)
+    assert again.to_json() == spec.to_json()
+    assert again == replace(spec, epsilon=spec.zone_radius)
+
+
+def test_a_scene_with_a_file_needs_that_file_again(tmp_path: Path) -> None:
+    photo, other = tmp_path / "photo.png", tmp_path / "other.png"
+    photo.write_bytes(b"one")
+    other.write_bytes(b"two")
+    spec = SceneSpec(background=photo)
+    stored = json.loads(json.dumps(spec.to_json()))
+    assert SceneSpec.from_json(stored, {"background": photo}).background == photo
+    with pytest.raises(SceneError, match="give that file again"):
+        SceneSpec.from_json(stored)
+    with pytest.raises(SceneError, match="Give that file"):
+        SceneSpec.from_json(stored, {"background": other})
+
+
+def test_a_scene_of_a_later_version_is_refused() -> None:
+    with pytest.raises(SceneError, match="gravity"):
+        SceneSpec.from_json({**SceneSpec().to_json(), "gravity": 1.6})

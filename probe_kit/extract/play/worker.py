@@ -50,7 +50,7 @@ class Worker:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(_torch_threads(self._controller.threads))
+            stack.enter_context(torch_threads(self._controller.threads))
             count = 2 * self._settings.batch
             self._stages = [self._open_stage(position, stack) for position in range(count)]
             self._ring = Ring([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
@@ -120,7 +120,8 @@ class Worker:
 
 
 @contextmanager
-def _torch_threads(count: int | None) -> Iterator[None]:
+def torch_threads(count: int | None) -> Iterator[None]:
+    """So many threads for torch while the body runs; None for its own choice. Other threads, other roundings."""
     if count is None:
         yield
         return

@@ -24,12 +24,13 @@ from probe_kit.extract.store.hashes import (
     read_plain,
     read_record,
 )
-from probe_kit.extract.store.layout import PROBES
+from probe_kit.extract.store.layout import INTERVENTIONS, PROBES
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.root import read_root
 
-BUNDLES = (PROBES,)
+BUNDLES = (PROBES, INTERVENTIONS)
 """Where bundles may lie in a run."""
+_MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
 HEAD, PARTIAL = "settings.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8
@@ -204,4 +205,4 @@ def _identity(location: Location) -> str | None:
 
 
 def _advice(folder: str) -> str:
-    return f"Remove {folder} and run the same `probe-kit train` again"
+    return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"

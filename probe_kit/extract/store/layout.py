@@ -10,6 +10,7 @@ RUN/
   columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
   sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
+  interventions/     results of `probe-kit intervene`
   videos/            GIFs, if asked for
   frames/<n>.webp    first and last frame of an episode, see `thumbnails`
 
@@ -34,6 +35,7 @@ TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES = "frames", "certificates", "sealed", "probes"
+INTERVENTIONS = "interventions"
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """What no hash covers: pictures for people."""
 CODECS = ("zstd", "fast", "none")

@@ -23,6 +23,14 @@ GLOSSARY = MappingProxyType(
             "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the "
             "decision itself, as a noisy action or as the tokens before."
         ),
+        "follows / against": (
+            "With the two pictures exchanged, and nothing else: share of episodes whose action then turns from "
+            "the correct picture's side to the other one, and share in which it does the reverse."
+        ),
+        "used": (
+            "Whether the action follows what can be read in the backbone. Encoded, unused: it can be read, and "
+            "the action does not change with it, while another category's does."
+        ),
         "wrong": "Share of episodes that ended on the other picture.",
         "outside": "Share of episodes that ended on neither picture.",
         "never moved": (

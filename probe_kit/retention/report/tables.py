@@ -7,6 +7,7 @@ from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
     DIFFERENCE_COLUMNS,
+    FOLLOWED_COLUMNS,
     action_place,
     area_value,
     beats,
@@ -154,6 +155,13 @@ _BEHAVIOUR = [
     _Column(
         "SR % [95 %]", success_interval, lambda row: row.sr, "SR", lambda row: row.sr,
         lambda row: row.regime == Regime.KNOWLEDGE,
+    ),
+    *(
+        _Column(
+            f"{name} %" if name != "used" else name, cell, lambda row: row.follows_net, name,
+            strong=lambda row: row.used == "used", note=lambda row: row.used_note,
+        )
+        for name, cell in FOLLOWED_COLUMNS
     ),
     _share("± Δ", "delta_regime", "Δ"),
     _share("paper's Δ", "delta", "paper's Δ"),

@@ -1,0 +1,55 @@
+"""Interventions: is what can be read also used? Changes what a policy sees or carries, and nothing else.
+
+Needs the run's policy and pictures again; what is stored needs neither to be read.
+"""
+
+from typing import TYPE_CHECKING
+
+from probe_kit.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.intervene.bench import Bench, Source
+    from probe_kit.intervene.effects import Effects, load_effects
+    from probe_kit.intervene.follow import Follow
+    from probe_kit.intervene.following import Following, stored_following
+    from probe_kit.intervene.intervening import intervene_on
+    from probe_kit.intervene.stored import Answers, stored_interventions
+    from probe_kit.intervene.verdict import Judgement, Verdict, judge, judgements
+
+__all__ = [
+    "Answers",
+    "Bench",
+    "Effects",
+    "Follow",
+    "Following",
+    "Judgement",
+    "Source",
+    "Verdict",
+    "intervene_on",
+    "judge",
+    "judgements",
+    "load_effects",
+    "stored_following",
+    "stored_interventions",
+]
+
+# `probe-kit --help` and tables that only read must load neither torch nor a simulator.
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Answers": "stored",
+        "Bench": "bench",
+        "Effects": "effects",
+        "Follow": "follow",
+        "Following": "following",
+        "Judgement": "verdict",
+        "Source": "bench",
+        "Verdict": "verdict",
+        "intervene_on": "intervening",
+        "judge": "verdict",
+        "judgements": "verdict",
+        "load_effects": "effects",
+        "stored_following": "following",
+        "stored_interventions": "stored",
+    },
+)

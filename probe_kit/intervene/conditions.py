@@ -1,0 +1,125 @@
+"""Conditions: the ways in which one first inference is made again, and what each of them gives."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.intervene.bench import Bench, Chunk, Question
+from probe_kit.intervene.patching import LEDGER, Ledger
+from probe_kit.intervene.settings import Asked
+from probe_kit.intervene.stored import EXCHANGED, PLAIN
+
+
+@dataclass
+class Turn:
+    """One question on the bench, with what its conditions share.
+
+    memo: what one condition computed and another needs as well, by name.
+    """
+
+    bench: Bench
+    question: Question
+    memo: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Played:
+    """The actions (chunk, 7) of one inference, and what was changed in it, if anything."""
+
+    chunk: Chunk
+    ledger: Ledger | None = None
+
+
+class Condition(Protocol):
+    """One way of making an inference again."""
+
+    @property
+    def name(self) -> str:
+        """What tells it from the others of its intervention."""
+
+    def play(self, turn: Turn) -> Played:
+        """Make the inference."""
+
+
+class Intervention(Asked, ABC):
+    """What is asked, and the conditions that answer it."""
+
+    @abstractmethod
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """All of them, in the order in which they are stored; the first is `Plain`."""
+
+
+@dataclass(frozen=True)
+class Plain:
+    """As the run made it."""
+
+    name: str = PLAIN
+
+    def play(self, turn: Turn) -> Played:
+        """Nothing is changed."""
+        return Played(turn.bench.act(turn.question.seen, turn.question.seed))
+
+
+@dataclass(frozen=True)
+class Exchanged:
+    """The same state and noise before the same two pictures in each other's place."""
+
+    name: str = EXCHANGED
+
+    def play(self, turn: Turn) -> Played:
+        """Only what is seen is another."""
+        return Played(turn.bench.act(turn.question.exchanged, turn.question.seed))
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What K conditions gave for E episodes.
+
+    rows: (E,) in the run's episodes. lateral: (K, E) metres, see `Bench.lateral`. changed: (K, E) the largest
+    difference of any action from the plain one's. ledger: (K, E, 5) what was changed, see `patching.LEDGER`.
+    apart: (E,) of the plain one from the stored one; NaN where the run does not say.
+    """
+
+    rows: NDArray[np.int64]
+    lateral: NDArray[np.float64]
+    changed: NDArray[np.float64]
+    ledger: NDArray[np.float64]
+    apart: NDArray[np.float64]
+
+    @classmethod
+    def joined(cls, parts: Sequence["Replayed"]) -> "Replayed":
+        """One after the other."""
+        axes = {"lateral": 1, "changed": 1, "ledger": 1}
+        return cls(
+            *(
+                np.concatenate([getattr(p, name) for p in parts], axis=axes.get(name, 0))
+                for name in cls.__annotations__
+            )
+        )
+
+
+def replay(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
+    """Play every condition on every question; the first one is the plain one."""
+    shape = len(conditions), len(questions)
+    found = Replayed(
+        np.array([question.row for question in questions], np.int64),
+        np.empty(shape),
+        np.zeros(shape),
+        np.zeros((*shape, len(LEDGER))),
+        np.empty(len(questions)),
+    )
+    for column, question in enumerate(questions):
+        turn = Turn(bench, question)
+        plain = conditions[0].play(turn).chunk
+        found.apart[column] = bench.apart(question, plain)
+        for number, condition in enumerate(conditions):
+            played = condition.play(turn) if number else Played(plain)
+            found.lateral[number, column] = bench.lateral(played.chunk, question.seen)
+            found.changed[number, column] = float(np.abs(played.chunk - plain).max())
+            if played.ledger is not None:
+                found.ledger[number, column] = played.ledger.row()
+    return found

@@ -1,0 +1,127 @@
+"""What an intervention did: a table, the verdicts, and the ways to write them down."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.errors import NoProbesError
+from probe_kit.intervene.following import Following, following, following_frame, stored_following
+from probe_kit.intervene.stored import Answers, Stored, find_stored
+from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
+from probe_kit.train.reader import RunReader
+from probe_kit.train.store import load_results
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.fitting_tables import FittingTable
+
+
+@dataclass(frozen=True)
+class Effects:
+    """One intervention: what was asked, what it gave, and what that means.
+
+    key: name of its folder. label: of the run. settings, certificate: as stored. verdicts: by category, from this
+    and what else is stored with the run.
+    """
+
+    key: str
+    label: str
+    suite: str
+    random_weights: bool
+    settings: dict[str, Any]
+    certificate: dict[str, Any]
+    answers: Answers = field(repr=False)
+    verdicts: dict[str, Judgement] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """Of the intervention."""
+        return str(self.settings["kind"])
+
+    @property
+    def rows(self) -> list[Following]:
+        """One per category."""
+        return following(self.answers, self.suite, self.key)
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """One line per category: the fields of `Following`, and verdict and reason."""
+        frame = following_frame(self.rows)
+        found = [self.verdicts.get(str(category), None) for category in frame["category"]]
+        frame["verdict"] = [None if one is None else one.verdict for one in found]
+        frame["reason"] = ["" if one is None else one.reason for one in found]
+        return frame
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader must know, a sentence each."""
+        check = self.certificate["replay"]
+        if check["compared"] == 0:
+            return (
+                "The run does not say what was carried out, so that plain inferences were not compared with it.",
+            )
+        if check["equal"] < check["compared"]:
+            return (
+                f"{check['equal']} of {check['compared']} plain inferences are the run's bit for bit; the others "
+                f"differ by at most {check['largest_difference']:.2g}: a larger batch, or another device.",
+            )
+        return ()
+
+    def to_json(self) -> str:
+        """Key, settings, certificate and the table as JSON."""
+        content = {
+            "key": self.key,
+            "label": self.label,
+            "settings": self.settings,
+            "certificate": self.certificate,
+            "effects": json.loads(self.table.to_json(orient="records", double_precision=15)),
+        }
+        return json.dumps(content, indent=2, ensure_ascii=False)
+
+    def to_csv(self) -> str:
+        """The table as comma-separated values with a header."""
+        return self.table.to_csv(index=False)
+
+    def to_rich(self) -> "FittingTable":
+        """The table for a console."""
+        from probe_kit.intervene.tables import following_table
+
+        return following_table(self.rows, self.verdicts, self.label, self.suite, self.random_weights)
+
+
+def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> Effects:
+    """The stored intervention whose key begins with `key`, or the newest (of `kind`), with verdicts as of now.
+
+    Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
+    """
+    return effects_of(run, find_stored(run, key, kind))
+
+
+def effects_of(run: RunReader, stored: Stored) -> Effects:
+    """Read one stored intervention."""
+    return Effects(
+        key=stored.key,
+        label=run.label,
+        suite=run.suite,
+        random_weights=run.random_weights,
+        settings=dict(stored.settings),
+        certificate=stored.certificate(),
+        answers=stored.answers(),
+        verdicts=verdicts_of(run),
+    )
+
+
+def verdicts_of(run: RunReader) -> dict[str, Judgement]:
+    """By category, from all interventions and the newest probes that are stored with a run."""
+    try:
+        results = load_results(run)
+    except NoProbesError:
+        results = None
+    return judgements(stored_following(run), encoded_in(results))
+
+
+def effects_csv(rows: Sequence[Following]) -> str:
+    """As stored beside the answers, without verdicts, which later probes may change."""
+    return following_frame(list(rows)).drop(columns="key").to_csv(index=False)

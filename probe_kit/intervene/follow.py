@@ -1,0 +1,22 @@
+"""Following: with the two pictures exchanged, and nothing else, does the action change sides?"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain
+
+
+@dataclass(frozen=True, kw_only=True)
+class Follow(Intervention):
+    """Two inferences per episode, same state and noise: with its pictures, and with the two exchanged."""
+
+    @property
+    def kind(self) -> str:
+        """`follow`."""
+        return "follow"
+
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """As the run made it, and exchanged."""
+        del bench
+        return Plain(), Exchanged()

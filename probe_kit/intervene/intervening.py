@@ -1,0 +1,145 @@
+"""Carrying out an intervention: replay what is missing, store it, say what it means."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.store.layout import INTERVENTIONS
+from probe_kit.extract.store.pieces import Pieces
+from probe_kit.extract.store.run import Run
+from probe_kit.intervene.bench import Bench, Source, open_bench
+from probe_kit.intervene.conditions import Condition, Intervention, Replayed, replay
+from probe_kit.intervene.effects import Effects, effects_csv, load_effects
+from probe_kit.intervene.follow import Follow
+from probe_kit.intervene.following import following
+from probe_kit.intervene.settings import key_of, refuse_unfit, settings_of
+from probe_kit.intervene.stored import Answers, is_stored, save
+from probe_kit.notebook import notebook_progress
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+REDO = "the same `probe-kit intervene` then plays it again"
+
+
+class Progress(Protocol):
+    """Called after every item."""
+
+    def __call__(self, done: int, total: int, what: str, /) -> None:
+        """done: items so far, of `total`. what: the last one."""
+
+
+def intervene_on(
+    run: Run,
+    asked: Intervention | None = None,
+    source: Source | None = None,
+    *,
+    load: "Callable[[Run, Source], Policy] | None" = None,
+    progress: Progress | None = None,
+) -> Effects:
+    """Intervene on a run's policy, and store what came of it with the run; what is stored is read back.
+
+    asked: what to do; `Follow()` by default. source: where policy and pictures are, by default the embedded suite
+    and the model's own checkpoint. load: how the policy is found, if not by its name. What was interrupted is
+    continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError, and what `open_bench`
+    raises.
+    """
+    asked = asked or Follow()
+    refuse_unfit(run)
+    settings = settings_of(asked, run)
+    key = key_of(settings)
+    if not is_stored(run.location, key):
+        _carry_out(run, asked, settings, key, source or Source(), load, progress)
+    return load_effects(run, key)
+
+
+def _carry_out(
+    run: Run,
+    asked: Intervention,
+    settings: Mapping[str, Any],
+    key: str,
+    source: Source,
+    load: "Callable[[Run, Source], Policy] | None",
+    progress: Progress | None,
+) -> None:
+    pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
+    items = items_of(run, asked)
+    with open_bench(run, source, load) as bench, bench.ready():
+        conditions = asked.conditions(bench)
+        parts = _replayed(bench, items, conditions, pieces, progress or notebook_progress("items replayed"))
+        certificate = {
+            "policy": bench.policy.card.to_json(),
+            "provenance": _provenance(bench),
+            "replay": _replay_check(parts),
+        }
+    answers = _answers(run, [condition.name for condition in conditions], parts)
+    save(run.location, settings, key, answers, effects_csv(following(answers, run.suite)), certificate)
+    pieces.discard()
+
+
+def items_of(run: Run, asked: Intervention) -> list[str]:
+    """The items that are replayed, category by category. Raises UsageError if there is none."""
+    episodes, chosen = run.episodes, []
+    for category in asked.chosen(run):
+        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
+        chosen += list(dict.fromkeys(names))[: asked.items]
+    if not chosen:
+        raise UsageError(f"{run.location} has no episode yet; extract some first")
+    return chosen
+
+
+def _replayed(
+    bench: Bench, items: Sequence[str], conditions: Sequence[Condition], pieces: Pieces, progress: Progress | None
+) -> Replayed:
+    """Item by item; what a former attempt finished is read back."""
+    parts = []
+    for number, item in enumerate(items):
+        name = f"{number:06d}"
+        stored = pieces.read(name)
+        if stored is None:
+            part = replay(bench, bench.questions(item), conditions)
+            pieces.keep(name, vars(part))
+        else:
+            part = Replayed(**stored)
+        parts.append(part)
+        if progress is not None:
+            progress(number + 1, len(items), item)
+    return Replayed.joined(parts)
+
+
+def _answers(run: Run, conditions: Sequence[str], found: Replayed) -> Answers:
+    rows = run.episodes.iloc[found.rows]
+    columns = {
+        own: rows[name].to_numpy(dtype=str)
+        for own, name in (
+            ("episodes", "episode_id"), ("items", "item_id"), ("groups", "group_id"), ("categories", "category"),
+            ("sides", "side_correct"),
+        )
+    }  # fmt: skip
+    return Answers(
+        conditions=tuple(conditions),
+        **columns,
+        lateral=found.lateral,
+        changed=found.changed,
+        ledger=found.ledger,
+        apart=found.apart,
+    )
+
+
+def _replay_check(found: Replayed) -> dict[str, Any]:
+    """Whether the plain inferences are the run's, bit for bit."""
+    known = found.apart[~np.isnan(found.apart)]
+    return {
+        "episodes": int(found.apart.size),
+        "compared": int(known.size),
+        "equal": int((known == 0).sum()),
+        "largest_difference": float(known.max(initial=0.0)),
+    }
+
+
+def _provenance(bench: Bench) -> dict[str, Any]:
+    from probe_kit.extract.store.provenance import provenance_here
+
+    return provenance_here(bench.policy.card.device, bench.policy.card.dtype)

@@ -1,0 +1,148 @@
+"""Changing the streams of one inference, with a ledger of what was changed where, and how far."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CaptureError
+from probe_kit.hooks.sites import Site
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit.hooks import Policy, Tape
+
+
+@dataclass
+class Ledger:
+    """What was done in one inference.
+
+    fires: how often an edited site fired. still: of these, the fires that moved nothing. norm, moved: sums over
+    fires of the mean norm of the tokens before, and of how far they were moved. largest: of any token.
+    """
+
+    fires: int = 0
+    still: int = 0
+    norm: float = 0.0
+    moved: float = 0.0
+    largest: float = 0.0
+
+    def row(self) -> NDArray[np.float64]:
+        """(5,) as stored; `norm` and `moved` per fire."""
+        per = max(self.fires, 1)
+        return np.array([self.fires, self.still, self.norm / per, self.moved / per, self.largest])
+
+
+LEDGER = ("fires", "still", "norm", "moved", "largest")
+"""What the columns of a stored ledger are."""
+
+
+class Change(Protocol):
+    """What becomes of the tokens of a site."""
+
+    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+        """(T', D) float32 tokens in, as many out."""
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """By the same tokens of another inference."""
+
+    donor: "Tape"
+    mask: NDArray[np.bool_]
+
+    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+        """The donor's."""
+        del own
+        other = self.donor[site][0].float()
+        if other.shape[0] != self.mask.size:
+            raise CaptureError(
+                f"the donor's {site} has {other.shape[0]} tokens; expected {self.mask.size}, as before exchanging"
+            )
+        return other[_index(self.mask, other)]
+
+
+@dataclass(frozen=True)
+class ReplacedAlong:
+    """By another inference's component along some directions; the rest stays. basis: (K, D) orthonormal."""
+
+    donor: "Tape"
+    mask: NDArray[np.bool_]
+    basis: NDArray[np.float32]
+
+    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+        """own + (donor − own) P."""
+        import torch
+
+        apart = Replaced(self.donor, self.mask)(site, own) - own
+        directions = torch.from_numpy(self.basis).to(own.device)
+        found: Tensor = own + (apart @ directions.T) @ directions
+        return found
+
+
+@dataclass(frozen=True)
+class Moved:
+    """By a vector (D,), the same for every token."""
+
+    vector: NDArray[np.float32]
+
+    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+        """own + vector."""
+        import torch
+
+        del site
+        found: Tensor = own + torch.from_numpy(self.vector).to(own.device)
+        return found
+
+
+@contextmanager
+def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], change: Change) -> Iterator[Ledger]:
+    """Change the tokens `mask` (T,) of some sites while the policy infers once, for one observation.
+
+    Raises CaptureError for another number of tokens, and what `hooks.edit` raises, such as for a site that fires
+    another number of times than its tap promises.
+    """
+    from probe_kit.hooks import edit
+
+    ledger = Ledger()
+
+    def changer(site: Site) -> "_Changer":
+        return _Changer(site, mask, change, ledger)
+
+    with edit(policy, {site: changer(site) for site in sites}):
+        yield ledger
+
+
+@dataclass(frozen=True)
+class _Changer:
+    site: Site
+    mask: NDArray[np.bool_]
+    change: Change
+    ledger: Ledger
+
+    def __call__(self, activation: "Tensor") -> "Tensor":
+        if activation.shape[0] != 1 or activation.shape[1] != self.mask.size:
+            raise CaptureError(
+                f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.mask.size} tokens"
+            )
+        where = _index(self.mask, activation)
+        before = activation[0][where].float()
+        after = self.change(self.site, before).to(activation.dtype)
+        activation[0, where] = after
+        moved = (after.float() - before).norm(dim=-1)
+        self.ledger.fires += 1
+        self.ledger.still += int(not bool(moved.any()))
+        self.ledger.norm += float(before.norm(dim=-1).mean())
+        self.ledger.moved += float(moved.mean())
+        self.ledger.largest = max(self.ledger.largest, float(moved.max()))
+        return activation
+
+
+def _index(mask: NDArray[np.bool_], like: "Tensor") -> "Tensor":
+    import torch
+
+    return torch.from_numpy(np.flatnonzero(mask)).to(like.device)

@@ -1,0 +1,81 @@
+"""The verdict: is what can be read also used? Loads no model."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from probe_kit.intervene.following import WORTH, Following
+
+if TYPE_CHECKING:
+    from probe_kit.train.results import ProbeResults
+
+Verdict = Literal[
+    "used",
+    "encoded, unused",
+    "encoded, acted against",
+    "absent",
+    "acted on, not found",
+    "acted against, not found",
+    "follows",
+    "acts against",
+    "does not follow",
+    "inconclusive",
+]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict, and in a few words what it rests on or why there is none."""
+
+    verdict: Verdict
+    reason: str = ""
+
+
+def judge(encoded: bool | None, found: Following, control: str | None) -> Judgement:
+    """What probes and the exchange of pictures say together.
+
+    encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
+    without probes. control: another category of the run that follows, which shows that following would have been
+    seen; None if there is none, and then nothing is called encoded and unused.
+    """
+    if found.is_following:
+        return Judgement(_by(encoded, "used", "acted on, not found", "follows"))
+    if found.is_against:
+        return Judgement(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
+    if not found.is_bounded:
+        low, high = found.net_ci
+        return Judgement(
+            "inconclusive", f"follows − against may be anything from {low:.2f} to {high:.2f}; {WORTH} would count"
+        )
+    if encoded and control is None:
+        return Judgement("inconclusive", "no other category of the run follows, so following is not known to show")
+    reason = f"positive control: {control}" if encoded and control else ""
+    return Judgement(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
+
+
+def _by(encoded: bool | None, yes: Verdict, no: Verdict, unknown: Verdict) -> Verdict:
+    return unknown if encoded is None else yes if encoded else no
+
+
+def control_for(category: str, found: Mapping[str, Following]) -> str | None:
+    """Another category of the run that follows, the one that does so most; None if there is none."""
+    others = [one for one in found.values() if one.category != category and one.is_following]
+    return max(others, key=lambda one: one.net).category if others else None
+
+
+def judgements(found: Mapping[str, Following], encoded: Mapping[str, bool | None]) -> dict[str, Judgement]:
+    """Of every category that was intervened on. encoded: by category; one that is not there was not probed."""
+    return {name: judge(encoded.get(name), one, control_for(name, found)) for name, one in found.items()}
+
+
+def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:
+    """By category, whether the backbone's best site beats chance and every control that was run.
+
+    As `retention` has it. view: None for the first that was probed. Empty without probes.
+    """
+    if results is None:
+        return {}
+    scores = results.scores
+    own = scores[(scores["stream"] == "backbone") & (scores["view"] == (view or results.settings.views[0]))]
+    best = own.loc[own.groupby("category", sort=False)["accuracy"].idxmax()]
+    return {str(row["category"]): bool(row["signal"]) for _, row in best.iterrows()}

@@ -1,0 +1,31 @@
+"""What stored interventions add to a row: does the action follow the pictures, and is what can be read used?
+
+Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing is played.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from probe_kit.intervene.following import Following
+from probe_kit.intervene.verdict import control_for, judge
+from probe_kit.retention.row_parts import Followed
+from probe_kit.retention.rows import RetentionRow
+
+
+def with_following(row: RetentionRow, found: Mapping[str, Following]) -> RetentionRow:
+    """The row with what was found of its category, judged by its own probes. found: by category; may be empty."""
+    own = found.get(row.category)
+    if own is None:
+        return row
+    encoded = row.prefix_signal if row.prefix_beats else None
+    judged = judge(encoded, own, control_for(row.category, found))
+    part = Followed(
+        follows=own.follows,
+        against=own.against,
+        follows_net=own.net,
+        follows_net_ci=own.net_ci,
+        follows_p=own.p_follows,
+        used=judged.verdict,
+        used_note=judged.reason,
+    )
+    return replace(row, **vars(part))

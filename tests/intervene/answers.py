@@ -1,0 +1,49 @@
+"""Answers made by hand: where the action goes, per episode of items in two layouts."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.intervene import Answers
+
+Cell = NDArray[np.float64]
+
+
+def answers_of(signs: Mapping[str, tuple[Cell, Cell]], groups: int | None = None) -> Answers:
+    """signs: by category, metres toward the correct side (E,), plain and exchanged; two layouts an item."""
+    rows: dict[str, list[str]] = {name: [] for name in ("episodes", "items", "groups", "categories", "sides")}
+    lateral: list[list[float]] = [[], []]
+    for category, (plain, exchanged) in signs.items():
+        for number, values in enumerate(zip(plain, exchanged, strict=True)):
+            item, swapped = divmod(number, 2)
+            side = ("left", "right")[(item + swapped) % 2]
+            rows["episodes"].append(f"{category}-{item}:{'os'[swapped]}")
+            rows["items"].append(f"{category}-{item}")
+            rows["groups"].append(f"{category}-{item if groups is None else item % groups}")
+            rows["categories"].append(category)
+            rows["sides"].append(side)
+            for row, value in zip(lateral, values, strict=True):
+                row.append(value if side == "left" else -value)
+    moved = np.array(lateral)
+    return Answers(
+        conditions=("plain", "exchanged"),
+        **{name: np.array(values) for name, values in rows.items()},
+        lateral=moved,
+        changed=np.abs(moved - moved[0]),
+        ledger=np.zeros((*moved.shape, 5)),
+        apart=np.zeros(moved.shape[1]),
+    )
+
+
+def follower(episodes: int) -> tuple[Cell, Cell]:
+    """Always goes to the correct picture, wherever it lies."""
+    return np.full(episodes, 0.1), np.full(episodes, -0.1)
+
+
+def habit(episodes: int) -> tuple[Cell, Cell]:
+    """Always goes left, but for tiny shifts whose sign is drawn once per item."""
+    draw = np.random.default_rng(1)
+    left = np.where([(n // 2 + n % 2) % 2 == 0 for n in range(episodes)], 0.1, -0.1)
+    nudge = np.repeat(draw.permutation([1e-5, -1e-5] * (episodes // 4)), 2)
+    return left, left - nudge

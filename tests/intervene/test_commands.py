@@ -1,0 +1,90 @@
+"""`probe-kit intervene`: what it prints of what is stored, and what it refuses before anything is loaded."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.extract import Run
+from probe_kit.intervene import Follow
+from probe_kit.intervene.effects import effects_csv
+from probe_kit.intervene.following import following
+from probe_kit.intervene.settings import key_of, settings_of
+from probe_kit.intervene.stored import save
+from tests.intervene.answers import answers_of, follower, habit
+
+
+@pytest.fixture
+def run(recorded_run: Run, tmp_path: Path) -> Run:
+    """With a stored intervention whose answers are made up."""
+    from probe_kit.extract import open_run
+
+    copy = open_run(shutil.copytree(recorded_run.path, tmp_path / "run"))
+    answers = answers_of({"color": follower(24), "shape": habit(24)})
+    settings = settings_of(Follow(), copy)
+    certificate = {"replay": {"episodes": 48, "compared": 48, "equal": 47, "largest_difference": 1e-7}}
+    save(
+        copy.location,
+        settings,
+        key_of(settings),
+        answers,
+        effects_csv(following(answers, copy.suite)),
+        certificate,
+    )
+    return copy
+
+
+def ask(run: Run | str, *options: str) -> tuple[int, str, str]:
+    told = CliRunner().invoke(app, ["intervene", str(run if isinstance(run, str) else run.path), *options])
+    return told.exit_code, told.stdout, told.stderr
+
+
+def test_the_table_says_what_follows(run: Run) -> None:
+    code, shown, said = ask(run)
+    assert code == 0
+    assert "follows" in shown
+    assert "100.0" in shown
+    assert "random weights" in shown
+    assert "47 of 48 plain inferences" in said
+
+
+def test_json_holds_settings_and_effects(run: Run) -> None:
+    code, shown, _ = ask(run, "--format", "json")
+    found = json.loads(shown)
+    assert code == 0
+    assert [row["category"] for row in found["effects"]] == ["color", "shape"]
+    assert found["effects"][0]["p_follows"] == 2.0**-12
+    assert found["settings"]["kind"] == "follow"
+
+
+def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
+    _, shown, _ = ask(run, "--format", "csv")
+    header, first, *_ = shown.splitlines()
+    assert header.endswith("verdict,reason")
+    assert first.startswith("color,24,12,12,1.0,0.0,1.0,")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (("--kind", "wish"), 2, "unknown kind"),
+        (("--format", "xml"), 2, "unknown format"),
+        (("--categories", "colour"), 2, "color, shape"),
+        (("--items", "0"), 2, "at least 1"),
+        (("--wording", "named"), 2, "no wording"),
+        (("--items", "3"), 2, "--suite"),
+    ],
+)
+def test_what_cannot_be_is_refused(run: Run, options: tuple[str, ...], code: int, words: str) -> None:
+    ended, _, said = ask(run, *options)
+    assert ended == code
+    assert words in said
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    code, _, said = ask(str(tmp_path))
+    assert code == 2
+    assert "is not a run" in said
