@@ -33,6 +33,10 @@ class UnknownSiteError(UsageError):
     """The policy or the run has no such site or view."""
 
 
+class UnsupportedInterventionError(UsageError):
+    """The family does not support the intervention that was asked for."""
+
+
 class RunNotFoundError(UsageError):
     """The folder is not a run."""
 

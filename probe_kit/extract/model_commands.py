@@ -33,6 +33,9 @@ def models(
         for protocol, settings in row["protocols"].items():
             line = ", ".join(f"{name} {value}" for name, value in settings.items())
             out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
+        if (supported := row["interventions"]) is not None:
+            line = f"{', '.join(supported['kinds'])}; read out by {supported['readout']}"
+            out.print(marked("  [dim]intervene [/] {}", line), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
@@ -66,6 +69,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
             "protocols": {protocol: row.settings() for protocol, row in family.protocols.items()},
+            "interventions": family.interventions_json(),
             "options": [
                 {"name": option.name, "kind": option.kind.__name__, "help": option.help, "default": option.default}
                 for option in family.options
@@ -74,8 +78,9 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         for family in chosen
     ]
     scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
+    nothing: dict[str, Any] = {"protocols": {}, "interventions": None, "options": []}
     rows += [
-        {"model": model, "description": text, **scripted, "does": "acts", "protocols": {}, "options": []}
+        {"model": model, "description": text, **scripted, "does": "acts", **nothing}
         for model, text in SCRIPTED.items()
         if name in (None, model)
     ]

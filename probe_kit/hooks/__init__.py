@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.edits import Edit
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.interventions import Interventions
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.registry import known_families, load_model, load_policy
@@ -12,6 +13,7 @@ from probe_kit.hooks.sites import Site, Stream
 from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.hooks.attention import AttentionMass
     from probe_kit.hooks.capture_context import capture, edit
     from probe_kit.hooks.editing import applied
     from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading, Rows, Tap
@@ -19,9 +21,11 @@ if TYPE_CHECKING:
     from probe_kit.hooks.tape import Tape
 
 __all__ = [
+    "AttentionMass",
     "Card",
     "Edit",
     "Family",
+    "Interventions",
     "Model",
     "Observation",
     "Option",
@@ -48,6 +52,7 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "AttentionMass": "attention",
         "Model": "model",
         "Policy": "model",
         "Question": "model",

@@ -27,6 +27,7 @@ __all__ = ["Edit", "Reduce", "Tape", "capture", "edit"]
 
 Reduce = Callable[[Site, Tensor], Tensor]
 Edit = Callable[[Tensor], Tensor]
+Handle = Callable[[Site, Tap, Tensor], None]
 _listening: WeakSet[Model] = WeakSet()
 
 
@@ -44,8 +45,9 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         raise CaptureError("this model is being captured already; leave the first capture before the next")
     tape = Tape()
 
-    def keep(site: Site, activation: Tensor) -> None:
-        tape._kept[site] = activation.detach().clone() if reduce is None else reduce(site, activation.detach())
+    def keep(site: Site, tap: Tap, passing: Tensor) -> None:
+        activation = tap.select(passing).detach()
+        tape._kept[site] = activation.clone() if reduce is None else reduce(site, activation)
 
     with ExitStack() as stack:
         _listening.add(model)
@@ -67,14 +69,15 @@ def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
     Raises CaptureError if a replacement has another shape or dtype, and for fires as `capture` does.
     """
 
-    def write(site: Site, activation: Tensor) -> None:
+    def write(site: Site, tap: Tap, passing: Tensor) -> None:
+        activation = tap.select(passing)
         new = edits[site](activation.detach().clone())
         if new.shape != activation.shape or new.dtype != activation.dtype:
             raise CaptureError(
                 f"the edit of {site} returned {new.dtype} {tuple(new.shape)}; "
                 f"expected {activation.dtype} {tuple(activation.shape)}"
             )
-        activation.copy_(new)
+        tap.write(passing, new)
 
     with ExitStack() as stack:
         listeners = _attach(model, edits, write, stack)
@@ -83,9 +86,7 @@ def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
         listener.check_count()
 
 
-def _attach(
-    model: Model, sites: Iterable[Site], handle: Callable[[Site, Tensor], None], stack: ExitStack
-) -> "list[_Listener]":
+def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStack) -> "list[_Listener]":
     """One listener per module; sites that differ only in the iteration share it."""
     groups: dict[Site, list[Site]] = defaultdict(list)
     for site in dict.fromkeys(sites):
@@ -99,7 +100,7 @@ def _attach(
 class _Listener:
     """Counts the calls of one module and hands the asked ones on."""
 
-    def __init__(self, tap: Tap, sites: list[Site], handle: Callable[[Site, Tensor], None]) -> None:
+    def __init__(self, tap: Tap, sites: list[Site], handle: Handle) -> None:
         self.tap, self.first, self.handle = tap, sites[0], handle
         self.at_fire = {site.iteration or 0: site for site in sites}
         self.count = 0
@@ -133,7 +134,7 @@ class _Listener:
         self.count += 1
         if site is not None:
             activation = passing[0] if isinstance(passing, tuple) else passing
-            self.handle(site, self.tap.select(activation))
+            self.handle(site, self.tap, activation)
 
     def check_count(self) -> None:
         expected = self.tap.first + self.tap.fires

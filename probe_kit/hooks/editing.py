@@ -51,7 +51,7 @@ def applied(
     Raises UsageError for a vector that is missing, has another hash or does not fit, UnknownSiteError for a site
     without roles, and what `capture_context.edit` raises.
     """
-    ledger, roles, given = Ledger(), model.roles(seen), dict(vectors or {})
+    ledger, roles, given = Ledger(), model.token_roles(seen), dict(vectors or {})
     changes: dict[Site, list[Callable[[Tensor], Tensor]]] = defaultdict(list)
     for own in edits:
         vector = _vector(own, given)
@@ -96,7 +96,7 @@ def _change(
     def change(activation: Tensor) -> Tensor:
         where = torch.from_numpy(mask).to(activation.device)
         before = activation.float()
-        after = before + where[..., None] * (_target(own, site, before, vector) - before)
+        after = torch.where(where[..., None], _target(own, site, before, vector), before)
         moved, norm = (after - before).norm(dim=-1)[where], before.norm(dim=-1)[where]
         if moved.numel():
             ledger.entries.append(Entry(str(site), moved.numel(), float(norm.mean()), float(moved.mean())))
@@ -116,7 +116,8 @@ def _target(own: Edit, site: Site, before: Tensor, vector: NDArray[np.float32] |
     if own.kind == "add":
         return before + own.strength * other
     if own.kind == "replace":
-        return before + own.strength * (other - before)
+        # All the way is the donor itself, bit for bit, and none of the way what was there.
+        return other.expand_as(before) if own.strength == 1 else before + own.strength * (other - before)
     direction = other / other.norm()
     removed: Tensor = before - own.strength * (before @ direction)[..., None] * direction
     return removed

@@ -9,9 +9,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit.errors import CheckpointError, MissingExtraError, UsageError
+from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.foreign_code import loading
+from probe_kit.hooks.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.options import Option, check_options
 from probe_kit.hooks.protocol import ProtocolRow
 from probe_kit.machine import check_device_name, what_is_here
@@ -45,7 +46,7 @@ class Family:
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
     for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
-    use the family, by name, with what they use it with.
+    use the family, by name, with what they use it with. interventions: what of them its policy supports.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -71,6 +72,7 @@ class Family:
     protocols: Mapping[str, ProtocolRow] = MappingProxyType({})
     source: str | None = None
     sizes: tuple[tuple[str, str], ...] = ()
+    interventions: Interventions = ALL_EDITS
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -146,6 +148,19 @@ class Family:
         if place is not None and self.config_types:
             check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
         return chosen
+
+    def check_intervention(self, kind: InterventionKind) -> None:
+        """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
+        if not self.acts:
+            raise UnsupportedInterventionError(
+                f"{self.name} does not support the intervention {kind!r}: it answers and does not act, and "
+                "interventions compare actions. Take a family that acts (`probe-kit models` lists which do)"
+            )
+        self.interventions.check(kind, self.name)
+
+    def interventions_json(self) -> dict[str, Any] | None:
+        """What of the interventions is supported, as plain values; None for a family that does not act."""
+        return self.interventions.to_json() if self.acts else None
 
     def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
         """What is loaded: `checkpoint`, that of a `size`, or the default. Raises UsageError for both at once."""

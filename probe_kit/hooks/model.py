@@ -2,9 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,10 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
 from probe_kit.hooks.card import Card
+from probe_kit.hooks.interventions import ALL_EDITS, Interventions
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.sites import Site, Stream, first_of
 from probe_kit.hooks.summary import model_html, model_text
 
 
@@ -73,17 +75,43 @@ class Tap:
         whole = passing if self.view is None else self.view(passing)
         return self.rows.of(whole)[:, self.tokens]
 
+    def write(self, passing: Tensor, new: Tensor) -> None:
+        """Put `new` (B, T, D) where `select` reads."""
+        self.select(passing).copy_(new)
+
+
+@dataclass(frozen=True)
+class HeadsTap(Tap):
+    """Where what passes has heads, (B, H, T, E), as keys and values do; a site sees them as (B, T, H · E)."""
+
+    def select(self, passing: Tensor) -> Tensor:
+        """The site's own (B, T, H · E); to write it, use `write`."""
+        return self._by_token(passing).flatten(2)
+
+    def write(self, passing: Tensor, new: Tensor) -> None:
+        """Put `new` (B, T, H · E) where `select` reads."""
+        own = self._by_token(passing)
+        own.copy_(new.reshape(own.shape))
+
+    def _by_token(self, passing: Tensor) -> Tensor:
+        """(B, T, H, E), a view."""
+        return self.rows.of(passing).transpose(1, 2)[:, self.tokens]
+
 
 class Model(ABC):
     """A network that can be listened to: what capture, edits, verification and the store need.
 
     streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
+    memory: the keys and values that the part which acts reads of the backbone, block by block, as a stream of the
+    quantities `MEMORY`; captured and edited by naming their sites, such as `memory.02.values`; None where a family
+    has none. Its tokens are the backbone's.
     role_names: per stream, every role its tokens can play.
     """
 
     card: Card
     streams: Mapping[str, Stream]
     further_streams: Mapping[str, Stream] = MappingProxyType({})
+    memory: Stream | None = None
     role_names: Mapping[str, tuple[str, ...]]
 
     def __repr__(self) -> str:
@@ -112,9 +140,22 @@ class Model(ABC):
             raise UnknownSiteError(f"no stream of {self.card.family} has a quantity {quantity!r}")
         return [site for stream in having for site in stream.sites(quantity)]
 
+    def every_stream(self) -> dict[str, Stream]:
+        """What is stored, what is captured by name only, and the memory."""
+        memory = {} if self.memory is None else {self.memory.name: self.memory}
+        return {**self.streams, **self.further_streams, **memory}
+
+    def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """As `roles`, and those of the memory's tokens."""
+        roles = self.roles(seen)
+        backbone = first_of("backbone", self.streams.values())
+        if self.memory is not None and backbone is not None:
+            roles[self.memory.name] = roles[backbone]
+        return roles
+
     def stream_of(self, site: Site) -> Stream:
         """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
-        every = {**self.streams, **self.further_streams}
+        every = self.every_stream()
         stream = every.get(site.stream)
         if stream is None or site.quantity not in stream.quantities or site not in stream.sites(site.quantity):
             there = "; ".join(
@@ -153,10 +194,12 @@ class Policy(Model):
 
     Deterministic for given seeds. Capturing changes no action, bit for bit.
 
+    interventions: what of the interventions it supports; a family says the same before it is loaded.
     flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
     then does is the family's. None for a family that cannot tell.
     """
 
+    interventions: ClassVar[Interventions] = ALL_EDITS
     flagged: NDArray[np.bool_] | None = None
 
     def misfit(self) -> str | None:
@@ -173,6 +216,16 @@ class Policy(Model):
         For a policy with a `misfit`, which `act` refuses.
         """
         return self.act(seen, seeds)
+
+    def weighing(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
+        """A context in which `note` is given what attention what acts pays; see `hooks.attention`.
+
+        note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
+        the backbone's T tokens. No number of the inference may change. Raises UnsupportedInterventionError.
+        """
+        del note
+        self.interventions.check("attention", self.card.family)
+        raise NotImplementedError(f"{type(self).__name__} declares attention and does not implement `weighing`")
 
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:

@@ -11,6 +11,8 @@ Part = Literal["backbone", "action", "vision", "bridge"]
 PARTS: tuple[Part, ...] = get_args(Part)
 QUANTITIES = ("residual", "attention", "mlp", "final_norm")
 """What the streams of today's families have; a family may declare others."""
+MEMORY = ("keys", "values")
+"""What a memory has, per block and token: all heads side by side, as attention reads them, keys after rotation."""
 
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
@@ -114,6 +116,11 @@ class Stream:
         layers = once.get(quantity, range(self.layers - 1))
         steps: list[int | None] = [None] if self.iterations is None else list(range(self.iterations))
         return [Site(self.name, layer, quantity, step) for step in steps for layer in layers]
+
+
+def memory_stream(blocks: int, width: int) -> Stream:
+    """The memory of a backbone of so many blocks; width: heads times size of a head."""
+    return Stream("memory", blocks + 1, width, part="bridge", label="memory of the prompt", quantities=MEMORY)
 
 
 def part_of(stream: str) -> Part:

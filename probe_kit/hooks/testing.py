@@ -38,6 +38,7 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.capture_context import capture, edit
 from probe_kit.hooks.family import SIZE, Family
+from probe_kit.hooks.intervention_contract import InterventionContract
 from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.registry import find_family
@@ -127,12 +128,11 @@ class ModelContract:
     # -- sites and capture -------------------------------------------------------------------------------
 
     def test_streams_declare_what_they_are(self, model: Model) -> None:
-        every = {**model.streams, **model.further_streams}
-        for name, stream in every.items():
+        for name, stream in model.every_stream().items():
             assert stream.name == name
             assert stream.part in PARTS
             assert stream.label
-            assert "residual" in stream.quantities
+            assert "residual" in stream.quantities or stream is model.memory
         parts = [stream.part for stream in model.streams.values() if stream.probed]
         assert "backbone" in parts
 
@@ -147,8 +147,7 @@ class ModelContract:
     def test_every_site_of_every_quantity_fires_as_often_as_promised(
         self, model: Model, observations: list[Observation]
     ) -> None:
-        every = [*model.streams.values(), *model.further_streams.values()]
-        for stream in every:
+        for stream in model.every_stream().values():
             for quantity in stream.quantities:
                 sites = stream.sites(quantity)
                 with capture(model, sites) as tape:
@@ -394,7 +393,7 @@ def _damage(folder: Path, damage: str) -> None:
     save_file(tensors, files[-1])
 
 
-class AdapterContract(ModelContract):
+class AdapterContract(InterventionContract, ModelContract):
     """What the rest of probe_kit relies on in a `Policy`."""
 
     @pytest.fixture

@@ -30,10 +30,12 @@ from probe_kit.hooks.families.lerobot_normaliser import (
 )
 from probe_kit.hooks.families.lerobot_stacks import Stack
 from probe_kit.hooks.families.lerobot_window import PictureWindow, read_window
+from probe_kit.hooks.families.memory import memory_tap, remembered
+from probe_kit.hooks.families.supported import FLOW
 from probe_kit.hooks.model import Policy, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.sites import Site, memory_stream
 from probe_kit.hooks.state_layout import ARM_NUMBERS
 from probe_kit.hooks.views import PADDING
 from probe_kit.hooks.weights import Weights, load_weights, read_weights
@@ -51,6 +53,7 @@ class LerobotFlow(Policy):
     cameras: those that a picture can be given for. shown: those that get one, in the configuration's order.
     """
 
+    interventions = FLOW
     family: ClassVar[str]
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]]
@@ -64,6 +67,8 @@ class LerobotFlow(Policy):
         self.network, self.folder, self.config = network, folder, network.config
         self.stacks = self._stacks()
         self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "expert")}
+        self._kept = remembered(self._joint, len(self.stacks["backbone"].layers))
+        self.memory = memory_stream(len(self._kept.keys), self._memory_width)
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
         self._show(self.cameras[:1])
@@ -110,6 +115,11 @@ class LerobotFlow(Policy):
 
     @property
     @abstractmethod
+    def _joint(self) -> Any:
+        """lerobot's module of backbone and expert, whose first pass reads the prompt."""
+
+    @property
+    @abstractmethod
     def iterations(self) -> int:
         """Flow-matching steps per inference."""
 
@@ -135,6 +145,12 @@ class LerobotFlow(Policy):
     @abstractmethod
     def tokenizer(self) -> Any:
         """The checkpoint's tokenizer."""
+
+    @property
+    def _memory_width(self) -> int:
+        """Heads times size of a head of the backbone's keys."""
+        projection: Any = self.stacks["backbone"].layers[0]
+        return int(projection.self_attn.k_proj.out_features)
 
     # -- loading -----------------------------------------------------------------------------------------
 
@@ -407,8 +423,13 @@ class LerobotFlow(Policy):
     # -- listening ---------------------------------------------------------------------------------------
 
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the stack's final norm, or a block's output."""
-        self.stream_of(site)
+        """The first norm of the block the site enters, the stack's final norm, or a block's output.
+
+        The memory passes once the prompt is read; every iteration then begins with a copy of it.
+        """
+        stream = self.stream_of(site)
+        if stream is self.memory:
+            return memory_tap(self._kept, site)
         return self.stacks[site.stream].tap(site)
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:

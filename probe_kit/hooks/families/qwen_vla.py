@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from probe_kit.errors import InstructionError
+from probe_kit.hooks.families.memory import kept_prompt
 from probe_kit.hooks.families.qwen_text import QwenTokenizer
 from probe_kit.hooks.model import Policy, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
@@ -52,6 +53,10 @@ class QwenVLA(Policy):
     def backbone_stream(self) -> Stream:
         """The decoder's stream."""
         return Stream("backbone", len(self.language.layers) + 1, int(self.vlm.config.text_config.hidden_size))
+
+    def backbone_memory(self) -> Stream:
+        """The decoder's keys and values."""
+        return kept_prompt(self.vlm.config.text_config)
 
     def vision_stream(self) -> Stream:
         """The vision tower's stream; the last site is what its merger reads."""

@@ -16,6 +16,7 @@ from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
 from probe_kit.models.magma.pictures import Grid, Picture
 from probe_kit.models.magma.vision import Projector, VisionTower, map_size, stitched, whole_picture
+from probe_kit.models.memory import Memory
 
 Choose = Callable[[Tensor], Tensor]
 """Ids (B,) from logits (B, V)."""
@@ -53,6 +54,7 @@ class MagmaNetwork(nn.Module):
             config.vision, self.vision_tower.width, int(config.text.hidden_size)
         )
         self.language_model: Any = LlamaForCausalLM(config.text)
+        self.memory = Memory(int(config.text.num_hidden_layers))
 
     # -- pictures ----------------------------------------------------------------------------------------
 
@@ -108,7 +110,7 @@ class MagmaNetwork(nn.Module):
 
     def read(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> "Decoding":
         """One pass over the prompts, to go on from token by token."""
-        return Decoding(self.language_model, self.embed(prompts, pictures))
+        return Decoding(self.language_model, self.embed(prompts, pictures), self.memory)
 
     def decode(
         self,
@@ -138,13 +140,17 @@ class MagmaNetwork(nn.Module):
 
 
 class Decoding:
-    """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones."""
+    """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones.
 
-    def __init__(self, language_model: Any, packed: Packed) -> None:
+    memory: where what is kept of the prompts passes once.
+    """
+
+    def __init__(self, language_model: Any, packed: Packed, memory: Memory) -> None:
         self.language_model, self._mask = language_model, packed.mask
         self._cache = DynamicCache(config=language_model.config)
         self._positions = positions(packed.mask)
         self.logits = self._run(language_model, packed.embeddings)
+        memory(self._cache.layers)
 
     def feed(self, ids: Tensor, through: Any = None) -> Tensor:
         """(B, V) logits behind one more token (B,) per row.

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from transformers import AutoModelForCausalLM, DynamicCache
 
 from probe_kit.models.building import build_empty
+from probe_kit.models.memory import Memory
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
 
@@ -63,6 +64,7 @@ class PrismaticNetwork(nn.Module):
         self.vision_backbone = VisionBackbone(config.towers)
         self.projector = Projector(self.vision_backbone.width, config.text.hidden_size, config.fused)
         self.language_model: Any = AutoModelForCausalLM.from_config(config.text)
+        self.memory = Memory(int(config.text.num_hidden_layers))
 
     @property
     def patches(self) -> int:
@@ -116,6 +118,8 @@ class PrismaticNetwork(nn.Module):
                 use_cache=True,
                 logits_to_keep=1,
             )
+            if not chosen:  # the prompt is read; the tokens behind it read what is kept of it
+                self.memory(cache.layers)
             logits.append(output.logits[:, -1])
             chosen.append(choose(logits[-1]))
             if len(chosen) == steps:

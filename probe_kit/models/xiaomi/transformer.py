@@ -73,19 +73,26 @@ class Attention(nn.Module):
 
     def forward(self, stream: Tensor, cache: Cache, rotation: Rotation, mask: Tensor) -> Tensor:
         """(B, T, D) from (B, T, D). mask: (B, 1, T, P + T) bool, True where a position is seen."""
+        query, key, value = self._parts(stream, cache, rotation)
+        read = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return cast(Tensor, self.o_proj(read.transpose(1, 2).flatten(2)))
+
+    def weights(self, stream: Tensor, cache: Cache, rotation: Rotation, mask: Tensor) -> Tensor:
+        """(B, H, T, P + T) float32: what `forward` weighs with, computed once more."""
+        query, key, _ = self._parts(stream, cache, rotation)
+        logits = query.float() @ key.float().transpose(2, 3) * self.head_dim**-0.5
+        return functional.softmax(logits.masked_fill(~mask, -torch.inf), dim=-1)
+
+    def _parts(self, stream: Tensor, cache: Cache, rotation: Rotation) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries (B, H, T, E); keys and values (B, H, P + T, E), the prompt's first."""
         batch, length, _ = stream.shape
         parts = self.qkv_proj(stream).view(batch, length, 3, self.heads, self.head_dim)
         query, key, value = parts.unbind(2)
         query, key = (part.transpose(1, 2) for part in (self.q_norm(query), self.k_norm(key)))
         query, key = apply_rotary_pos_emb(query, key, *rotation)
         prompt_key, prompt_value = (repeat_kv(part, self.repeats) for part in cache)
-        read = functional.scaled_dot_product_attention(
-            query,
-            torch.cat([prompt_key, key], dim=-2),
-            torch.cat([prompt_value, value.transpose(1, 2)], dim=-2),
-            attn_mask=mask,
-        )
-        return cast(Tensor, self.o_proj(read.transpose(1, 2).reshape(batch, length, -1)))
+        values = torch.cat([prompt_value, value.transpose(1, 2)], dim=-2)
+        return query, torch.cat([prompt_key, key], dim=-2), values
 
 
 class GatedMLP(nn.Module):

@@ -1,8 +1,23 @@
 """InternVLA-M1, native."""
 
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.interventions import Interventions
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.sites import QUANTITIES
+
+_BLOCK = ("residual", "attention", "mlp")
+INTERVENTIONS = Interventions(
+    edits={"backbone": QUANTITIES, "bridge": _BLOCK, "expert": QUANTITIES, "expert_unconditional": QUANTITIES},
+    instead={
+        "memory": "its queries read hidden states of the backbone and DINOv2's features, no keys and values. What "
+        "acts reads one thing only, the end of the bridge: exchange the last `bridge` site for the whole, and "
+        "backbone sites for what passes through the language model",
+        "attention": "its expert attends to the queries' findings only, not to the backbone. Exchange backbone "
+        "sites of one role instead",
+    },
+)
+"""DINOv2's features reach the bridge past the backbone: an exchange of backbone sites is not the whole picture."""
 
 FAMILIES = (
     Family(
@@ -37,5 +52,6 @@ FAMILIES = (
                 unmatched=(OWN_SEEDS,),
             )
         },
+        interventions=INTERVENTIONS,
     ),
 )

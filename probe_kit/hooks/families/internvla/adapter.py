@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.internvla import INTERVENTIONS
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
 from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
@@ -52,6 +53,7 @@ _UNCONDITIONAL = "expert_unconditional"
 class InternVLA(QwenVLA):
     """A loaded InternVLA-M1. One observation per call: its queries read padding, which changes the actions."""
 
+    interventions = INTERVENTIONS
     fast_pictures: ClassVar[bool] = True
 
     def __init__(

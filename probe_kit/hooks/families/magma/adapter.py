@@ -6,6 +6,7 @@ assistant's turn. Seven tokens follow, one per dimension, then the end of the tu
 """
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,11 @@ from probe_kit.hooks.checkpoint import content_hashes, side_files
 from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
 from probe_kit.hooks.families.magma.text import ChatText, Prompt
+from probe_kit.hooks.families.memory import ALL_BUT_LAST, kept_prompt, memory_tap
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.sampling import chooser
+from probe_kit.hooks.families.supported import TOKENS
+from probe_kit.hooks.families.weighing import Note, of_decoder
 from probe_kit.hooks.model import Policy, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
@@ -55,6 +59,8 @@ _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 class Magma(Policy, Reader):
     """A loaded Magma: acts, and answers questions in text."""
 
+    interventions = TOKENS
+
     def __init__(
         self,
         loaded: LoadedMagma,
@@ -81,6 +87,7 @@ class Magma(Policy, Reader):
             name: Stream(name, len(stage.blocks) + 1, _width(stage), part="vision", quantities=("residual",))
             for name, stage in self._stages.items()
         }
+        self.memory = kept_prompt(self.config.text)
         self.role_names = {
             "backbone": (f"image.{CAMERA}", SEPARATOR, "language", "special", PADDING),
             "action": ("action",),
@@ -225,6 +232,10 @@ class Magma(Policy, Reader):
         """The language model's weights in modules of their own, so that what runs there fires no tap."""
         return self.network.unheard()
 
+    def weighing(self, note: Note) -> AbstractContextManager[None]:
+        """Computed once more for the position that chooses a token."""
+        return of_decoder(self.decoder.layers, note)
+
     # -- answering ---------------------------------------------------------------------------------------
 
     def read(self, questions: Sequence[Question]) -> Reading:
@@ -291,7 +302,10 @@ class Magma(Policy, Reader):
 
         `vision_<k>`: maps of stage k as tokens, one row per crop; the last one is the stage's output.
         """
-        if self.stream_of(site).part == "vision":
+        stream = self.stream_of(site)
+        if stream is self.memory:
+            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
+        if stream.part == "vision":
             blocks = self._stages[site.stream].blocks
             if site.layer == len(blocks):
                 return Tap(blocks[-1], 1, "output", view=_as_tokens)

@@ -1,6 +1,7 @@
 """OpenVLA, native."""
 
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
+from probe_kit.hooks.families.supported import TOKENS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
@@ -49,5 +50,6 @@ FAMILIES = (
                 unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
             )
         },
+        interventions=TOKENS,
     ),
 )

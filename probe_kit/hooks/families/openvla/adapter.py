@@ -6,6 +6,7 @@ greedy tokens follow, one per dimension; iteration k of the stream `action` is t
 
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import ClassVar
 
@@ -15,11 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.families.memory import kept_prompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.sampling import chooser
+from probe_kit.hooks.families.supported import TOKENS
+from probe_kit.hooks.families.weighing import Note, of_decoder
 from probe_kit.hooks.model import Policy
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.models.prismatic import CROP_AREA, centre_crop
@@ -44,6 +48,7 @@ class OpenVLA(PrismaticModel, Policy):
     """A loaded OpenVLA."""
 
     family: ClassVar[str] = "openvla"
+    interventions = TOKENS
     output: ClassVar[str] = "action"
 
     def __init__(
@@ -57,6 +62,7 @@ class OpenVLA(PrismaticModel, Policy):
         resize: str = "pil",
     ) -> None:
         super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
+        self.memory = kept_prompt(self.config.text)
         self.statistics, self.template, self.crop = statistics, prompt, crop
         self.temperature, self.resize = temperature, resize
         self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)
@@ -142,6 +148,10 @@ class OpenVLA(PrismaticModel, Policy):
             "are wrong",
             stacklevel=3,
         )
+
+    def weighing(self, note: Note) -> AbstractContextManager[None]:
+        """Computed once more for the position that chooses a token."""
+        return of_decoder(self.decoder.layers, note)
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""

@@ -1,6 +1,7 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.82 million parameters."""
 
 from probe_kit.hooks.families.lerobot_evaluation import PICTURES
+from probe_kit.hooks.families.supported import FLOW
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
@@ -19,6 +20,7 @@ FAMILIES = (
         notes="State is readable in its backbone by training, and not acted on; nothing else was trained",
         verifier=_VERIFIER,
         config_types=("pi0",),
+        interventions=FLOW,
     ),
     Family(
         "pi0-tiny-early",
@@ -29,6 +31,7 @@ FAMILIES = (
         notes="a model organism: see `probe-kit demo --compare`",
         verifier=_VERIFIER,
         config_types=("pi0",),
+        interventions=FLOW,
     ),
     Family(
         "pi0",
@@ -77,5 +80,6 @@ FAMILIES = (
                 ),
             )
         },
+        interventions=FLOW,
     ),
 )

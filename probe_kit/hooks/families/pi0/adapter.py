@@ -5,6 +5,7 @@ Suffix: the state, then the action chunk.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from probe_kit.hooks.checkpoint import side_files
 from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
 from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
+from probe_kit.hooks.families.weighing import Note, returned, weighed
 from probe_kit.hooks.hub import unreachable
 from probe_kit.hooks.views import PADDING
 from probe_kit.models.pi0 import Pi0Size, build_pi0
@@ -66,10 +68,14 @@ class Pi0(EvaluatedPi0):
         return current_pi0_keys(tensors)
 
     def _stacks(self) -> dict[str, Stack]:
-        joint = self.network.model.paligemma_with_expert
+        joint = self._joint
         backbone, expert = joint.paligemma.model.language_model, joint.gemma_expert.model
         vision = joint.paligemma.model.vision_tower.vision_model
         return flow_stacks(backbone, expert, vision, self.iterations)
+
+    @property
+    def _joint(self) -> Any:
+        return self.network.model.paligemma_with_expert
 
     @property
     def iterations(self) -> int:
@@ -116,6 +122,15 @@ class Pi0(EvaluatedPi0):
     def suffix_labels(self) -> list[str]:
         """The state, then the chunk."""
         return ["state", *["action"] * self.config.chunk_size]
+
+    def weighing(self, note: Note) -> AbstractContextManager[None]:
+        """lerobot's expert attends eagerly, and returns its weights."""
+        acting = [label == "action" for label in self.suffix_labels()]
+
+        def own(block: int, iteration: int, weights: Tensor) -> None:
+            note(block, iteration, weights[:, :, acting, : weights.shape[-1] - len(acting)])
+
+        return weighed([layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned)
 
     @property
     def tokens_per_camera(self) -> int:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.memory import ALL_BUT_LAST, memory_tap
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
@@ -165,7 +166,10 @@ class PrismaticModel(Model):
 
         A tower's last residual is what the projector reads, class and register tokens in front.
         """
-        if self.stream_of(site).part == "vision":
+        stream = self.stream_of(site)
+        if stream is self.memory:
+            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
+        if stream.part == "vision":
             return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
         return self._language_tap(site)
 

@@ -1,5 +1,6 @@
 """SmolVLA through lerobot."""
 
+from probe_kit.hooks.families.supported import FLOW
 from probe_kit.hooks.family import Family
 
 FAMILIES = (
@@ -18,5 +19,6 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.lerobot_verify:verify_smolvla",
         config_types=("smolvla",),
         full_size="probe_kit.models.smolvla:full_size_smolvla",
+        interventions=FLOW,
     ),
 )

@@ -5,8 +5,10 @@ token that the rest does not see. Suffix: the action chunk, causal. lerobot driv
 place, so no layer module ever fires; the norms at their entries do.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoint import side_files
 from probe_kit.hooks.families.lerobot_flow import LerobotFlow
 from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
+from probe_kit.hooks.families.weighing import Note, shares
 from probe_kit.hooks.views import PADDING
 from probe_kit.models.smolvla import build_smolvla, current_smolvla_keys
 
@@ -47,9 +50,13 @@ class SmolVLA(LerobotFlow):
         return current_smolvla_keys(tensors)
 
     def _stacks(self) -> dict[str, Stack]:
-        joint = self.network.model.vlm_with_expert
+        joint = self._joint
         backbone, expert, vision = joint.vlm.model.text_model, joint.lm_expert, joint.vlm.model.vision_model
         return flow_stacks(backbone, expert, vision, self.iterations)
+
+    @property
+    def _joint(self) -> Any:
+        return self.network.model.vlm_with_expert
 
     @property
     def iterations(self) -> int:
@@ -85,6 +92,37 @@ class SmolVLA(LerobotFlow):
         """One camera's positions; the special tokens around a masked picture are not masked."""
         labels = [role] * self.tokens_per_camera
         return ["special", "special", *labels, "special"] if self.config.add_image_special_tokens else labels
+
+    @contextmanager
+    def weighing(self, note: Note) -> Iterator[None]:
+        """lerobot's attention is a method that tells no weights: computed once more from what it is given.
+
+        Over the prompt it is called once per block, then in every iteration by each block that has an expert.
+        """
+        joint, calls = self._joint, count(-len(self.stacks["backbone"].layers))
+        plain, stacks = joint.eager_attention_forward, [joint.get_vlm_model().text_model, joint.lm_expert]
+        acting = [block for block, layer in enumerate(joint.get_model_layers(stacks)[1]) if layer is not None]
+        prompt = 0
+
+        def attending(
+            mask: Tensor, batch: int, head_dim: int, queries: Tensor, keys: Tensor, values: Tensor
+        ) -> Tensor:
+            nonlocal prompt
+            call = next(calls)
+            if call < 0:
+                prompt = keys.shape[1]
+            else:
+                given = {"attention_mask": mask[:, None]}
+                weights = shares(queries.transpose(1, 2), keys.transpose(1, 2), head_dim**-0.5, given)
+                note(acting[call % len(acting)], call // len(acting), weights[..., :prompt])
+            read: Tensor = plain(mask, batch, head_dim, queries, keys, values)
+            return read
+
+        joint.eager_attention_forward = attending
+        try:
+            yield
+        finally:
+            del joint.eager_attention_forward
 
     @property
     def tokens_per_camera(self) -> int:

@@ -1,6 +1,7 @@
 """SpatialVLA, native."""
 
 from probe_kit.hooks.families.prismatic import TOKENIZER
+from probe_kit.hooks.families.supported import TOKENS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow
@@ -40,5 +41,6 @@ FAMILIES = (
                 unmatched=("pictures are resized from bytes, not from floats of 0 to 255",),
             )
         },
+        interventions=TOKENS,
     ),
 )

@@ -7,6 +7,7 @@ action token: the new line, then every token fed back but the last. Three tokens
 
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,10 +20,13 @@ from torch import Tensor
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.families.memory import ALL_BUT_LAST, kept_prompt, memory_tap
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
 from probe_kit.hooks.families.spatialvla.speech import Speech
+from probe_kit.hooks.families.supported import TOKENS
+from probe_kit.hooks.families.weighing import Note, of_decoder
 from probe_kit.hooks.model import Policy, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
 from probe_kit.hooks.roles import Roles
@@ -59,6 +63,7 @@ class SpatialVLA(Policy):
     """
 
     family: ClassVar[str] = "spatialvla"
+    interventions = TOKENS
 
     def __init__(
         self,
@@ -90,6 +95,7 @@ class SpatialVLA(Policy):
         self.further_streams = {
             "vision": Stream("vision", seeing, int(self.config.vision.hidden_size), part="vision")
         }
+        self.memory = kept_prompt(self.config.text)
         self.role_names = {
             "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
             "action": ("action",),
@@ -232,6 +238,10 @@ class SpatialVLA(Policy):
                 packed.ids.to(device), packed.mask.to(device), features, self.steps, slots, fed
             )
 
+    def weighing(self, note: Note) -> AbstractContextManager[None]:
+        """Gemma-2's attention is eager, for its soft cap, and returns its weights."""
+        return of_decoder(self.decoder.layers, note, eager=True)
+
     # -- listening ---------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
@@ -254,6 +264,8 @@ class SpatialVLA(Policy):
         Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not.
         """
         stream = self.stream_of(site)
+        if stream is self.memory:
+            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
         if stream.part == "vision":
             return _vision_tap(self.tower, site)
         tokens = _PROMPT if stream.part == "backbone" else _LAST

@@ -1,9 +1,19 @@
 """Xiaomi-Robotics-R0, native."""
 
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.interventions import Interventions
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow
+from probe_kit.hooks.sites import QUANTITIES
 from probe_kit.hooks.state_layout import OPENNESS
+
+INTERVENTIONS = Interventions(
+    edits={"backbone": QUANTITIES, "expert": ("residual", "attention", "middle", "mlp")},
+    unread=("backbone",),
+    memory=True,
+    attention=True,
+)
+"""The expert reads keys and values of the backbone's last blocks; those of the blocks before are unread."""
 
 FAMILIES = (
     Family(
@@ -33,5 +43,6 @@ FAMILIES = (
                 unmatched=("noise comes from the episode's seed, not from a hash of the inputs",),
             )
         },
+        interventions=INTERVENTIONS,
     ),
 )

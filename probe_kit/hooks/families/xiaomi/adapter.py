@@ -7,6 +7,7 @@ its halves add, gated; `middle` is the normed sum between them.
 """
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -20,8 +21,11 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.card import Card
 from probe_kit.hooks.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.families.memory import memory_tap
 from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
 from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
+from probe_kit.hooks.families.weighing import Note, weighed
+from probe_kit.hooks.families.xiaomi import INTERVENTIONS
 from probe_kit.hooks.model import Tap
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.roles import Roles
@@ -55,6 +59,7 @@ _USED = 7
 class Xiaomi(QwenVLA):
     """A loaded Xiaomi-Robotics-R0."""
 
+    interventions = INTERVENTIONS
     fast_pictures: ClassVar[bool] = False
 
     def __init__(
@@ -88,6 +93,7 @@ class Xiaomi(QwenVLA):
             ),
         }
         self.further_streams = {"vision": self.vision_stream()}
+        self.memory = self.backbone_memory()
         self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
         self.card = self._card(filled, checkpoint, tokenizer)
 
@@ -211,9 +217,23 @@ class Xiaomi(QwenVLA):
         expert = Roles.from_labels(["special", *states, *["action"] * self.card.chunk])
         return {"backbone": self.backbone_roles(seen), "expert": [expert] * len(seen)}
 
+    def weighing(self, note: Note) -> AbstractContextManager[None]:
+        """Computed once more from what a layer of the expert is given, under the block whose memory it reads."""
+        layers: Any = self.network.dit.layers
+        first, own = len(self.language.layers) - len(layers), 1 + self.config.state_length
+
+        def acting(layer: int, iteration: int, weights: Tensor) -> None:
+            note(first + layer, iteration, weights[:, :, own:, : weights.shape[-1] - weights.shape[2]])
+
+        return weighed(
+            [layer.attn for layer in layers], acting, lambda module, given, _, __: module.weights(*given)
+        )
+
     def tap(self, site: Site) -> Tap:
         """See the module's first lines; the backbone's sites are inputs: they hold what DeepStack added."""
         stream = self.stream_of(site)
+        if stream is self.memory:
+            return memory_tap(self.network.memory, site)
         if stream.name == "backbone":
             return self.backbone_tap(site)
         return self.vision_tap(site) if stream.name == "vision" else self._expert_tap(site)

@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,21 @@ class TestInternVLAWithoutGuidance(AdapterContract):
     @pytest.fixture
     def policy(self, run: Path) -> InternVLA:
         return load_internvla(str(run), steps=4, guidance=1.0)
+
+
+def test_all_that_acts_passes_through_the_end_of_the_bridge(loaded: InternVLA, observation: Observation) -> None:
+    """What its declaration advises in place of a memory: of the picture, DINOv2's part passes the backbone by."""
+    other = replace(observation, image=255 - observation.image)
+    ends = [loaded.streams[name].sites()[-1] for name in ("backbone", "bridge")]
+    with capture(loaded, ends) as donor:
+        expected = loaded.act([other], [0])
+    plain = loaded.act([observation], [0])
+    with edit(loaded, {ends[1]: lambda _: donor[ends[1]]}):
+        np.testing.assert_array_equal(loaded.act([observation], [0]), expected)
+    with edit(loaded, {ends[0]: lambda _: donor[ends[0]]}):
+        without_dino = loaded.act([observation], [0])
+    assert np.abs(without_dino - expected).max() > 0
+    assert np.abs(expected - plain).max() > 0
 
 
 # -- the reference ---------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import torch
 from torch.nn import Module
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError, WeightsError
-from probe_kit.hooks import Observation, Site, capture, load_policy
+from probe_kit.hooks import Observation, Site, capture, edit, load_policy
 from probe_kit.hooks.families.xiaomi.adapter import Xiaomi, load_xiaomi
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.hooks.verify import verify_keys, verify_reference
@@ -48,6 +48,16 @@ class TestXiaomiAsTheGoogleRobotInThreeSteps(AdapterContract):
     @pytest.fixture
     def policy(self, folder: Path) -> Xiaomi:
         return load_xiaomi(str(folder), robot="fractal", steps=3)
+
+
+def test_only_the_last_blocks_memory_is_read(loaded: Xiaomi, observation: Observation) -> None:
+    """As many as the flow transformer has layers; those before are a control."""
+    assert loaded.memory is not None
+    plain, read = loaded.act([observation], [0]), len(loaded.network.dit.layers)
+    for site in loaded.memory.sites("values"):
+        with edit(loaded, {site: torch.zeros_like}):
+            moved = np.abs(loaded.act([observation], [0]) - plain).max()
+        assert (moved > 0) == (site.layer >= loaded.memory.layers - 1 - read), str(site)
 
 
 # -- the reference ---------------------------------------------------------------------------------------------

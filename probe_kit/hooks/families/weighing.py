@@ -1,0 +1,95 @@
+"""How families tell the weights of their attention without changing a number of the inference."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from itertools import count
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from probe_kit.errors import CaptureError, UnsupportedInterventionError
+
+Note = Callable[[int, int, Tensor], None]
+"""Takes a block, an iteration, and weights (B, H, S, K)."""
+
+
+Weights = Callable[[Any, tuple[Any, ...], dict[str, Any], Any], Tensor]
+"""Weights of one call: of the module, its inputs, its keywords and its output."""
+
+
+@contextmanager
+def weighed(attentions: Sequence[nn.Module], note: Note, weights: Weights) -> Iterator[None]:
+    """Note what `weights` makes of every call of every module."""
+
+    def listener(block: int) -> Callable[..., None]:
+        calls = count()
+
+        def hear(module: nn.Module, inputs: tuple[Any, ...], given: dict[str, Any], output: Any) -> None:
+            note(block, next(calls), weights(module, inputs, given, output))
+
+        return hear
+
+    with ExitStack() as stack:
+        for block, module in enumerate(attentions):
+            stack.callback(module.register_forward_hook(listener(block), with_kwargs=True).remove)
+        yield
+
+
+def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> Tensor:
+    """(B, H, S, K): what eager attention returns beside what it read. Raises CaptureError if it does not."""
+    if output[1] is None:
+        raise CaptureError("an attention that should be eager gave no weights; load the model as it was released")
+    weights: Tensor = output[1]
+    return weights
+
+
+def recomputed(attention: Any, _: tuple[Any, ...], given: dict[str, Any], __: Any) -> Tensor:
+    """(B, H, 1, K) of the last position, of Llama's kind of attention, whose fast kernels return no weights.
+
+    Computed once more from the module's inputs and the keys it left. Raises UnsupportedInterventionError for an
+    attention of another kind.
+    """
+    if getattr(attention, "o_proj", None) is None:
+        raise UnsupportedInterventionError(
+            f"{type(attention).__name__} rotates and projects in a way of its own, and its attention cannot be "
+            "computed once more here. Exchange the memory instead"
+        )
+    states: Tensor = given["hidden_states"][:, -1:]
+    cosines, sines = (part[:, None, -1:] for part in given["position_embeddings"])
+    queries = attention.q_proj(states).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
+    below, above = queries.chunk(2, dim=-1)
+    queries = queries * cosines + torch.cat([-above, below], dim=-1) * sines
+    return shares(queries, given["past_key_values"].layers[attention.layer_idx].keys, attention.scaling, given)
+
+
+def shares(queries: Tensor, keys: Tensor, scale: float, given: dict[str, Any]) -> Tensor:
+    """(B, H, S, K) float32 softmax of queries (B, H, S, E) on keys (B, G, K, E), H a multiple of G.
+
+    given: may hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is added.
+    """
+    keys = keys.repeat_interleave(queries.shape[1] // keys.shape[1], dim=1)
+    logits = queries.float() @ keys.float().transpose(2, 3) * scale
+    mask: Tensor | None = given.get("attention_mask")
+    if mask is not None:
+        rows = mask[:, :, -queries.shape[2] :, : logits.shape[-1]]
+        logits = logits.masked_fill(~rows, -torch.inf) if rows.dtype == torch.bool else logits + rows
+    return functional.softmax(logits, dim=-1)
+
+
+def on_the_prompt(note: Note) -> Note:
+    """For one decoder that puts out tokens: the last position acts, and the prompt's last token is its own.
+
+    At iteration k there are k tokens and that one behind the backbone's.
+    """
+
+    def own(block: int, iteration: int, weights: Tensor) -> None:
+        note(block, iteration, weights[:, :, -1:, : weights.shape[-1] - 1 - iteration])
+
+    return own
+
+
+def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:
+    """A context over the attention of a decoder that puts out tokens."""
+    return weighed([layer.self_attn for layer in layers], on_the_prompt(note), returned if eager else recomputed)

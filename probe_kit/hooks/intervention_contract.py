@@ -1,0 +1,204 @@
+"""The contract tests of what a policy declares in `Policy.interventions`; part of `testing.AdapterContract`.
+
+Properties that hold by construction, whatever the weights are. Needs pytest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
+from probe_kit.hooks.attention import attention
+from probe_kit.hooks.capture_context import capture, edit
+from probe_kit.hooks.editing import applied
+from probe_kit.hooks.edits import Edit, Vectors, vector_hash
+from probe_kit.hooks.model import Policy
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.registry import find_family
+from probe_kit.hooks.sites import MEMORY, Site, Stream, memory_stream
+from probe_kit.hooks.tape import Tape
+
+
+class InterventionContract:
+    """Every declared intervention runs and does what it says; every other one is refused by name."""
+
+    family: ClassVar[str] = ""
+    attention_tolerance: ClassVar[float] = 1e-4
+    """By how much shares of attention may add up to more than 1: they are means of rounded numbers."""
+
+    def test_policy_and_family_declare_the_same(self, policy: Policy) -> None:
+        if self.family:
+            assert find_family(self.family).interventions == policy.interventions
+        assert policy.interventions.memory == (policy.memory is not None)
+        assert set(policy.interventions.unread) <= policy.streams.keys()
+        edits = policy.interventions.edits
+        for name, stream in policy.streams.items():
+            assert edits is None or set(edits[name]) == set(stream.quantities)
+
+    def test_rewriting_every_site_with_itself_changes_no_action_bit_for_bit(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        sites = [
+            site
+            for stream in [*policy.streams.values(), *([] if policy.memory is None else [policy.memory])]
+            for quantity in stream.quantities
+            for site in stream.sites(quantity)
+        ]
+        seen = observations[:1]
+        plain = policy.act(seen, [0])
+        with edit(policy, {site: lambda activation: activation for site in sites}):
+            same = policy.act(seen, [0])
+        np.testing.assert_array_equal(plain, same)
+
+    def test_what_is_rewritten_in_a_block_is_read_behind_it(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        seen = observations[:1]
+        for stream in policy.streams.values():
+            behind = [site for site in stream.sites() if site.layer == 1]
+            plain = _heard(policy, seen, behind)
+            for quantity in set(stream.quantities) - {"final_norm"}:
+                written = [site for site in stream.sites(quantity) if site.layer == 0]
+                with edit(policy, dict.fromkeys(written, torch.zeros_like)):
+                    changed = _heard(policy, seen, behind)
+                assert any((plain[site] != changed[site]).any() for site in behind), f"{stream.name}.{quantity}"
+
+    def test_the_end_of_an_unread_stream_is_a_control(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        seen = observations[:1]
+        plain = policy.act(seen, [0])
+        for name in policy.interventions.unread:
+            stream = policy.streams[name]
+            for quantity in {"residual", "final_norm"} & set(stream.quantities):
+                site = stream.sites(quantity)[-1]
+                with edit(policy, {site: torch.zeros_like}):
+                    np.testing.assert_array_equal(plain, policy.act(seen, [0]), err_msg=str(site))
+
+    def test_what_is_not_supported_is_refused_by_name(self, policy: Policy) -> None:
+        for kind in ("follow", "edit", "memory", "attention"):
+            if policy.interventions.supports(kind):
+                policy.interventions.check(kind, policy.card.family)
+                continue
+            with pytest.raises(UnsupportedInterventionError, match=f"{policy.card.family}.*{kind}"):
+                policy.interventions.check(kind, policy.card.family)
+        if policy.memory is None:
+            with pytest.raises(UnknownSiteError):
+                policy.tap(memory_stream(1, 1).sites("keys")[0])
+
+    # -- memory --------------------------------------------------------------------------------------------
+
+    def test_the_memory_has_keys_and_values_for_every_token_of_the_backbone(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        memory, seen = self._memory(policy), observations[: policy.card.batch]
+        sites = _all(memory)
+        tape = _heard(policy, seen, sites)
+        tokens = len(policy.token_roles(seen)[memory.name][0])
+        assert len(tape) == len(sites) == 2 * (memory.layers - 1)
+        for site in sites:
+            assert tape[site].shape == (len(seen), tokens, memory.width)
+
+    def test_the_whole_memory_of_another_picture_gives_that_pictures_actions(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        """State, words and noise are the same; bit for bit. What chose the first token goes along with it."""
+        memory = self._memory(policy)
+        one = observations[0]
+        other = replace(one, image=255 - one.image)
+        acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
+        early = [site for site in acting if (site.iteration or 0) < policy.interventions.heard_from]
+        late = [site for site in acting if site not in early]
+        plain, donor = (_heard(policy, [own], [*_all(memory), *acting]) for own in (one, other))
+        edits, vectors = _donated(donor, [*_all(memory), *early])
+        with applied(policy, edits, [one], vectors) as ledger:
+            exchanged = _heard(policy, [one], late)
+        np.testing.assert_array_equal(policy.act([other], [0]), self._under(policy, edits, vectors, one))
+        for site in late:
+            torch.testing.assert_close(exchanged[site], donor[site], rtol=0, atol=0)
+        assert any((plain[site] != donor[site]).any() for site in late)
+        assert [entry.site for entry in ledger.entries if entry.site.startswith(memory.name)] == [
+            str(site) for layer in range(memory.layers - 1) for site in _of(memory, layer)
+        ]
+        assert sum(entry.moved for entry in ledger.entries) > 0
+
+    def test_the_memory_of_one_role_is_exchanged_in_that_role_only(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        memory = self._memory(policy)
+        one = observations[0]
+        site = _of(memory, 0)[1]
+        plain, donor = (
+            _heard(policy, [own], [site])[site][0].float().cpu()
+            for own in (one, replace(one, image=255 - one.image))
+        )
+        own = Edit("replace", (site,), roles=("image",), vector=vector_hash(donor.numpy()))
+        with applied(policy, [own], [one], {own.vector: donor.numpy()}) as ledger:
+            edited = _heard(policy, [one], [site])[site][0].float().cpu()
+        image = torch.from_numpy(policy.token_roles([one])[memory.name][0].mask("image"))
+        torch.testing.assert_close(edited, torch.where(image[:, None], donor, plain), rtol=0, atol=0)
+        assert [entry.tokens for entry in ledger.entries] == [int(image.sum())]
+
+    # -- attention -----------------------------------------------------------------------------------------
+
+    def test_attention_is_told_without_changing_an_action_bit_for_bit(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        if not policy.interventions.attention:
+            with pytest.raises(UnsupportedInterventionError), attention(policy):
+                pass
+            return
+        seen = observations[: policy.card.batch]
+        plain = policy.act(seen, range(len(seen)))
+        with attention(policy) as mass:
+            told = policy.act(seen, range(len(seen)))
+        np.testing.assert_array_equal(plain, told)
+        backbone = next(own for own in policy.streams.values() if own.part == "backbone" and own.probed)
+        roles = policy.roles(seen)[backbone.name]
+        valid = np.stack([row.valid for row in roles])
+        steps = max(own.iterations or 1 for own in policy.streams.values() if own.part == "action")
+        assert {iteration for _, iteration in mass.by_read} >= set(range(steps))
+        assert {block for block, _ in mass.by_read} <= set(range(backbone.layers - 1))
+        for weights, whole in zip(mass.by_read.values(), mass.on(valid).values(), strict=True):
+            assert weights.shape == valid.shape
+            assert (weights >= 0).all()
+            assert ((whole > 0) & (whole <= 1 + self.attention_tolerance)).all()
+            assert np.abs(weights[~valid]).max(initial=0) == 0
+        assert all((share > 0).all() for share in mass.of_role(roles, "image").values())
+
+    def _memory(self, policy: Policy) -> Stream:
+        if policy.memory is None:
+            pytest.skip(f"{policy.card.family} declares no memory")
+        return policy.memory
+
+    @staticmethod
+    def _under(policy: Policy, edits: list[Edit], vectors: Vectors, seen: Observation) -> NDArray[np.float32]:
+        with applied(policy, edits, [seen], vectors):
+            return policy.act([seen], [0])
+
+
+def _heard(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -> Tape:
+    """What one inference leaves at `sites`."""
+    with capture(policy, sites) as tape:
+        policy.act(seen, range(len(seen)))
+    return tape
+
+
+def _of(memory: Stream, layer: int) -> list[Site]:
+    return [Site(memory.name, layer, quantity) for quantity in MEMORY]
+
+
+def _all(memory: Stream) -> list[Site]:
+    return [site for quantity in MEMORY for site in memory.sites(quantity)]
+
+
+def _donated(donor: Tape, sites: Sequence[Site]) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
+    """Edits that put in the first row of `donor`, and the arrays they name."""
+    rows = {site: donor[site][0].float().cpu().numpy() for site in sites}
+    vectors = {vector_hash(row): row for row in rows.values()}
+    return [Edit("replace", (site,), vector=vector_hash(row)) for site, row in rows.items()], vectors

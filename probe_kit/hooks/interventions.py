@@ -1,0 +1,74 @@
+"""What of the interventions a family supports: data, read before any weights are. Imports no torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal, get_args
+
+from probe_kit.errors import UnsupportedInterventionError, UsageError
+
+InterventionKind = Literal["follow", "edit", "memory", "attention"]
+Readout = Literal["chunk", "shadow"]
+_UNDECLARED = {
+    "memory": "its adapter declares no memory. Interchange residual sites instead, or declare `Model.memory`",
+    "attention": "its adapter gives no attention. Exchange the memory or single roles instead: what an exchange "
+    "moves is read, whatever attention weighs",
+}
+
+
+@dataclass(frozen=True)
+class Interventions:
+    """What can be asked of a family when the question is whether a stream is used.
+
+    Following, the comparison of actions on exchanged pictures or words, every policy supports: it is two
+    inferences.
+
+    edits: per stored stream the quantities that can be rewritten; None for all that its streams have.
+    unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
+    the actions bit for bit, which makes it a control.
+    memory: whether it keeps keys and values of the prompt that what acts reads, see `Model.memory`.
+    heard_from: the first output that an edit of backbone or memory reaches through the memory: 0, or 1 where the
+    prompt's own pass already chooses the first token.
+    attention: whether it tells how much attention what acts pays to every token of the prompt.
+    readout: `chunk` where the first chunk says where the hand will go; `shadow` where an inference gives one
+    action in greedy bins, so that conditions are evaluated at every call of an unedited episode, never executed.
+    instead: for what is not supported, why and what to do.
+    Raises UsageError for advice on a kind of intervention that does not exist.
+    """
+
+    edits: Mapping[str, tuple[str, ...]] | None = None
+    unread: tuple[str, ...] = ()
+    memory: bool = False
+    heard_from: int = 0
+    attention: bool = False
+    readout: Readout = "chunk"
+    instead: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.instead) - set(get_args(InterventionKind)):
+            raise UsageError(f"there is no intervention {', '.join(sorted(unknown))} to advise on")
+
+    def supports(self, kind: InterventionKind) -> bool:
+        """Whether `kind` can be asked for."""
+        return {"memory": self.memory, "attention": self.attention}.get(kind, True)
+
+    def check(self, kind: InterventionKind, family: str) -> None:
+        """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
+        if not self.supports(kind):
+            why = {**_UNDECLARED, **self.instead}[kind]
+            raise UnsupportedInterventionError(f"{family} does not support the intervention {kind!r}: {why}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, for listings and certificates."""
+        return {
+            "kinds": [kind for kind in get_args(InterventionKind) if self.supports(kind)],
+            "edits": None if self.edits is None else {name: list(own) for name, own in self.edits.items()},
+            "unread": list(self.unread),
+            "heard_from": self.heard_from,
+            "readout": self.readout,
+            "instead": dict(self.instead),
+        }
+
+
+ALL_EDITS = Interventions()
+"""Of a family that says nothing: every policy can be followed, and edited at every site it has."""
