@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from probe_kit.errors import ProbeKitError
     from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
-    from probe_kit.intervene import Follow, Source, intervene_on, load_effects
+    from probe_kit.intervene import Follow, Interchange, Source, Steer, intervene_on, load_effects
     from probe_kit.retention import retention as retention_table
     from probe_kit.retention.displays import (
         FinalPositionsDisplay,
@@ -37,6 +37,7 @@ __all__ = [
     "ExtractSettings",
     "FinalPositionsDisplay",
     "Follow",
+    "Interchange",
     "IterationMapDisplay",
     "KnowledgeActionDisplay",
     "LayerCurveDisplay",
@@ -46,6 +47,7 @@ __all__ = [
     "SceneSpec",
     "Site",
     "Source",
+    "Steer",
     "Suite",
     "build_suite",
     "capture",
@@ -67,6 +69,8 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "Steer": "intervene",
+        "Interchange": "intervene",
         "Act2AnswerEnv": "env",
         "ExtractSettings": "extract",
         "FinalPositionsDisplay": "retention.displays",

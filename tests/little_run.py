@@ -16,7 +16,6 @@ from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.identity import derive_seed
 from probe_kit.intervene import Answers, Follow
 from probe_kit.intervene.effects import effects_csv
-from probe_kit.intervene.following import following
 from probe_kit.intervene.settings import key_of, settings_of
 from probe_kit.intervene.stored import save
 from probe_kit.suite import Suite
@@ -108,14 +107,13 @@ def intervene_on_little_run(run: Run) -> None:
         ledger=np.zeros((*lateral.shape, 5)),
         apart=np.zeros(len(episodes)),
     )
-    rows = following(answers, run.suite)
     check = {
         "episodes": len(episodes),
         "compared": len(episodes),
         "equal": len(episodes),
         "largest_difference": 0.0,
     }
-    save(run.location, settings, key_of(settings), answers, effects_csv(rows), {"replay": check})
+    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
 
 
 def probe_little_run(run: Run) -> None:

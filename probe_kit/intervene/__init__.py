@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from probe_kit.intervene.effects import Effects, load_effects
     from probe_kit.intervene.follow import Follow
     from probe_kit.intervene.following import Following, stored_following
+    from probe_kit.intervene.interchange import Interchange
     from probe_kit.intervene.intervening import intervene_on
+    from probe_kit.intervene.passing import Passing, stored_passing
+    from probe_kit.intervene.steer import Steer
     from probe_kit.intervene.stored import Answers, stored_interventions
     from probe_kit.intervene.verdict import Judgement, Verdict, judge, judgements
 
@@ -22,8 +25,11 @@ __all__ = [
     "Effects",
     "Follow",
     "Following",
+    "Interchange",
     "Judgement",
+    "Passing",
     "Source",
+    "Steer",
     "Verdict",
     "intervene_on",
     "judge",
@@ -31,12 +37,17 @@ __all__ = [
     "load_effects",
     "stored_following",
     "stored_interventions",
+    "stored_passing",
 ]
 
 # `probe-kit --help` and tables that only read must load neither torch nor a simulator.
 __getattr__ = lazy_names(
     __name__,
     {
+        "stored_passing": "passing",
+        "Passing": "passing",
+        "Steer": "steer",
+        "Interchange": "interchange",
         "Answers": "stored",
         "Bench": "bench",
         "Effects": "effects",

@@ -150,14 +150,15 @@ class Bench:
 
     @contextmanager
     def ready(self) -> Iterator[None]:
-        """With as many threads as the run had, so that sums are rounded alike; errors are named as the model's."""
+        """With as many threads as the run had, so that sums are rounded alike."""
         threads = 1 if self.policy.card.parameters < SMALL else None
-        with torch_threads(threads), acting(self.run.model):
+        with torch_threads(threads):
             yield
 
     def act(self, seen: Observation, seed: int) -> Chunk:
-        """(chunk, 7): one inference, alone in its batch."""
-        return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
+        """(chunk, 7): one inference, alone in its batch. Raises PolicyFailedError for what the policy raises."""
+        with acting(self.run.model):
+            return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
 
     def apart(self, question: Question, chunk: Chunk) -> float:
         """By how much a plain inference differs from what the run carried out; NaN where it does not say.

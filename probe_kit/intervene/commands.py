@@ -1,7 +1,7 @@
 """`probe-kit intervene`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,19 +9,61 @@ from probe_kit.console import counter, marked, out, print_json_text, print_text,
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from probe_kit.intervene.conditions import Intervention
     from probe_kit.intervene.effects import Effects
 
-KINDS = {"follow": "the two pictures exchanged, same state and noise"}
+KINDS = ("follow", "interchange", "steer")
+INSIDE = "Inside the network (interchange, steer)"
 _FORMATS = ("table", "json", "csv")
 
 
 def intervene(
     run: Annotated[str, typer.Argument(help="Run folder or URL.")],
     kind: Annotated[
-        str, typer.Option(help="follow: with the two pictures exchanged, does the action change sides?")
+        str,
+        typer.Option(
+            help="follow: with the two pictures exchanged, does the action change sides? interchange: where "
+            "inside does that pass? steer: a direction added, beside matched controls."
+        ),
     ] = "follow",
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
     items: Annotated[int | None, typer.Option(help="Items per category, the first ones; default all.")] = None,
+    sites: Annotated[
+        str | None,
+        typer.Option(
+            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4; default backbone.*.",
+            rich_help_panel=INSIDE,
+        ),
+    ] = None,
+    roles: Annotated[
+        str | None,
+        typer.Option(
+            help="Comma-separated: all, image, language, state, action; default all,image,language. Steer: the "
+            "one whose tokens are moved.",
+            rich_help_panel=INSIDE,
+        ),
+    ] = None,
+    direction: Annotated[
+        str | None,
+        typer.Option(
+            help="mean-difference or probe: interchange along it only; steer along it (the first is default).",
+            rich_help_panel=INSIDE,
+        ),
+    ] = None,
+    controls: Annotated[
+        int | None,
+        typer.Option(
+            help="Matched random directions beside it; default 5.", min=0, max=100, rich_help_panel=INSIDE
+        ),
+    ] = None,
+    doses: Annotated[
+        str | None,
+        typer.Option(help="Steer: in half gaps of the class means; default 1,2,4.", rich_help_panel=INSIDE),
+    ] = None,
+    toward: Annotated[
+        str | None, typer.Option(help="Steer: wrong (default), correct, left or right.", rich_help_panel=INSIDE)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of controls and folds of directions.", rich_help_panel=INSIDE)] = 0,
     suite: Annotated[
         Path | None, typer.Option(help="Folder of the run's suite; default the embedded one.")
     ] = None,
@@ -50,7 +92,7 @@ def intervene(
     """
     from probe_kit.extract import open_run
     from probe_kit.hooks.options import read_pairs
-    from probe_kit.intervene import Follow, Source, intervene_on
+    from probe_kit.intervene import Source, intervene_on
     from probe_kit.intervene.settings import refuse_unfit
 
     if kind not in KINDS:
@@ -58,7 +100,13 @@ def intervene(
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    asked = Follow(categories=split(categories), items=items)
+    asked = _asked(
+        kind,
+        {"categories": split(categories), "items": items},
+        {"sites": split(sites), "roles": split(roles), "direction": direction, "controls": controls,
+         "doses": None if doses is None else tuple(map(_dose, split(doses) or ())), "toward": toward,
+         "seed": seed or None},
+    )  # fmt: skip
     refuse_unfit(opened)
     asked.chosen(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
@@ -67,6 +115,42 @@ def intervene(
         effects = intervene_on(opened, asked, source, progress=counter(bar, "items replayed"))
     _show(effects, style)
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", effects.key, run))
+
+
+_OPTIONS = {
+    "follow": (),
+    "interchange": ("sites", "roles", "direction", "controls", "seed"),
+    "steer": ("sites", "roles", "direction", "controls", "doses", "toward", "seed"),
+}
+
+
+def _asked(kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
+    """What was asked. Raises UsageError for an option that this kind does not have."""
+    from probe_kit.intervene import Follow, Interchange, Steer
+
+    given = {name: value for name, value in inside.items() if value is not None}
+    if meaningless := [name for name in given if name not in _OPTIONS[kind]]:
+        raise UsageError(
+            f"--{meaningless[0]} means nothing to --kind {kind}; leave it out, or choose another kind"
+        )
+    if kind == "follow":
+        return Follow(**common)
+    if kind == "interchange":
+        controls = given.pop("controls", 5 if "direction" in given else 0)
+        return Interchange(**common, **given, controls=controls)
+    named = given.pop("roles", ())
+    if "sites" not in given or len(named) != 1:
+        raise UsageError(
+            "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
+        )
+    return Steer(**common, **given, role=named[0])
+
+
+def _dose(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is no dose; expected numbers of half gaps, such as 1,2,4") from None
 
 
 def _show(effects: "Effects", style: str) -> None:

@@ -1,13 +1,13 @@
 """What an intervention did: a table, the verdicts, and the ways to write them down."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.following import Following, following, following_frame, stored_following
-from probe_kit.intervene.stored import Answers, Stored, find_stored
+from probe_kit.intervene.passing import Passing, passing, passing_frame, stored_places
+from probe_kit.intervene.stored import EXCHANGED, Answers, Stored, find_stored
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit.fitting_tables import FittingTable
+
+
+FOLLOW = "follow"
+LARGE = 2.0
+"""Token norms beyond which a dose is said to be large."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +47,19 @@ class Effects:
 
     @property
     def rows(self) -> list[Following]:
-        """One per category."""
-        return following(self.answers, self.suite, self.key)
+        """What the exchange of the pictures did, one per category; empty if they were not exchanged."""
+        return following(self.answers, self.suite, self.key) if EXCHANGED in self.answers.conditions else []
+
+    @property
+    def changes(self) -> list[Passing]:
+        """What changes inside the network did, one per category and change; empty for `follow`."""
+        return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One line per category: the fields of `Following`, and verdict and reason."""
+        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`."""
+        if self.kind != FOLLOW:
+            return passing_frame(self.changes)
         frame = following_frame(self.rows)
         found = [self.verdicts.get(str(category), None) for category in frame["category"]]
         frame["verdict"] = [None if one is None else one.verdict for one in found]
@@ -57,6 +69,16 @@ class Effects:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader must know, a sentence each."""
+        return (*self._replayed(), *self._large_doses())
+
+    def _large_doses(self) -> list[str]:
+        large = {row.name: row.norm_ratio for row in self.changes if row.dose and row.norm_ratio > LARGE}
+        return [
+            f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
+            for name, ratio in large.items()
+        ]
+
+    def _replayed(self) -> tuple[str, ...]:
         check = self.certificate["replay"]
         if check["compared"] == 0:
             return (
@@ -86,8 +108,10 @@ class Effects:
 
     def to_rich(self) -> "FittingTable":
         """The table for a console."""
-        from probe_kit.intervene.tables import following_table
+        from probe_kit.intervene.tables import following_table, passing_table
 
+        if self.kind != FOLLOW:
+            return passing_table(self.changes, self.kind, self.label, self.suite, self.random_weights)
         return following_table(self.rows, self.verdicts, self.label, self.suite, self.random_weights)
 
 
@@ -119,9 +143,11 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
         results = load_results(run)
     except NoProbesError:
         results = None
-    return judgements(stored_following(run), encoded_in(results))
+    return judgements(stored_following(run), encoded_in(results), stored_places(run))
 
 
-def effects_csv(rows: Sequence[Following]) -> str:
+def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED) -> str:
     """As stored beside the answers, without verdicts, which later probes may change."""
-    return following_frame(list(rows)).drop(columns="key").to_csv(index=False)
+    changes = passing(answers, suite, toward)
+    frame = passing_frame(changes) if changes else following_frame(following(answers, suite))
+    return frame.drop(columns="key").to_csv(index=False)

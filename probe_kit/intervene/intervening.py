@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
@@ -13,9 +13,10 @@ from probe_kit.intervene.bench import Bench, Source, open_bench
 from probe_kit.intervene.conditions import Condition, Intervention, Replayed, replay
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
-from probe_kit.intervene.following import following
+from probe_kit.intervene.passing import Named
+from probe_kit.intervene.patching import LEDGER
 from probe_kit.intervene.settings import key_of, refuse_unfit, settings_of
-from probe_kit.intervene.stored import Answers, is_stored, save
+from probe_kit.intervene.stored import EXCHANGED, Answers, is_stored, save
 from probe_kit.notebook import notebook_progress
 
 if TYPE_CHECKING:
@@ -73,9 +74,11 @@ def _carry_out(
             "policy": bench.policy.card.to_json(),
             "provenance": _provenance(bench),
             "replay": _replay_check(parts),
+            "edits": _ledgers(conditions, parts),
         }
     answers = _answers(run, [condition.name for condition in conditions], parts)
-    save(run.location, settings, key, answers, effects_csv(following(answers, run.suite)), certificate)
+    effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)))
+    save(run.location, settings, key, answers, effects, certificate)
     pieces.discard()
 
 
@@ -137,6 +140,31 @@ def _replay_check(found: Replayed) -> dict[str, Any]:
         "equal": int((known == 0).sum()),
         "largest_difference": float(known.max(initial=0.0)),
     }
+
+
+def _ledgers(conditions: Sequence[Condition], found: Replayed) -> dict[str, dict[str, float]]:
+    """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
+
+    Raises CaptureChangedActionError if a dose of zero changed an action.
+    """
+    said = {}
+    for number, condition in enumerate(conditions):
+        rows = dict(zip(LEDGER, found.ledger[number].T, strict=True))
+        fires = float(rows["fires"].sum())
+        if not fires:
+            continue
+        means = {name: float((rows[name] * rows["fires"]).sum() / fires) for name in ("norm", "moved")}
+        said[condition.name] = {
+            "fires": fires, "still": float(rows["still"].sum()), **means, "largest": float(rows["largest"].max()),
+            "largest_change": float(found.changed[number].max()),
+        }  # fmt: skip
+        if Named.of(condition.name).dose == "0" and found.changed[number].any():
+            raise CaptureChangedActionError(
+                f"{condition.name} adds nothing and changed an action by {found.changed[number].max():.3g}; "
+                "expected the same bit for bit. The adapter's tap does not write what it reads, or the model is "
+                "not deterministic"
+            )
+    return said
 
 
 def _provenance(bench: Bench) -> dict[str, Any]:

@@ -44,8 +44,8 @@ LEDGER = ("fires", "still", "norm", "moved", "largest")
 class Change(Protocol):
     """What becomes of the tokens of a site."""
 
-    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
-        """(T', D) float32 tokens in, as many out."""
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+        """(T', D) float32 tokens in, as many out. where: (T',) their positions."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class Replaced:
     """By the same tokens of another inference."""
 
     donor: "Tape"
-    mask: NDArray[np.bool_]
+    tokens: int
 
-    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
         """The donor's."""
         del own
-        other = self.donor[site][0].float()
-        if other.shape[0] != self.mask.size:
+        other = self.donor[site][0]
+        if other.shape[0] != self.tokens:
             raise CaptureError(
-                f"the donor's {site} has {other.shape[0]} tokens; expected {self.mask.size}, as before exchanging"
+                f"the donor's {site} has {other.shape[0]} tokens; expected {self.tokens}, as before exchanging"
             )
-        return other[_index(self.mask, other)]
+        return other[where].float()
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,14 @@ class ReplacedAlong:
     """By another inference's component along some directions; the rest stays. basis: (K, D) orthonormal."""
 
     donor: "Tape"
-    mask: NDArray[np.bool_]
+    tokens: int
     basis: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
         """own + (donor − own) P."""
         import torch
 
-        apart = Replaced(self.donor, self.mask)(site, own) - own
+        apart = Replaced(self.donor, self.tokens)(site, own, where) - own
         directions = torch.from_numpy(self.basis).to(own.device)
         found: Tensor = own + (apart @ directions.T) @ directions
         return found
@@ -90,11 +90,11 @@ class Moved:
 
     vector: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
         """own + vector."""
         import torch
 
-        del site
+        del site, where
         found: Tensor = own + torch.from_numpy(self.vector).to(own.device)
         return found
 
@@ -106,12 +106,14 @@ def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], ch
     Raises CaptureError for another number of tokens, and what `hooks.edit` raises, such as for a site that fires
     another number of times than its tap promises.
     """
+    import torch
+
     from probe_kit.hooks import edit
 
-    ledger = Ledger()
+    ledger, where = Ledger(), torch.from_numpy(np.flatnonzero(mask)).to(policy.card.device)
 
     def changer(site: Site) -> "_Changer":
-        return _Changer(site, mask, change, ledger)
+        return _Changer(site, mask.size, where, change, ledger)
 
     with edit(policy, {site: changer(site) for site in sites}):
         yield ledger
@@ -120,29 +122,27 @@ def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], ch
 @dataclass(frozen=True)
 class _Changer:
     site: Site
-    mask: NDArray[np.bool_]
+    tokens: int
+    where: "Tensor"
     change: Change
     ledger: Ledger
 
     def __call__(self, activation: "Tensor") -> "Tensor":
-        if activation.shape[0] != 1 or activation.shape[1] != self.mask.size:
+        import torch
+
+        if activation.shape[0] != 1 or activation.shape[1] != self.tokens:
             raise CaptureError(
-                f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.mask.size} tokens"
+                f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.tokens} tokens"
             )
-        where = _index(self.mask, activation)
-        before = activation[0][where].float()
-        after = self.change(self.site, before).to(activation.dtype)
-        activation[0, where] = after
+        before = activation[0][self.where].float()
+        after = self.change(self.site, before, self.where).to(activation.dtype)
+        activation[0, self.where] = after
         moved = (after.float() - before).norm(dim=-1)
+        # One transfer per fire: a GPU waits at each.
+        norm, mean, largest = torch.stack([before.norm(dim=-1).mean(), moved.mean(), moved.max()]).tolist()
         self.ledger.fires += 1
-        self.ledger.still += int(not bool(moved.any()))
-        self.ledger.norm += float(before.norm(dim=-1).mean())
-        self.ledger.moved += float(moved.mean())
-        self.ledger.largest = max(self.ledger.largest, float(moved.max()))
+        self.ledger.still += int(largest == 0)
+        self.ledger.norm += norm
+        self.ledger.moved += mean
+        self.ledger.largest = max(self.ledger.largest, largest)
         return activation
-
-
-def _index(mask: NDArray[np.bool_], like: "Tensor") -> "Tensor":
-    import torch
-
-    return torch.from_numpy(np.flatnonzero(mask)).to(like.device)

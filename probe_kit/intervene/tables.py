@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.following import WORTH, Following
+from probe_kit.intervene.passing import Passing
 from probe_kit.intervene.verdict import Judgement
 
 if TYPE_CHECKING:
@@ -53,5 +54,49 @@ def _cells(row: Following) -> "tuple[Cell, ...]":
     texts = (
         f"{100 * row.follows:.1f}", f"{100 * row.against:.1f}", f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
         f"{row.p_follows:.2g}", f"{100 * row.shift:.2f}", f"{row.n_episodes} ({row.n_items})",
+    )  # fmt: skip
+    return tuple(map(Cell, texts))
+
+
+_CHANGE_LEGEND = (
+    "effect: share of what the whole exchange does, n/a where that is nothing; turned: share of episodes that "
+    "turn to the side they are pushed to, minus those that turn from it; p: family-wise over all changes of the "
+    "category, one-sided; moved: how far tokens were moved, in their own norms"
+)
+
+
+def passing_table(
+    rows: Sequence[Passing], kind: str, label: str, suite: str, random_weights: bool
+) -> "FittingTable":
+    """One line per category and change; controls stand beside what they are held against."""
+    from probe_kit.fitting_tables import FittingTable, Part
+
+    marked = f"{label} (random weights)" if random_weights else label
+    shown = [row for row in rows if not row.is_control]
+    return FittingTable(
+        title=f"Where is it used? {marked} on {suite}, {kind}",
+        caption=_CHANGE_LEGEND,
+        name="category · change",
+        names=tuple(f"{row.category} · {row.name}" for row in shown),
+        styles=tuple("bold" if row.is_located else "" for row in shown),
+        parts=(
+            Part(
+                "What the action does",
+                ("effect", "turned [95 %]", "left / right", "shift cm", "controls cm", "p", "moved"),
+                tuple(_change_cells(row) for row in shown),
+            ),
+        ),
+    )
+
+
+def _change_cells(row: Passing) -> "tuple[Cell, ...]":
+    from probe_kit.fitting_tables import Cell
+
+    low, high = row.net_ci
+    texts = (
+        "n/a" if row.effect is None else f"{row.effect:.2f}", f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
+        f"{row.net_left:+.2f} / {row.net_right:+.2f}", f"{100 * row.shift:+.2f}",
+        "–" if row.control_shift is None else f"{100 * row.control_shift:+.2f}",
+        "–" if row.p_fwe is None else f"{row.p_fwe:.2g}", f"{row.norm_ratio:.2f}",
     )  # fmt: skip
     return tuple(map(Cell, texts))

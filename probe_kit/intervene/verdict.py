@@ -1,7 +1,8 @@
 """The verdict: is what can be read also used? Loads no model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from probe_kit.intervene.following import WORTH, Following
@@ -31,14 +32,21 @@ class Judgement:
     reason: str = ""
 
 
-def judge(encoded: bool | None, found: Following, control: str | None) -> Judgement:
+def judge(
+    encoded: bool | None, found: Following, control: str | None, located: Sequence[str] | None = None
+) -> Judgement:
     """What probes and the exchange of pictures say together.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
     without probes. control: another category of the run that follows, which shows that following would have been
-    seen; None if there is none, and then nothing is called encoded and unused.
+    seen; None if there is none, and then nothing is called encoded and unused. located: places that carry half of
+    the effect, if an interchange looked for them; where it did and found none, nothing is called used.
     """
     if found.is_following:
+        if encoded and located is not None:
+            if not located:
+                return Judgement("inconclusive", "it follows, and no place that was tried carries half of that")
+            return Judgement("used", f"passes at {', '.join(located)}")
         return Judgement(_by(encoded, "used", "acted on, not found", "follows"))
     if found.is_against:
         return Judgement(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
@@ -63,9 +71,19 @@ def control_for(category: str, found: Mapping[str, Following]) -> str | None:
     return max(others, key=lambda one: one.net).category if others else None
 
 
-def judgements(found: Mapping[str, Following], encoded: Mapping[str, bool | None]) -> dict[str, Judgement]:
-    """Of every category that was intervened on. encoded: by category; one that is not there was not probed."""
-    return {name: judge(encoded.get(name), one, control_for(name, found)) for name, one in found.items()}
+def judgements(
+    found: Mapping[str, Following],
+    encoded: Mapping[str, bool | None],
+    located: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> dict[str, Judgement]:
+    """Of every category that was intervened on.
+
+    encoded, located: by category; one that is not there was not probed, or not looked for inside.
+    """
+    return {
+        name: judge(encoded.get(name), one, control_for(name, found), located.get(name))
+        for name, one in found.items()
+    }
 
 
 def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:

@@ -3,7 +3,7 @@
 Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing is played.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from probe_kit.intervene.following import Following
@@ -12,13 +12,18 @@ from probe_kit.retention.row_parts import Followed
 from probe_kit.retention.rows import RetentionRow
 
 
-def with_following(row: RetentionRow, found: Mapping[str, Following]) -> RetentionRow:
-    """The row with what was found of its category, judged by its own probes. found: by category; may be empty."""
+def with_following(
+    row: RetentionRow, found: Mapping[str, Following], located: Mapping[str, Sequence[str]]
+) -> RetentionRow:
+    """The row with what was found of its category, judged by its own probes.
+
+    found: by category; may be empty. located: places that carry it, by category, of those that were looked into.
+    """
     own = found.get(row.category)
     if own is None:
         return row
     encoded = row.prefix_signal if row.prefix_beats else None
-    judged = judge(encoded, own, control_for(row.category, found))
+    judged = judge(encoded, own, control_for(row.category, found), located.get(row.category))
     part = Followed(
         follows=own.follows,
         against=own.against,

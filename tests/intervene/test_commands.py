@@ -11,7 +11,6 @@ from probe_kit.cli import app
 from probe_kit.extract import Run
 from probe_kit.intervene import Follow
 from probe_kit.intervene.effects import effects_csv
-from probe_kit.intervene.following import following
 from probe_kit.intervene.settings import key_of, settings_of
 from probe_kit.intervene.stored import save
 from tests.intervene.answers import answers_of, follower, habit
@@ -31,7 +30,7 @@ def run(recorded_run: Run, tmp_path: Path) -> Run:
         settings,
         key_of(settings),
         answers,
-        effects_csv(following(answers, copy.suite)),
+        effects_csv(answers, copy.suite),
         certificate,
     )
     return copy
@@ -88,3 +87,20 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     code, _, said = ask(str(tmp_path))
     assert code == 2
     assert "is not a run" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--doses", "1"), "--doses means nothing to --kind follow"),
+        (("--kind", "interchange", "--toward", "left"), "--toward means nothing"),
+        (("--kind", "steer"), "needs --sites"),
+        (("--kind", "steer", "--sites", "backbone.02", "--roles", "image,language"), "one of --roles"),
+        (("--kind", "steer", "--sites", "backbone.02", "--roles", "image", "--doses", "much"), "is no dose"),
+        (("--kind", "interchange", "--controls", "2"), "choose --direction"),
+    ],
+)
+def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...], words: str) -> None:
+    code, _, said = ask(run, *options)
+    assert code == 2
+    assert words in " ".join(said.split())

@@ -1,0 +1,123 @@
+"""Interchange: one part of the stream taken from the same inference before exchanged pictures.
+
+What is put in is what this very policy has there in this very state, so it lies where streams lie, has no dose,
+and can do no more than the exchange itself: with all that differs put in, the effect is 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.sites import Site
+from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
+from probe_kit.intervene.directions import Axes, axes_of
+from probe_kit.intervene.patching import Change, Replaced, ReplacedAlong, patched
+from probe_kit.intervene.places import ALL, Place, places, roles_of, token_mask
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Tape
+
+SITES = ("backbone.*",)
+ROLES = (ALL, "image", "language")
+NONE = "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interchange(Intervention):
+    """Every place is tried at every role, alone.
+
+    sites: patterns of places, see `places`. roles: of the tokens that are taken over; a stream is tried at those
+    that it has. direction: `none` takes tokens over whole; `mean-difference` or `probe` only along that direction
+    of each place (rank 1), found without the episode it is used on. controls: so many random directions of the
+    data's own covariance, orthogonal to it, per place and role.
+    """
+
+    sites: tuple[str, ...] = SITES
+    roles: tuple[str, ...] = ROLES
+    direction: str = NONE
+    controls: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.sites or not self.roles:
+            raise UsageError("an interchange needs at least one site and one role")
+        if self.controls and self.direction == NONE:
+            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
+
+    @property
+    def kind(self) -> str:
+        """`interchange`."""
+        return "interchange"
+
+    def own_settings(self) -> dict[str, Any]:
+        """Where, which tokens and along what."""
+        return {
+            "sites": list(self.sites), "roles": list(self.roles), "direction": self.direction,
+            "controls": self.controls, "seed": self.seed,
+        }  # fmt: skip
+
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """Plain, exchanged, and every place at every role. Raises UnknownSiteError, NoProbesError."""
+        found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
+        donors = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
+        conditions: list[Condition] = [Plain(), Exchanged()]
+        for place in found.values():
+            for role in roles_of(bench.policy, place.stream, self.roles):
+                if self.direction == NONE:
+                    conditions.append(TakenOver(place, role, donors))
+                    continue
+                axes = axes_of(bench.run, place.only_site, role, self.direction, self.controls, self.seed)
+                conditions += [
+                    TakenOver(place, role, donors, name, axes) for name in (self.direction, *axes.control_names)
+                ]
+        return conditions
+
+
+@dataclass(frozen=True)
+class TakenOver:
+    """The tokens of one role at one place, from the inference before exchanged pictures.
+
+    donors: all sites of which that inference is asked, once for all conditions. direction: the name of one of
+    `axes`, empty to take tokens over whole.
+    """
+
+    place: Place
+    role: str
+    donors: tuple[Site, ...]
+    direction: str = ""
+    axes: Axes | None = None
+
+    @property
+    def name(self) -> str:
+        """Place, role and direction, apart by `|`."""
+        return "|".join(filter(None, (self.place.name, self.role, self.direction)))
+
+    def play(self, turn: Turn) -> Played:
+        """The plain inference with these tokens in it."""
+        question, bench = turn.question, turn.bench
+        mask = token_mask(bench.policy, question.seen, self.place.stream, self.role)
+        with patched(bench.policy, self.place.sites, mask, self._change(turn, mask.size)) as ledger:
+            chunk = bench.act(question.seen, question.seed)
+        return Played(chunk, ledger)
+
+    def _change(self, turn: Turn, tokens: int) -> Change:
+        donor = donor_of(turn, self.donors)
+        if self.axes is None:
+            return Replaced(donor, tokens)
+        vector = self.axes.of(self.direction, turn.question.episode_id, turn.question.category)
+        return ReplacedAlong(donor, tokens, vector[None])
+
+
+def donor_of(turn: Turn, sites: Sequence[Site]) -> "Tape":
+    """What all these sites hold before exchanged pictures, with the question's state and noise; made once."""
+    from probe_kit.hooks import capture
+
+    if "donor" not in turn.memo:
+        with capture(turn.bench.policy, sites) as tape:
+            turn.memo["chunk"] = turn.bench.act(turn.question.exchanged, turn.question.seed)
+        turn.memo["donor"] = tape
+    donor: Tape = turn.memo["donor"]
+    return donor

@@ -1,0 +1,234 @@
+"""What changes inside the network did, place by place. Reads stored answers; needs no model.
+
+Effects are signed: *toward* is the side on which the correct picture lies once the two are exchanged (an
+interchange) or the side that was steered to. How often actions change sides says nothing by itself: they do so
+away from it as well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.identity import derive_seed
+from probe_kit.intervene.following import following
+from probe_kit.intervene.patching import LEDGER
+from probe_kit.intervene.stored import EXCHANGED, PLAIN, Answers, stored_interventions
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Values = NDArray[np.float64]
+CONTROL = "control-"
+HALF = 0.5
+"""Share of the whole effect that a place must carry to be called one where it passes."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """The parts of a condition's name: `place|role|direction|dose`, the last two where there are any."""
+
+    place: str
+    role: str = ""
+    direction: str = ""
+    dose: str = ""
+
+    @classmethod
+    def of(cls, condition: str) -> "Named":
+        """Take a name apart."""
+        return cls(*condition.split("|"))
+
+    @property
+    def is_control(self) -> bool:
+        """Whether its direction is a random one that another is held against."""
+        return self.direction.startswith(CONTROL)
+
+    def is_control_of(self, other: "Named") -> bool:
+        """Whether `other`, no control itself, is held against this one."""
+        same = (self.place, self.role, self.dose) == (other.place, other.role, other.dose)
+        return self.is_control and bool(other.direction) and not other.is_control and same
+
+
+@dataclass(frozen=True)
+class Passing:
+    """What a change at one place did, in one category.
+
+    effect: share of what the whole exchange does to where the action goes; None if that does nothing, so that a
+    share would be a ratio of noise. net: share of episodes whose action turns to the side it is pushed to, minus
+    those that turn from it, with its 95 % interval by groups. shift, control_shift: mean metres toward that side,
+    its own and of its matched controls. t, p, p_fwe: of the shift beyond the controls', one-sided, by sign flips
+    of whole groups; p_fwe against the largest t of all changes of the category. changed: largest difference in any
+    action of any episode; 0 is bit for bit. fires, still: fires of edited sites in all episodes, and those that
+    moved nothing. norm_ratio: how far tokens were moved, in their own norms. net_left, net_right: by the side it
+    is pushed to.
+    """
+
+    category: str
+    place: str
+    role: str
+    direction: str
+    dose: str
+    is_control: bool
+    n_episodes: int
+    n_items: int
+    effect: float | None
+    net: float
+    net_ci: tuple[float, float]
+    net_left: float
+    net_right: float
+    shift: float
+    control_shift: float | None
+    t: float
+    p: float | None
+    p_fwe: float | None
+    changed: float
+    fires: int
+    still: int
+    norm_ratio: float
+    key: str = ""
+
+    @property
+    def is_located(self) -> bool:
+        """Whether it carries half of the effect, beyond chance among all that was tried."""
+        enough = self.effect is not None and self.effect >= HALF
+        return enough and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+
+    @property
+    def name(self) -> str:
+        """What was changed, in a few words."""
+        return " ".join(filter(None, (self.place, self.role, self.direction, self.dose and f"dose {self.dose}")))
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def passing(answers: Answers, suite: str, toward: str = "exchanged", key: str = "") -> list[Passing]:
+    """One per category and change. toward: `exchanged`, or the side that was steered to, see `Steer`."""
+    return [
+        row
+        for category in dict.fromkeys(answers.categories.tolist())
+        for row in _of_category(answers.only(str(category)), str(category), suite, toward, key)
+    ]
+
+
+def pushed_to(answers: Answers, toward: str) -> NDArray[np.float64]:
+    """(E,) the side that is pushed to, +1 for left."""
+    fixed = {"left": 1.0, "right": -1.0}
+    if toward in fixed:
+        return np.full(answers.toward.size, fixed[toward])
+    return answers.toward if toward == "correct" else -answers.toward
+
+
+def _of_category(answers: Answers, category: str, suite: str, toward: str, key: str) -> list[Passing]:
+    push, plain = pushed_to(answers, toward), answers.of(PLAIN)
+    rows = [row for row, name in enumerate(answers.conditions) if name not in (PLAIN, EXCHANGED)]
+    if not rows:
+        return []
+    names = [Named.of(answers.conditions[row]) for row in rows]
+    shifts = push * (answers.lateral[rows] - plain)
+    controls = [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
+    beyond = np.stack([own - shifts[own_controls].mean(axis=0) if own_controls else own
+                       for own, own_controls in zip(shifts, controls, strict=True)])  # fmt: skip
+    tested = [at for at, name in enumerate(names) if not name.is_control]
+    seed = derive_seed("sign flips", suite, category)
+    t, p, p_fwe = max_t(beyond[tested], answers.items, answers.groups, seed)
+    place_of = {at: place for place, at in enumerate(tested)}
+    share = _shares(answers, rows, suite)
+    found = []
+    for at, name in enumerate(names):
+        turned = _turned(push, plain, answers.lateral[rows[at]])
+        drawn = units_seed(answers.groups, suite)
+        low, high = group_bootstrap(turned[:, None], answers.groups, drawn, bounds=GAINS)
+        ledger = dict(zip(LEDGER, answers.ledger[rows[at]].T, strict=True))
+        fires = float(ledger["fires"].sum())
+        norm = float((ledger["norm"] * ledger["fires"]).sum())
+        tested_at = place_of.get(at)
+        found.append(
+            Passing(
+                category=category,
+                place=name.place,
+                role=name.role,
+                direction=name.direction,
+                dose=name.dose,
+                is_control=name.is_control,
+                n_episodes=plain.size,
+                n_items=np.unique(answers.items).size,
+                effect=None if share is None else float(share[at]),
+                net=float(turned.mean()),
+                net_ci=(float(low[0]), float(high[0])),
+                net_left=_mean(turned[push > 0]),
+                net_right=_mean(turned[push < 0]),
+                shift=float(shifts[at].mean()),
+                control_shift=float(shifts[controls[at]].mean()) if controls[at] else None,
+                t=0.0 if tested_at is None else float(t[tested_at]),
+                p=None if tested_at is None else float(p[tested_at]),
+                p_fwe=None if tested_at is None else float(p_fwe[tested_at]),
+                changed=float(answers.changed[rows[at]].max()),
+                fires=int(fires),
+                still=int(ledger["still"].sum()),
+                norm_ratio=float((ledger["moved"] * ledger["fires"]).sum()) / norm if norm else 0.0,
+                key=key,
+            )
+        )
+    return found
+
+
+def _turned(push: Values, plain: Values, changed: Values) -> Values:
+    """(E,) 1 where the action turns to the side it is pushed to, −1 where it turns from it, else 0."""
+    turned: NDArray[np.float64] = (push * changed > 0).astype(float) - (push * plain > 0)
+    return turned
+
+
+def _shares(answers: Answers, rows: Sequence[int], suite: str) -> NDArray[np.float64] | None:
+    """(S,) of what the exchange does; None if there was no exchange, or it does nothing."""
+    if EXCHANGED not in answers.conditions:
+        return None
+    (whole,) = following(answers, suite)
+    if min(whole.p_follows, whole.p_against) >= SIGNIFICANCE:
+        return None
+    plain = answers.of(PLAIN)
+    total = answers.of(EXCHANGED) - plain
+    found: NDArray[np.float64] = ((answers.lateral[rows] - plain) * total).sum(axis=1) / (total**2).sum()
+    return found
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if values.size else 0.0
+
+
+def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
+    """By category, what the newest interchange of it found; empty if there is none. Raises RunDamagedError."""
+    found: dict[str, list[Passing]] = {}
+    for one in stored_interventions(run, "interchange"):
+        rows = passing(one.answers(), run.suite, key=one.key)
+        found |= {str(name): [row for row in rows if row.category == name] for name in one.settings["categories"]}
+    return found
+
+
+def located_in(rows: Sequence[Passing]) -> tuple[str, ...]:
+    """The places, each once, that carry half of the effect or more when their tokens are taken over whole."""
+    return tuple(dict.fromkeys(row.place for row in rows if row.is_located and not row.direction))
+
+
+def stored_places(run: RunReader) -> dict[str, tuple[str, ...]]:
+    """By category, `located_in` of what is stored."""
+    return {category: located_in(rows) for category, rows in stored_passing(run).items()}
+
+
+def passing_frame(rows: Sequence[Passing]) -> "pd.DataFrame":
+    """One line per category and change; the interval as two columns."""
+    import pandas as pd
+
+    flat = []
+    for row in rows:
+        plain = row.to_json()
+        low, high = plain.pop("net_ci")
+        flat.append({**plain, "net_ci_low": low, "net_ci_high": high})
+    return pd.DataFrame(flat)

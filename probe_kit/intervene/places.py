@@ -1,0 +1,97 @@
+"""Places: sites that are changed together, and the tokens at which they are."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import EmptyRoleError, UnknownSiteError
+from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.sites import Site
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy, Stream
+
+ALL = "all"
+"""The role of every token but padding."""
+_PATTERN = re.compile(r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(@(?P<first>\d+)(-(?P<last>\d+))?)?")
+
+
+@dataclass(frozen=True)
+class Place:
+    """One layer of a stream, over some of its iterations; of a memory its keys and values together."""
+
+    name: str
+    sites: tuple[Site, ...]
+
+    @property
+    def only_site(self) -> Site:
+        """Its one site, where a direction can be found. Raises UnknownSiteError if it has several."""
+        if len(self.sites) != 1:
+            raise UnknownSiteError(
+                f"{self.name} is {len(self.sites)} sites, each with directions of its own; name one, such as "
+                f"{self.name.partition('@')[0]}@0"
+            )
+        return self.sites[0]
+
+    @property
+    def stream(self) -> str:
+        """Of all its sites."""
+        return self.sites[0].stream
+
+
+def places(pattern: str, policy: "Policy") -> list[Place]:
+    """The places that a pattern names.
+
+    `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
+    changed at each of them; `expert.03` over all. Raises UnknownSiteError.
+    """
+    match, streams = _PATTERN.fullmatch(pattern), {**policy.streams, **policy.further_streams}
+    if match is None or match["stream"] not in streams:
+        raise UnknownSiteError(
+            f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02 or expert.03@0-4, "
+            f"of the streams {', '.join(streams)}"
+        )
+    stream = streams[match["stream"]]
+    layers = range(stream.layers) if match["layer"] == "*" else [int(match["layer"])]
+    return [_place(stream, layer, match["first"], match["last"]) for layer in layers]
+
+
+def _place(stream: "Stream", layer: int, first: str | None, last: str | None) -> Place:
+    name = f"{stream.name}.{layer:02d}"
+    if first is not None:
+        name += f"@{first}" if last is None else f"@{first}-{last}"
+    low, high = int(first or 0), int(last or first or 0)
+    sites = tuple(
+        site
+        for site in stream.sites()
+        if site.layer == layer and (first is None or low <= (site.iteration or 0) <= high)
+    )
+    expected = 1 if stream.iterations is None else stream.iterations if first is None else high - low + 1
+    if len(sites) != expected or (stream.iterations is None and first is not None):
+        there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
+        raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
+    return Place(name, sites)
+
+
+def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> NDArray[np.bool_]:
+    """(T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
+    roles = policy.roles([seen])[stream][0]
+    mask = roles.valid if role == ALL else roles.mask(role)
+    if not mask.any():
+        there = ", ".join(dict.fromkeys(span.role for span in roles.spans))
+        raise EmptyRoleError(f"no token of {stream} plays {role!r}; there are {there}")
+    return np.asarray(mask, bool)
+
+
+def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
+    """Those of the wanted roles that tokens of a stream play, `all` included."""
+    return [
+        role
+        for role in wanted
+        if role == ALL
+        or any(name == role or name.startswith(f"{role}.") for name in policy.role_names.get(stream, ()))
+    ]
