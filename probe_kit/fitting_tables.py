@@ -59,6 +59,8 @@ class Part:
 class FittingTable:
     """A table that is as wide as the console allows: one, or several that each repeat the names of the rows.
 
+    A row that has nothing to say in one of several tables, all its cells there being empty, is left out of it.
+
     names: of the rows, under the heading `name`; styles: one per row. caption: under the last table.
     """
 
@@ -104,8 +106,9 @@ class FittingTable:
             for heading in part.headings:
                 table.add_column(heading, no_wrap=True)
         for number, (name, style) in enumerate(zip(self.names, self.styles, strict=True)):
-            cells = (cell for part in parts for cell in part.rows[number])
-            table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
+            cells = [cell for part in parts for cell in part.rows[number]]
+            if any(cell.text for cell in cells):
+                table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
         return table
 
     def _lists(self) -> "Iterator[RenderableType]":
@@ -116,6 +119,8 @@ class FittingTable:
             yield Text(f"{self.name} {name}", style=style or "underline")
             for part in self.parts:
                 for heading, cell in zip(part.headings, part.rows[number], strict=True):
+                    if not cell.text:
+                        continue
                     yield Text(" ".join(f"{heading}:".split()), style="dim")
                     yield Text(f"  {cell.text}", style=cell.style, overflow="fold")
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from probe_kit.retention.differences import Difference
 from probe_kit.retention.estimates import Limits
+from probe_kit.retention.names import full_name
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.wordings import WordingPair
 
@@ -27,10 +27,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def model_name(row: RetentionRow) -> str:
     """The model, marked if its weights are random or it was only listened to, and its group if there is one."""
-    name = row.label or row.model
-    name += " (random weights)" if row.random_weights else ""
-    name += " (listened to)" if row.listened else ""
-    return name if row.group is None else f"{row.group}: {name}"
+    return full_name(row.label or row.model, row.random_weights, row.listened, row.group)
 
 
 def with_limits(value: str, limits: Limits | None, write: Callable[[float | None], str]) -> str:
@@ -39,6 +36,50 @@ def with_limits(value: str, limits: Limits | None, write: Callable[[float | None
         return value
     low, high = limits
     return f"{value} [unbounded]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
+
+
+def category_name(row: RetentionRow) -> str:
+    """As the suite has it."""
+    return row.category
+
+
+def view_name(row: RetentionRow) -> str:
+    """How tokens became one vector; a dash without probes."""
+    return row.view or "–"
+
+
+def success_value(row: RetentionRow) -> str:
+    """SR in percent without its interval; n/a for a model that did not act."""
+    return NOT_ACTED if row.sr is None else percent(row.sr)
+
+
+def prefix_value(row: RetentionRow) -> str:
+    """Accuracy of the backbone's best site in percent, with its interval."""
+    return with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)
+
+
+def action_value(row: RetentionRow) -> str:
+    """The same where the action is made."""
+    return with_limits(percent(row.action_accuracy), row.action_ci, percent)
+
+
+def prefix_share(row: RetentionRow) -> str:
+    """Accuracy of the backbone's best site without its interval."""
+    return percent(row.prefix_accuracy)
+
+
+def action_share(row: RetentionRow) -> str:
+    """The same where the action is made."""
+    return percent(row.action_accuracy)
+
+
+def difference_test(_: RetentionRow) -> str:
+    """Nothing: only differences between runs are tested here, see `probe_kit.retention.lines`."""
+    return ""
+
+
+DIFFERENCE_TEST: Column = ("p (Holm)", difference_test)
+"""Column of tables of several runs."""
 
 
 def success_interval(row: RetentionRow) -> str:
@@ -81,6 +122,25 @@ FOLLOWED_COLUMNS: list[Column] = [
 def followed(rows: Sequence[RetentionRow]) -> bool:
     """Whether any row was intervened on."""
     return any(row.follows is not None for row in rows)
+
+
+ANSWER_SCORES: list[Column] = [
+    ("by text", lambda row: percent(row.accuracy_text)),
+    ("by logits", lambda row: percent(row.accuracy_logits)),
+    ("without letter bias", lambda row: percent(row.accuracy_debiased)),
+    ("unreadable", lambda row: percent(row.p_unreadable)),
+    ("near ties", lambda row: percent(row.p_near_tie)),
+]
+"""What answers of asked runs say by each score, in percent."""
+ANSWER_MEASURES: list[Column] = [
+    ("option mass", lambda row: number(row.option_mass)),
+    ("letter bias", lambda row: number(row.letter_bias)),
+]
+"""What else there is to know of them, in no unit or logits."""
+ANSWER_LEGEND = (
+    "a constant answer is right in one half; without letter bias: options exchanged; letter bias: logits by which "
+    "the option named first is preferred; near ties: choices that rounding may have made"
+)
 
 
 def rule_name(rows: Sequence[RetentionRow]) -> str:
@@ -233,7 +293,7 @@ CONTROL_PARTS: dict[str, Sequence[Column]] = {
 """Columns of the controls, by the question they answer."""
 
 CONTROL_COLUMNS: list[Column] = [
-    ("category", lambda row: row.category),
+    ("category", category_name),
     *(column for columns in CONTROL_PARTS.values() for column in columns),
 ]
 
@@ -241,29 +301,6 @@ CONTROL_COLUMNS: list[Column] = [
 def controlled(rows: Sequence[RetentionRow]) -> bool:
     """Whether any row was held against a control."""
     return any(row.baselines or row.twin for row in rows)
-
-
-# -- differences ---------------------------------------------------------------------------------------------
-
-DIFFERENCE_COLUMNS: list[tuple[str, Callable[[Difference], str]]] = [
-    ("view", lambda row: row.view or "–"),
-    ("SR % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
-    ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
-    ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
-    (
-        "bounded retention [95 %]",
-        lambda row: with_limits(number(row.retention_bounded), row.retention_bounded_ci, number),
-    ),
-    ("area [95 %]", lambda row: with_limits(number(row.retention_area), row.retention_area_ci, number)),
-    ("debiased [95 %]", lambda row: with_limits(number(row.retention), row.retention_ci, number)),
-    ("call", lambda row: "–" if row.call is None else str(row.call)),
-]
-"""Beside the category."""
-
-
-def difference_title(row: Difference) -> str:
-    """Which groups are compared, and whether item by item."""
-    return f"Difference: {row.group} − {row.minus} ({'the same items' if row.paired else 'other items'})"
 
 
 # -- wordings ------------------------------------------------------------------------------------------------

@@ -20,9 +20,19 @@ ASKED = "Asked runs"
 
 
 def retention(
-    runs: Annotated[list[str] | None, typer.Argument(help="One or more run folders or URLs.")] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Argument(help="Run folders or URLs; of several on the same questions, differences are shown too."),
+    ] = None,
     group: Annotated[
         list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            help="Run (its folder or its name in tables) or group that every other is compared with; default: the "
+            "first run against every other, every two groups."
+        ),
     ] = None,
     style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
     probes: Annotated[
@@ -98,7 +108,7 @@ def retention(
     table = make_table(
         opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii, rule=rule,
         last_steps=last_steps,
-        score=score, gap=gap, with_side_words=with_side_words,
+        score=score, gap=gap, with_side_words=with_side_words, against=against,
     )  # fmt: skip
     if style == "table":
         out.print(table.to_rich())
@@ -123,6 +133,11 @@ def _check_places(html: Path | None, figures: Path | None) -> None:
     """Refuse places that cannot be written to before anything is computed."""
     if html is not None and html.is_dir():
         raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
+    refuse_file(figures)
+
+
+def refuse_file(figures: Path | None) -> None:
+    """Raise UsageError if figures should go to what is a file."""
     if figures is not None and figures.exists() and not figures.is_dir():
         raise UsageError(f"--figures {figures} is a file; give a folder")
 

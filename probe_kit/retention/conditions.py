@@ -29,8 +29,14 @@ def condition_tables(rows: Sequence[RetentionRow], wordings: Sequence[WordingPai
     for title, pairs in groupby(wordings, key=wording_title):
         columns = ("category", *(name for name, _ in WORDING_COLUMNS))
         cells = tuple((pair.category, *(cell(pair) for _, cell in WORDING_COLUMNS)) for pair in pairs)
-        found.append(PlainTable(title, "same items, same seeds", columns, cells))
+        found.append(PlainTable(title, _LADDER, columns, cells))
     return found
+
+
+_LADDER = (
+    "same items, same seeds; only one: episodes right in the first wording alone, and in the second alone; p: "
+    "McNemar, exact; by group: items that share pictures count once; Holm: that, for all pairs of the category"
+)
 
 
 def rule_sentences(rows: Sequence[RetentionRow]) -> list[str]:

@@ -1,6 +1,6 @@
 """Retention tables on a console: one block per run, whole at any width."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,19 +8,21 @@ from typing import TYPE_CHECKING
 from probe_kit.fitting_tables import Cell, FittingTable, Part
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
+    ANSWER_LEGEND,
+    ANSWER_MEASURES,
+    ANSWER_SCORES,
     CONTROL_PARTS,
-    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TEST,
     FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
     RULE_COLUMNS,
-    WORDING_COLUMNS,
     Column,
     action_place,
+    action_value,
     beats,
     bounded_value,
     call_words,
     controlled,
-    difference_title,
     first_iteration,
     margin_value,
     model_name,
@@ -29,15 +31,15 @@ from probe_kit.retention.cells import (
     paper_margin,
     percent,
     prefix_place,
+    prefix_value,
     probed,
     success_interval,
-    with_limits,
-    wording_title,
 )
+from probe_kit.retention.conditions import condition_tables, rule_sentences
 from probe_kit.retention.differences import Difference
+from probe_kit.retention.lines import Line, behaviour_lines, cell_of, compared, difference_legend, probe_lines
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
-from probe_kit.retention.ruled import rule_sentence
 from probe_kit.retention.success import Regime
 from probe_kit.retention.wordings import WordingPair
 from probe_kit.statistics.significance import detectable
@@ -58,39 +60,51 @@ def rich_tables(
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
     further: Sequence[PlainTable] = (),
+    unpaired: Sequence[str] = (),
 ) -> "Group":
-    """Success rates of every run, its retention and controls per view, differences, wordings, notes.
+    """Success rates of all runs in one table, retention and controls in one per view; wordings, more and notes.
 
-    Asked runs stand above a rule. further: tables behind these.
+    Several runs go by letters, under each other, with their differences below them. Asked runs stand above a rule.
+    further: tables behind these. unpaired: why runs have no differences.
     """
     from rich.console import Group
     from rich.rule import Rule
     from rich.text import Text
 
-    tables: list[FittingTable | Rule] = []
-    kinds: list[str] = []
-    for _, of_run in groupby(rows, key=lambda row: (row.group, row.run)):
-        found = list(of_run)
-        if kinds[-1:] == ["asks"] and not is_asked(found[0]):
+    called = _letters(rows)
+    tables: list[FittingTable | Rule | Text] = []
+    for kind, of_kind in groupby(rows, key=lambda row: row.kind):
+        if tables and kind != "asks":
             tables.append(Rule("asked above, acting below", style="dim"))
-        kinds.append(found[0].kind)
-        once = once_per_category(found)
-        if is_asked(found[0]):
-            tables.append(_of_run("Accuracy of answers", once, _ANSWERS, [_ANSWER_LEGEND]))
-        else:
-            tables.append(_of_run("Success rate", once, _SUCCESS, [_OUTCOME_LEGEND, rule_sentence(once[-1])]))
-        for view, of_view in groupby(probed(found), key=lambda row: row.view):
-            shown = list(of_view)
-            reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
-            legend = [_SITE_LEGEND, *reasons, *_judged(shown)]
-            tables.append(_of_run(f"Retention, view {view}", shown, _RETENTION, legend))
-            if controlled(shown):
-                tables.append(_of_run(f"Controls, view {view}", shown, _CONTROLS, [_control_legend(shown)]))
-    for title, of_pair in groupby(differences, key=difference_title):
-        tables.append(_fitting(title, "", list(of_pair), {"Difference": DIFFERENCE_COLUMNS}))
-    for title, of_ladder in groupby(wordings, key=wording_title):
-        tables.append(_fitting(title, _LADDER_LEGEND, list(of_ladder), _LADDER))
-    return Group(*tables, *map(_plain, further), *(Text(note, style="yellow") for note in notes))
+        tables += _of_kind(list(of_kind), differences, called)
+    tables += [Text(sentence, style="yellow") for sentence in unpaired]
+    conditions = condition_tables([], wordings)  # outcome rules are columns of their own here
+    plain = map(_plain, [*conditions, *further])
+    return Group(*tables, *plain, *(Text(note, style="yellow") for note in notes))
+
+
+def _of_kind(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference], called: "_Letters"
+) -> "list[FittingTable]":
+    """Of asked, or of acting runs."""
+    once = once_per_category(rows)
+    lines = behaviour_lines(once, differences)
+    if is_asked(rows[0]):
+        what, parts, notes = "Accuracy of answers", _ANSWERS, [_ANSWER_LEGEND, ANSWER_LEGEND]
+    else:
+        what, parts, notes = "Success rate", _SUCCESS, [_OUTCOME_LEGEND, *rule_sentences(once)]
+    tables = [_of_runs(what, lines, parts, notes, called)]
+    for view in dict.fromkeys(row.view for row in probed(rows)):
+        shown = [row for row in rows if row.view == view]
+        reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
+        legend = [_SITE_LEGEND, *reasons, *_judged(shown)]
+        tables.append(
+            _of_runs(f"Retention, view {view}", probe_lines(shown, differences), _RETENTION, legend, called)
+        )
+        if controlled(shown):
+            legend = [_control_legend(shown)]
+            tables.append(_of_runs(f"Controls, view {view}", compared(shown), _CONTROLS, legend, called))
+    return tables
 
 
 def _plain(table: PlainTable) -> FittingTable:
@@ -139,20 +153,12 @@ _SITE_LEGEND = (
     "of which the first sees no action yet; p family-wise"
 )
 
-_LADDER_LEGEND = (
-    "only one: episodes right in the first wording alone, and in the second alone; p: McNemar, exact; by group: "
-    "items that share pictures count once; Holm: that, for all pairs of the category"
-)
-
-_LADDER: dict[str, Sequence[tuple[str, Callable[[WordingPair], str]]]] = {
-    "Same items, same seeds": WORDING_COLUMNS
-}
-
-_ANSWER_LEGEND = "wrong, unread (no answer, or several): each in % of all; without letter bias: options exchanged"
+_ANSWER_LEGEND = "wrong, unread (no answer, or several): each in % of all"
 
 _ANSWERS: dict[str, Sequence[Column]] = {
     "Does it know the answer?": [
-        ("accuracy % [95 %]", lambda row: with_limits(percent(row.sr), row.sr_ci, percent)),
+        ("accuracy % [95 %]", success_interval),
+        DIFFERENCE_TEST,
         ("± Δ", margin_value),
         ("regime", _regime),
         ("left / right", _sides),
@@ -160,17 +166,14 @@ _ANSWERS: dict[str, Sequence[Column]] = {
     "How it answered": [
         ("wrong", lambda row: percent(row.p_wrong)),
         ("unread", lambda row: percent(row.p_oob)),
-        ("by text", lambda row: percent(row.accuracy_text)),
-        ("by logits", lambda row: percent(row.accuracy_logits)),
-        ("without letter bias", lambda row: percent(row.accuracy_debiased)),
-        ("letter bias", lambda row: number(row.letter_bias)),
-        ("option mass", lambda row: number(row.option_mass)),
-        ("near ties", lambda row: percent(row.p_near_tie)),
+        *(column for column in ANSWER_SCORES if column[0] != "unreadable"),  # that is: unread
+        *ANSWER_MEASURES,
     ],
 }
 _SUCCESS: dict[str, Sequence[Column]] = {
     "Does it act on the answer?": [
         ("SR % [95 %]", success_interval),
+        DIFFERENCE_TEST,
         ("± Δ", margin_value),
         ("paper's Δ", paper_margin),
         ("regime", _regime),
@@ -186,13 +189,13 @@ _SUCCESS: dict[str, Sequence[Column]] = {
 }
 _RETENTION: dict[str, Sequence[Column]] = {
     "In the backbone": [
-        ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+        ("backbone % [95 %]", prefix_value),
         ("layer", prefix_place),
         ("p", lambda row: number(row.prefix_p_fwe, 3)),
         ("beats", beats),
     ],
     "Where the action is made": [
-        ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+        ("action % [95 %]", action_value),
         ("layer", action_place),
         ("p", lambda row: number(row.action_p_fwe, 3)),
         ("first iteration %", first_iteration),
@@ -206,34 +209,85 @@ _RETENTION: dict[str, Sequence[Column]] = {
 _CONTROLS: dict[str, Sequence[Column]] = CONTROL_PARTS
 
 
-def _of_run(
-    what: str, rows: Sequence[RetentionRow], parts: dict[str, Sequence[Column]], notes: Sequence[str]
+_Letters = Mapping[tuple[str | None, str], str]
+"""By group and run, what it is called in a table of several."""
+
+
+def _letters(rows: Sequence[RetentionRow]) -> _Letters:
+    runs = dict.fromkeys((row.group, row.run) for row in rows)
+    return {run: _letter(at) for at, run in enumerate(runs)}
+
+
+def _letter(at: int) -> str:
+    """A to Z, then A2 to Z2."""
+    round_, place = divmod(at, 26)
+    return chr(ord("A") + place) + (str(round_ + 1) if round_ else "")
+
+
+def _of_runs(
+    what: str,
+    lines: Sequence[Line],
+    parts: Mapping[str, Sequence[Column]],
+    notes: Sequence[str],
+    called: _Letters,
 ) -> FittingTable:
-    title = f"{what}: {model_name(rows[0])} on {rows[0].suite}"
-    return _fitting(title, "; ".join([_sizes(rows), *notes]), rows, parts)
+    """One run by its name, several by their letters."""
+    rows = [line for line in lines if isinstance(line, RetentionRow)]
+    runs = {(row.group, row.run): row for row in reversed(rows)}
+    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
+    if len(called) == 1:
+        name, names = "category", [row.category for row in rows]
+        title, sizes = f"{what}: {model_name(rows[0])} on {suites}", f"{_folder(rows)}, {_sizes(rows)}"
+    else:
+        shown = [key for key in called if key in runs]
+        title = f"{what}: {', '.join(f'{called[key]} {model_name(runs[key])}' for key in shown)} on {suites}"
+        name, names = "category · run", [f"{line.category} {_short(line, rows, called)}" for line in lines]
+        sizes = _sizes_of({called[key]: [r for r in rows if (r.group, r.run) == key] for key in shown})
+    tested = any(DIFFERENCE_TEST in columns for columns in parts.values())
+    legend = difference_legend([line for line in lines if isinstance(line, Difference)], tested)
+    return _fitting(title, "; ".join(filter(None, [sizes, *notes, legend])), name, names, lines, parts)
 
 
-def _fitting[Row: (RetentionRow, Difference, WordingPair)](
+def _short(line: Line, rows: Sequence[RetentionRow], called: _Letters) -> str:
+    """A run's letter, or those of two; a group of several runs by its name."""
+    if isinstance(line, RetentionRow):
+        return called[line.group, line.run]
+    letters: dict[str, list[str]] = {}
+    for row in rows:
+        letters.setdefault(model_name(row) if row.group is None else row.group, []).append(
+            called[row.group, row.run]
+        )
+    sides = ["".join(dict.fromkeys(letters[side])) for side in (line.group, line.minus)]
+    return " − ".join(sides) + ("" if line.paired else ", other items")
+
+
+def _fitting(
     title: str,
     caption: str,
-    rows: Sequence[Row],
-    parts: dict[str, Sequence[tuple[str, Callable[[Row], str]]]],
+    name: str,
+    names: Sequence[str],
+    lines: Sequence[Line],
+    parts: Mapping[str, Sequence[Column]],
 ) -> FittingTable:
-    """Columns in which no row has anything to show are left out."""
+    """Columns in which no line has anything to show are left out."""
     found = []
     for question, columns in parts.items():
-        shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]
-        cells = tuple(tuple(_coloured(cell(row)) for _, cell in shown) for row in rows)
+        shown = [column for column in columns if any(cell_of(column[1], line) not in ("–", "") for line in lines)]
+        cells = tuple(tuple(_coloured(cell_of(cell, line)) for _, cell in shown) for line in lines)
         if shown:
             found.append(Part(question, tuple(heading for heading, _ in shown), cells))
     return FittingTable(
         title=title,
         caption=caption,
-        name="category",
-        names=tuple(row.category for row in rows),
-        styles=tuple("bold" if row.category == MEAN else "" for row in rows),
+        name=name,
+        names=tuple(names),
+        styles=tuple(_style(line) for line in lines),
         parts=tuple(found),
     )
+
+
+def _style(line: Line) -> str:
+    return " ".join(["bold"] * (line.category == MEAN) + ["italic"] * isinstance(line, Difference))
 
 
 def _coloured(cell: str) -> Cell:
@@ -247,11 +301,22 @@ def _control_legend(rows: Sequence[RetentionRow]) -> str:
     return f"held-out accuracy % without the model, {seen}; selectivity: accuracy above random labels{twin}"
 
 
+def _sizes_of(runs: Mapping[str, Sequence[RetentionRow]]) -> str:
+    """Of several runs by their letters; what is the same of all is said once."""
+    found = {letter: _sizes(rows) for letter, rows in runs.items()}
+    if len(set(found.values())) == 1:
+        return "; ".join([*(f"{letter}: {_folder(rows)}" for letter, rows in runs.items()), *set(found.values())])
+    return "; ".join(f"{letter}: {_folder(runs[letter])}, {sizes}" for letter, sizes in found.items())
+
+
+def _folder(rows: Sequence[RetentionRow]) -> str:
+    return f"run {Path(rows[0].run).name}"
+
+
 def _sizes(rows: Sequence[RetentionRow]) -> str:
     """What is the same, or nearly so, in all rows."""
     single = [row for row in rows if row.category != MEAN]
     parts = [
-        f"run {Path(rows[0].run).name}",
         f"per category {_span([row.n_episodes for row in single])} episodes",
         f"{_span([row.n_items for row in single])} items",
     ]

@@ -1,11 +1,16 @@
 """`probe-kit join`."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from probe_kit.console import out, print_json
+from probe_kit.console import out, print_json, say
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention.commands import refuse_file
+
+if TYPE_CHECKING:
+    from probe_kit.retention.known import KnownUsed
 
 
 def join(
@@ -19,6 +24,9 @@ def join(
     ] = False,
     wording: Annotated[
         str | None, typer.Option(help="Of an acting run with several wordings: which one; default its first.")
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="Folder for the figure `known-used`, as PNG and PDF.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
@@ -41,8 +49,18 @@ def join(
         if view is not None:
             raise UsageError(f"--view {view}: {acted} has no probes. Run `probe-kit train {acted}`") from None
         results = None
+    refuse_file(figures)
     joined = join_runs(reader, policy, results, view)
     if as_json:
         print_json(joined.to_json())
     else:
         out.print(rich_join(joined))
+    if figures is not None:
+        _save(joined, figures)
+
+
+def _save(joined: "KnownUsed", folder: Path) -> None:
+    from probe_kit.retention.displays.gallery import exhibit_joins, save_figures
+
+    for path in save_figures(exhibit_joins([joined]), folder):
+        say(f"figure: {path}")

@@ -1,4 +1,4 @@
-"""Known, encoded, used on a console and in Markdown."""
+"""Known, encoded, used on a console and in the report."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from probe_kit.fitting_tables import Cell, FittingTable, Part
 from probe_kit.retention.cells import number, percent, with_limits
 from probe_kit.retention.known import OVERALL, PAIRS, Comparison, Joined, KnownUsed
+from probe_kit.retention.plain_tables import PlainTable
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -15,6 +16,7 @@ _LEGEND = (
     "known: answered right; encoded: the probe's held-out decision right; used: acted right; each in both layouts "
     "of an item, which a coin manages in 25 %"
 )
+_CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over categories and pairs"
 
 
@@ -33,6 +35,28 @@ def rich_join(joined: KnownUsed) -> "Group":
         _table("Single episodes (nothing is tested)", "", rows, [("", _episodes(rows))]),
     ]
     return Group(*tables, *(Text(note, style="yellow") for note in joined.notes))
+
+
+def join_tables(joined: KnownUsed) -> list[PlainTable]:
+    """The same counts and tests as tables of text, for pages."""
+    seen = f"probes in view {joined.view}" if joined.view else "no probes: known and used only"
+    title = f"Known, encoded, used: {joined.asked} (by {joined.score}) · {joined.acted}"
+    rows = joined.rows
+    return [
+        _plain(title, f"{_LEGEND}; {seen}", rows, [*_SHARES, *_LOST]),
+        _plain("Which of them: known · encoded · used (expected of coins)", _CODES, rows, _codes(rows)),
+        _plain("Equally many?", _TESTS, rows, _tests()),
+    ]
+
+
+def _plain(title: str, note: str, rows: Sequence[Joined], columns: Columns) -> PlainTable:
+    shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]
+    return PlainTable(
+        title,
+        note,
+        ("category", *(name for name, _ in shown)),
+        tuple((row.category, *(cell(row) for _, cell in shown)) for row in rows),
+    )
 
 
 def _share(count: int | None, row: Joined) -> str:

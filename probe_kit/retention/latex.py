@@ -1,35 +1,37 @@
 """The retention table in LaTeX: booktabs rules, and five heat colours for retention."""
 
 from collections.abc import Callable, Sequence
-from itertools import groupby
 
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
-    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TEST,
     FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
-    NOT_ACTED,
     action_place,
+    action_share,
     beats,
     call_value,
+    category_name,
     controlled,
-    difference_title,
     first_iteration,
     followed,
     margin_value,
     model_name,
     paper_margin,
-    percent,
     prefix_place,
+    prefix_share,
     probed,
     retention_value,
     rule_name,
+    success_value,
     title,
+    view_name,
 )
 from probe_kit.retention.conditions import rule_sentences
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.heat import HEAT
+from probe_kit.retention.lines import Line, cell_of, compared, difference_legend
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import MEAN, RetentionRow
 
@@ -40,6 +42,9 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "Δ": r"$\Delta$",
     "–": "--",
     "−": "$-$",
+    "<": "$<$",
+    ">": "$>$",
+    "·": r"$\cdot$",
 }
 
 
@@ -48,23 +53,19 @@ def latex(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     further: Sequence[PlainTable] = (),
+    unpaired: Sequence[str] = (),
 ) -> str:
-    """Complete `table` environments: retention, then controls and differences between groups where there are any.
+    """Complete `table` environments: retention with differences between runs, then controls where there are any.
 
-    further: tables behind these. notes: sentences for the author, as comments.
+    further: tables behind these. notes: sentences for the author, as comments. unpaired: why runs have no
+    differences, a part of the caption.
     Needs the packages booktabs and xcolor with its option `table`.
     """
-    parts = [_retention_table(rows)]
+    parts = [_retention_table(rows, differences, unpaired)]
     if controlled(rows):
-        names = ["Model", "view", "call", *(name for name, _ in CONTROL_COLUMNS)]
-        cells = [
-            [model_name(row), row.view or "–", call_value(row), *(cell(row) for _, cell in CONTROL_COLUMNS)]
-            for row in probed(rows)
-        ]
-        parts.append(_plain_table(title("Controls", rows), names, cells))
-    for heading, of_pair in groupby(differences, key=difference_title):
-        cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
-        parts.append(_plain_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
+        columns = [("Model", model_name), ("view", view_name), ("call", call_value), *CONTROL_COLUMNS]
+        cells = [[cell_of(cell, line) for _, cell in columns] for line in compared(probed(rows))]
+        parts.append(_plain_table(title("Controls", rows), [name for name, _ in columns], cells))
     parts += [_plain_table(f"{own.title} ({own.note})", own.columns, own.cells) for own in further]
     return "\n".join([*parts, *(f"% {note}" for note in (*rule_sentences(rows), *notes))])
 
@@ -91,30 +92,27 @@ def _coloured(cell: str) -> str:
     return rf"\textcolor{{red}}{{{escape(cell)}}}" if cell.endswith(ABOVE_CHANCE) else escape(cell)
 
 
-def _retention_table(rows: Sequence[RetentionRow]) -> str:
+def _retention_table(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference], unpaired: Sequence[str]
+) -> str:
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
-    body: list[str] = []
-    columns = _columns(rows)
     asked = any(is_asked(row) for row in rows)
-    for place, row in enumerate(rows):
-        if place and is_asked(rows[place - 1]) and not is_asked(row):
-            body += [r"\midrule"]
-        body += (
-            [r"\midrule"] * (row.category == MEAN) + [_line(row, columns)] + [r"\midrule"] * (row.category == MEAN)
-        )
     what = "SR / accuracy and retention" if asked else "Success rate and retention"
+    caption = title(f"{what} ({rule_name(rows)})", rows)
+    said = [sentence for sentence in (difference_legend(differences), *unpaired) if sentence]
+    columns = _columns(rows, differences)
     return "\n".join(
         [
             "% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}",
             *colours,
             r"\begin{table}",
-            rf"\caption{{{escape(title(f'{what} ({rule_name(rows)})', rows))}}}",
+            rf"\caption{{{escape('. '.join([caption, *said]))}}}",
             rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in columns)}}}",
             r"\toprule",
             " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in columns)
             + r" \\",
             r"\midrule",
-            *body[:-1],
+            *_body(rows, differences, columns),
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{table}",
@@ -123,24 +121,40 @@ def _retention_table(rows: Sequence[RetentionRow]) -> str:
     )
 
 
+def _body(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference], columns: "Sequence[_Column]"
+) -> list[str]:
+    """Lines with a rule around means and between asked and acting runs."""
+    body: list[str] = []
+    for kind in dict.fromkeys(row.kind for row in rows):
+        of_kind = [row for row in rows if row.kind == kind]
+        body += [r"\midrule"] * bool(body and body[-1] != r"\midrule")
+        lines = compared(of_kind, differences)
+        for before, line in zip([None, *lines], lines, strict=False):
+            new = before is None or (before.category == MEAN) != (line.category == MEAN)
+            body += [r"\midrule"] * bool(body and new and body[-1] != r"\midrule") + [_line(line, columns)]
+    return body
+
+
 def escape(text: str) -> str:
     """`text` with LaTeX's special characters made harmless."""
     return "".join(_SPECIAL.get(character, character) for character in text)
 
 
-_Columns = list[tuple[str, Callable[[RetentionRow], str], str]]
-_COLUMNS: _Columns = [
+_Column = tuple[str, Callable[[RetentionRow], str], str]
+_COLUMNS: list[_Column] = [
     ("Model", model_name, "l"),
-    ("View", lambda row: row.view or "–", "l"),
+    ("View", view_name, "l"),
     ("Call", call_value, "r"),
-    ("Category", lambda row: row.category, "l"),
+    ("Category", category_name, "l"),
     ("$n$", lambda row: str(row.n_episodes), "r"),
-    ("SR", lambda row: NOT_ACTED if row.sr is None else percent(row.sr), "r"),
+    ("SR", success_value, "r"),
+    ("$p$ (Holm)", DIFFERENCE_TEST[1], "r"),
     (r"$\Delta$", margin_value, "r"),
     (r"$\Delta$ (paper)", paper_margin, "r"),
-    ("Prefix", lambda row: percent(row.prefix_accuracy), "r"),
+    ("Prefix", prefix_share, "r"),
     ("Layer", prefix_place, "r"),
-    ("Action", lambda row: percent(row.action_accuracy), "r"),
+    ("Action", action_share, "r"),
     ("Layer", action_place, "r"),
     ("First it.", first_iteration, "r"),
     ("Prefix beats", beats, "l"),
@@ -150,25 +164,24 @@ _COLUMNS: _Columns = [
 """Heading in LaTeX, content as text, alignment."""
 
 
-def _columns(rows: Sequence[RetentionRow]) -> _Columns:
-    """Behind the SR, what interventions say, if any row was intervened on."""
-    if not followed(rows):
-        return _COLUMNS
-    place = next(number for number, (heading, _, _) in enumerate(_COLUMNS) if heading == "SR") + 1
-    more: _Columns = [(escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
-    return [*_COLUMNS[:place], *more, *_COLUMNS[place:]]
+def _columns(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[_Column]:
+    """Behind the SR, tests of differences and what interventions say, as far as there are any."""
+    more = [(escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
+    place = next(number for number, column in enumerate(_COLUMNS) if column[1] is DIFFERENCE_TEST[1]) + 1
+    columns = [*_COLUMNS[:place], *(more if followed(rows) else []), *_COLUMNS[place:]]
+    return [column for column in columns if differences or column[1] is not DIFFERENCE_TEST[1]]
 
 
-def _line(row: RetentionRow, columns: _Columns) -> str:
-    cells = [_coloured_retention(cell, row) for _, cell, _ in columns]
-    return " & ".join(cells) + r" \\"
+def _line(line: Line, columns: Sequence[_Column]) -> str:
+    return " & ".join(_coloured_retention(cell, line) for _, cell, _ in columns) + r" \\"
 
 
-def _coloured_retention(cell: Callable[[RetentionRow], str], row: RetentionRow) -> str:
-    text = escape(cell(row))
-    if cell is not retention_value or not row.retention_defined or row.retention_bounded is None:
+def _coloured_retention(cell: Callable[[RetentionRow], str], line: Line) -> str:
+    text = escape(cell_of(cell, line))
+    heated = cell is retention_value and isinstance(line, RetentionRow) and line.retention_defined
+    if not heated or line.retention_bounded is None:
         return text
-    return rf"\cellcolor{{{heat_colour(row.retention_bounded)}}}{text}"
+    return rf"\cellcolor{{{heat_colour(line.retention_bounded)}}}{text}"
 
 
 def heat_colour(value: float) -> str:

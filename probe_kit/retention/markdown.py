@@ -1,22 +1,20 @@
 """Retention tables in Markdown."""
 
 from collections.abc import Sequence
-from itertools import groupby
 
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
-    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TEST,
     FOLLOWED_COLUMNS,
     FURTHER_RETENTION,
-    RULE_COLUMNS,
-    WORDING_COLUMNS,
     Column,
     action_place,
+    action_value,
     beats,
     call_value,
+    category_name,
     controlled,
-    difference_title,
     first_iteration,
     followed,
     margin_value,
@@ -26,16 +24,17 @@ from probe_kit.retention.cells import (
     paper_margin,
     percent,
     prefix_place,
+    prefix_value,
     probed,
     retention_value,
     rule_name,
     success_interval,
     title,
-    with_limits,
-    wording_title,
+    view_name,
 )
-from probe_kit.retention.conditions import rule_sentences
+from probe_kit.retention.conditions import condition_tables, rule_sentences
 from probe_kit.retention.differences import Difference
+from probe_kit.retention.lines import Line, behaviour_lines, cell_of, compared, difference_legend, probe_lines
 from probe_kit.retention.plain_tables import PlainTable, is_asked
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.wordings import WordingPair
@@ -47,7 +46,7 @@ def _score(row: RetentionRow) -> str:
 
 SUCCESS_COLUMNS: list[Column] = [
     ("model", model_name),
-    ("category", lambda row: row.category),
+    ("category", category_name),
     ("SR % [95 %]", success_interval),
     ("± Δ %", margin_value),
     ("paper's Δ %", paper_margin),
@@ -63,15 +62,15 @@ SUCCESS_COLUMNS: list[Column] = [
 
 RETENTION_COLUMNS: list[Column] = [
     ("model", model_name),
-    ("view", lambda row: row.view or "–"),
+    ("view", view_name),
     ("call", call_value),
-    ("category", lambda row: row.category),
+    ("category", category_name),
     ("bounded retention [95 %]", retention_value),
     *FURTHER_RETENTION,
-    ("backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)),
+    ("backbone % [95 %]", prefix_value),
     ("at layer", prefix_place),
     ("p", lambda row: number(row.prefix_p_fwe, 3)),
-    ("action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent)),
+    ("action % [95 %]", action_value),
     ("at layer @iteration", action_place),
     ("p", lambda row: number(row.action_p_fwe, 3)),
     ("first iteration %", first_iteration),
@@ -88,30 +87,33 @@ def markdown(
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
     further: Sequence[PlainTable] = (),
+    unpaired: Sequence[str] = (),
 ) -> str:
-    """Success rates and, where there are any, retention, controls, differences, wordings, more and notes."""
+    """Success rates and, where there are any, retention, controls, conditions, more and notes.
+
+    Differences stand below the runs of their category; unpaired: why others have none.
+    """
     asked, behaviour = any(is_asked(row) for row in rows), once_per_category(rows)
-    columns = [(_of_both(name) if asked else name, cell) for name, cell in SUCCESS_COLUMNS]
-    columns[3:3] = FOLLOWED_COLUMNS if followed(rows) else []
+    more = [DIFFERENCE_TEST] if any(row.p is not None for row in differences) else []
+    more += FOLLOWED_COLUMNS if followed(rows) else []
+    shown = [*SUCCESS_COLUMNS[:3], *more, *SUCCESS_COLUMNS[3:]]
+    columns = [(_of_both(name) if asked else name, cell) for name, cell in shown]
     what = "SR / accuracy" if asked else f"Success rate by {rule_name(rows)}"
-    parts = [_rows_table(what, behaviour, columns)]
-    if any(row.sr_idle is not None for row in rows):
-        columns = [*SUCCESS_COLUMNS[:3], *((f"{name} %", cell) for name, cell in RULE_COLUMNS)]
-        parts.append(_rows_table(f"What the {rule_name(rows)} makes of it", behaviour, columns))
-    parts += [f"> {sentence}\n" for sentence in rule_sentences(behaviour)]
+    parts = [_lines_table(title(what, behaviour), behaviour_lines(behaviour, differences), columns)]
+    captions = [f"{sentence}." for sentence in [difference_legend(differences)] if sentence]
+    parts += [f"> {sentence}\n" for sentence in (*captions, *unpaired)]
+    conditions = condition_tables(rows, wordings)
+    if all(row.sr_idle is None for row in rows):  # else their table says it
+        parts += [f"> {sentence}\n" for sentence in rule_sentences(behaviour)]
     if probed(rows):
-        parts.append(_rows_table("Retention", probed(rows), RETENTION_COLUMNS))
+        lines = probe_lines(probed(rows), differences)
+        parts.append(_lines_table(title("Retention", probed(rows)), lines, RETENTION_COLUMNS))
     if controlled(rows):
-        columns = [("model", model_name), ("view", lambda row: row.view or "–")]
+        columns = [("model", model_name), ("view", view_name)]
         columns += [("call", call_value), *CONTROL_COLUMNS]
-        parts.append(_rows_table("Controls", probed(rows), columns))
-    for heading, of_pair in groupby(differences, key=difference_title):
-        cells = [[row.category, *(cell(row) for _, cell in DIFFERENCE_COLUMNS)] for row in of_pair]
-        parts.append(_markdown_table(heading, ["category", *(name for name, _ in DIFFERENCE_COLUMNS)], cells))
-    for heading, of_run in groupby(wordings, key=wording_title):
-        ladder = [[row.category, *(cell(row) for _, cell in WORDING_COLUMNS)] for row in of_run]
-        parts.append(_markdown_table(heading, ["category", *(name for name, _ in WORDING_COLUMNS)], ladder))
-    parts += [f"{_markdown_table(own.title, own.columns, own.cells)}\n{own.note}\n" for own in further]
+        parts.append(_lines_table(title("Controls", probed(rows)), compared(probed(rows)), columns))
+    plain = [*conditions, *further]
+    parts += [f"{_markdown_table(own.title, own.columns, own.cells)}\n{own.note}\n" for own in plain]
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 
@@ -126,9 +128,9 @@ def _regime(row: RetentionRow) -> str:
     return row.regime or _score(row)
 
 
-def _rows_table(what: str, rows: Sequence[RetentionRow], columns: Sequence[Column]) -> str:
-    cells = [[cell(row) for _, cell in columns] for row in rows]
-    return _markdown_table(title(what, rows), [heading for heading, _ in columns], cells)
+def _lines_table(heading: str, lines: Sequence[Line], columns: Sequence[Column]) -> str:
+    cells = [[cell_of(cell, line) for _, cell in columns] for line in lines]
+    return _markdown_table(heading, [name for name, _ in columns], cells)
 
 
 def _markdown_table(heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

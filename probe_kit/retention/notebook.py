@@ -9,7 +9,6 @@ from probe_kit.retention.report.tables import (
     HtmlCell,
     HtmlTable,
     behaviour_table,
-    difference_tables,
     retention_table,
 )
 from probe_kit.retention.rows import RetentionRow
@@ -20,7 +19,7 @@ _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of t
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The report's first tables, without its page: headings explain themselves when pointed at."""
-    found = [behaviour_table(rows), retention_table(rows), *difference_tables(differences)]
+    found = [behaviour_table(rows, differences), retention_table(rows, differences)]
     return _heading(rows) + "".join(_table(one) for one in found if one is not None)
 
 
@@ -62,7 +61,9 @@ def _cell(cell: HtmlCell, numeric: bool, bold: bool) -> str:
     style += f";background:{cell.heat}{_INK}" if cell.heat else ""
     style += ";font-weight:bold" if bold or cell.strong else ""
     style += ";color:#b00020" if cell.alarm else ""
-    return f'<td style="{style}" title="{escape(cell.note)}">{escape(cell.text)}</td>'
+    style += ";font-style:italic" if cell.difference else ""
+    below = f"<br><small>{escape(cell.below)}</small>" if cell.below else ""
+    return f'<td style="{style}" title="{escape(cell.note)}">{escape(cell.text)}{below}</td>'
 
 
 def _style(numeric: bool) -> str:

@@ -4,7 +4,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from probe_kit.retention.cells import model_name, number, once_per_category, percent, success_interval, with_limits
+from probe_kit.retention.cells import (
+    ANSWER_LEGEND,
+    ANSWER_MEASURES,
+    ANSWER_SCORES,
+    Column,
+    category_name,
+    model_name,
+    number,
+    once_per_category,
+    percent,
+    success_interval,
+    with_limits,
+)
 from probe_kit.retention.gap import VlmGap
 from probe_kit.retention.rows import MEAN, RetentionRow
 
@@ -26,17 +38,12 @@ def is_asked(row: RetentionRow) -> bool:
     return row.kind == "asks"
 
 
-_ANSWERS: Sequence[tuple[str, Callable[[RetentionRow], str]]] = [
+_ANSWERS: Sequence[Column] = [
     ("model", model_name),
-    ("category", lambda row: row.category),
+    ("category", category_name),
     ("accuracy % [95 %]", success_interval),
-    ("by text %", lambda row: percent(row.accuracy_text)),
-    ("by logits %", lambda row: percent(row.accuracy_logits)),
-    ("without letter bias %", lambda row: percent(row.accuracy_debiased)),
-    ("unreadable %", lambda row: percent(row.p_unreadable)),
-    ("option mass", lambda row: number(row.option_mass)),
-    ("letter bias", lambda row: number(row.letter_bias)),
-    ("near ties %", lambda row: percent(row.p_near_tie)),
+    *((f"{name} %", cell) for name, cell in ANSWER_SCORES),
+    *ANSWER_MEASURES,
 ]
 
 
@@ -48,8 +55,7 @@ def answer_table(rows: Sequence[RetentionRow]) -> PlainTable | None:
     scores = ", ".join(dict.fromkeys(str(row.score) for row in asked))
     return PlainTable(
         ANSWERS,
-        f"accuracy is by {scores}; a constant answer is right in one half; letter bias: logits by which the "
-        "option named first is preferred; near ties: choices that rounding may have made",
+        f"accuracy is by {scores}; {ANSWER_LEGEND}",
         tuple(name for name, _ in _ANSWERS),
         tuple(tuple(cell(row) for _, cell in _ANSWERS) for row in asked),
     )

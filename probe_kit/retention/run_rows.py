@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A row and the estimates behind its numbers."""
+    """A row and the estimates behind its numbers. outcomes: the episodes of its success rate, if it has one."""
 
     row: RetentionRow
     estimates: Estimates
+    outcomes: "pd.DataFrame | None" = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def _row(
             _kept(retention),
             probed.background(success),
         ]
-    return Drawn(RetentionRow.of(category, view, group, *parts), estimates)
+    return Drawn(RetentionRow.of(category, view, group, *parts), estimates, None if success is None else episodes)
 
 
 def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> Source:

@@ -1,26 +1,27 @@
 """The retention table: several runs joined, and the ways to write it down."""
 
-import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from probe_kit.env.outcome import SENSITIVITY_RADII
 from probe_kit.env.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.asked import ask_of, left_out, scored
+from probe_kit.retention.comparisons import Compared, compare_runs
 from probe_kit.retention.differences import Difference, group_differences
 from probe_kit.retention.frames import frame_of
 from probe_kit.retention.gap import VlmGap, vlm_gaps
 from probe_kit.retention.mean_row import mean_row
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_settings
+from probe_kit.retention.names import distinct_labels
 from probe_kit.retention.plain_tables import ANSWERS, PlainTable, answer_table, gap_tables, size_table
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.ruled import by_rule, can_be_judged, check_epsilons
 from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
 from probe_kit.retention.success import listened
+from probe_kit.retention.table_json import table_json
 from probe_kit.retention.wordings import WordingPair, wording_pairs
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
 class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
-    Runs are never averaged with each other, so no mean mixes suites. differences: between groups of runs, if any.
+    Runs are never averaged with each other, so no mean mixes suites. differences: between runs, or groups of runs.
+    unpaired: which runs of several have none, and why, a sentence each.
     results: the probes that the rows were made of, by `row.run`; figures and reports of the table draw these.
     wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
@@ -50,6 +52,7 @@ class RetentionTable:
     notes: tuple[str, ...] = ()
     wordings: list[WordingPair] = field(default_factory=list)
     gaps: list[VlmGap] = field(default_factory=list)
+    unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         from probe_kit.retention.notebook import table_text
@@ -93,24 +96,17 @@ class RetentionTable:
         return frame_of(self.all_rows)
 
     def differences_frame(self) -> "pd.DataFrame":
-        """Differences between groups as a data frame with the fields of `Difference`, intervals as two columns."""
+        """Differences as a data frame with the fields of `Difference`, intervals as two columns."""
         return frame_of(self.differences)
 
     def to_json(self) -> str:
         """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
 
-        With groups, runs in several wordings or gaps, an object with the lists `rows`, `differences`, `wordings`
-        and `gaps`, as far as there are any.
+        Where runs are compared, every row has a list `differences` as well: those of its run minus others. With
+        groups, runs in several wordings or gaps, an object with the lists `rows`, `differences` between groups,
+        `wordings` and `gaps`, as far as there are any.
         """
-        rows = [asdict(row) for row in self.all_rows]
-        lists: dict[str, Sequence[Any]] = {
-            "differences": self.differences,
-            "wordings": self.wordings,
-            "gaps": self.gaps,
-        }
-        beside = {name: [asdict(row) for row in found] for name, found in lists.items() if found}
-        content = {"rows": rows, **beside} if beside else rows
-        return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        return table_json(self.all_rows, self.differences, {"wordings": self.wordings, "gaps": self.gaps})
 
     def to_csv(self) -> str:
         """All rows as comma-separated values with a header; differences have `differences_frame`."""
@@ -120,7 +116,9 @@ class RetentionTable:
         """Success rates, retention, controls and differences as Markdown tables."""
         from probe_kit.retention.markdown import markdown
 
-        return markdown(self.all_rows, self.differences, self.notes, self.wordings, self.further_tables)
+        return markdown(
+            self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
+        )
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
@@ -128,14 +126,15 @@ class RetentionTable:
         from probe_kit.retention.latex import latex
 
         wordings = condition_tables([], self.wordings)
-        return latex(self.all_rows, self.differences, self.notes, [*wordings, *self.further_tables])
+        further = [*wordings, *self.further_tables]
+        return latex(self.all_rows, self.differences, self.notes, further, self.unpaired)
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.console import rich_tables
 
         further = [table for table in self.further_tables if table.title != ANSWERS]  # its blocks say the same
-        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further)
+        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further, self.unpaired)
 
     @property
     def further_tables(self) -> list[PlainTable]:
@@ -157,11 +156,14 @@ def retention(
     gap: bool = False,
     rule: str = DEFAULT_RULE,
     last_steps: int = 1,
+    against: str | None = None,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
-    runs: a list, or lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared
-    with each other. views: those that were probed by default. iterations: which expert iterations take part.
+    runs: a list, of which the first is compared with every other on the same questions (see `compare_runs`), or
+    lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
+    against: the run or group that every other is compared with instead, by its name. views: those that were probed
+    by default. iterations: which expert iterations take part.
     keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
     metres at which SR is scored again, for the rule `disc`. rule: by which episodes are judged, a name of
     `probe_kit.env.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
@@ -170,7 +172,8 @@ def retention(
     score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
     their items in whose name a side stands. gap: compare every asked run with every acting one, see `vlm_gaps`.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
-    is not that of the runs, or for a run that is given twice, SceneError for overlapping zones.
+    is not that of the runs, for a run that is given twice, or for `against` where it is none of them; SceneError
+    for overlapping zones.
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
@@ -194,12 +197,16 @@ def retention(
         drawn += found
         shown = dict.fromkeys(one.row.view for one in found)
         means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
-    by_group = {name: [one for one in drawn if one.row.group == name] for name in groups if name is not None}
-    differences = group_differences(by_group)
+    names = distinct_labels([run for _, run in listed])
+    compared = Compared([], ())
+    if isinstance(runs, Mapping):
+        by_group = {name: [one for one in drawn if one.row.group == name] for name in runs}
+        compared = Compared(group_differences(by_group, against), ())
+    elif len(listed) > 1 or against is not None:
+        compared = compare_runs([run for _, run in listed], drawn, names, against, gap)
     notes += [f"{run.location} was listened to and did not act: SR is n/a." for _, run in listed if _heard(run)]
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
     notes += [*chosen_wordings([run for _, run in listed]), *left_out([run for _, run in listed])]
-    names = _distinct_labels([run for _, run in listed])
     rows, means = (
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
@@ -211,7 +218,9 @@ def retention(
             "--gap compares asked runs with acting ones in the same categories, and these runs have no such pair. "
             "Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
-    return RetentionTable(rows, means, differences, results, iterations, tuple(notes), pairs, gaps)
+    return RetentionTable(
+        rows, means, compared.differences, results, iterations, tuple(notes), pairs, gaps, compared.unpaired
+    )
 
 
 def _wordings(run: RunReader, label: str) -> list[WordingPair]:
@@ -231,17 +240,6 @@ def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:
         f"{run.location} keeps no trajectories, so that its success rate by the rule {rule} is n/a. Extract it "
         "again to have it."
     )
-
-
-def _distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
-    """By run what it is called; runs that share a name are told apart by the hash of their settings."""
-    shared = Counter((run.label, run.random_weights, _heard(run)) for run in runs)
-    return {
-        str(run.location): run.label
-        if shared[run.label, run.random_weights, _heard(run)] == 1
-        else f"{run.label} · {run.settings_sha256[:6]}"
-        for run in runs
-    }
 
 
 def _heard(run: RunReader) -> bool:

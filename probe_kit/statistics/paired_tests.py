@@ -25,13 +25,21 @@ def mcnemar_p(first: Right, second: Right) -> float:
 def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:
     """Exact two-sided p of the same, where the items of a group are one toss: all their differences turn together.
 
-    groups: (N,). The distribution of the sum of differences over all flips of signs is added up group by group, so
-    that no draw is needed for any number of groups.
+    groups: (N,).
+    """
+    return flip_gains_p(first.astype(np.int64) - second, groups)
+
+
+def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
+    """Exact two-sided p that (N,) gains, in whole units, have no direction; those of a group turn together.
+
+    groups: (N,). The distribution of the sum of gains over all flips of signs is added up group by group, so that
+    no draw is needed for any number of groups.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
-    gains = np.zeros(names.size, np.int64)
-    np.add.at(gains, group_of, first.astype(np.int64) - second)
-    sizes = np.abs(gains[gains != 0])
+    totals_of = np.zeros(names.size, np.int64)
+    np.add.at(totals_of, group_of, gains)
+    sizes = np.abs(totals_of[totals_of != 0])
     shares = np.ones(1)
     for size in sizes:
         spread = np.zeros(shares.size + 2 * size)

@@ -40,7 +40,10 @@ def from_csv(
         Path, typer.Argument(help="CSV: instruction,correct,wrong[,group,category,object,other_object].")
     ],
     out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
-    license_name: Annotated[str, typer.Option("--license", help="What others may do with the pictures (SPDX).")],
+    license_name: Annotated[
+        str | None,
+        typer.Option("--license", help="Needed: what others may do with the pictures, such as CC0-1.0 (SPDX)."),
+    ] = None,
     attribution: Annotated[str, typer.Option(help="Whom to name for the pictures.")] = "the author of the table",
     category: Annotated[str, typer.Option(help="Of rows that name none.")] = "questions",
     name: Annotated[str | None, typer.Option(help="Of the suite; default the table's file name.")] = None,
@@ -57,11 +60,17 @@ def from_csv(
     """
     from probe_kit.suite import Terms, suite_from_csv
 
+    if license_name is None:
+        raise UsageError(
+            "--license is missing: a suite says what others may do with its pictures. Of your own pictures it is "
+            "yours to choose: --license CC0-1.0 (anything), CC-BY-4.0 (name you) or LicenseRef-not-for-others"
+        )
     terms = Terms(license_name, attribution, contains_real_face=real_faces)
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
     out.print(f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True)
     err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
+    err.print(f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/mine", soft_wrap=True)
 
 
 @app.command("show")

@@ -57,6 +57,7 @@ def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> Non
     other = probed_run({"color": SIGNAL}, "other", suite="other@1#ba9876543210")
     row = retention({"a": [one], "b": [other]}).differences[0]
     assert not row.paired
+    assert row.p is None
     assert row.sr == 0.0
     assert row.sr_ci[0] is not None
     assert row.sr_ci[0] < -0.05
@@ -78,9 +79,9 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     content = json.loads(table.to_json())
     assert [row["group"] for row in content["rows"]] == ["with VQA"] * 3 + ["without"] * 3
     assert content["differences"][0]["sr_ci"][0] < 0
-    assert "**Difference: with VQA − without (the same items)**" in table.to_markdown()
+    assert "| with VQA − without | color | +0.0 [" in table.to_markdown()
     assert "| with VQA: vqa |" in table.to_markdown()
-    assert r"\caption{Difference: with VQA $-$ without (the same items)}" in table.to_latex()
+    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
     frame = table.differences_frame()
     assert frame["prefix_accuracy"].round(6).tolist() == [0.1, 0.35, 0.225]
     assert (frame["prefix_ci_low"] < frame["prefix_accuracy"]).all()

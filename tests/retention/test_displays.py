@@ -155,7 +155,7 @@ def test_an_iteration_map_holds_every_site_and_frames_the_best(probed_run: Probe
 def test_the_maps_of_one_figure_share_one_scale(probed_run: ProbedRun) -> None:
     figure = iteration_maps(load_results(probed_run({"color": SIGNAL, "shape": NOISE})))
     norms = [image.norm for axes in figure.axes for image in axes.images]
-    assert [(norm.vmin, norm.vmax) for norm in norms] == [(50, 70)] * 2
+    assert [(norm.vmin, norm.vmax) for norm in norms] == [(50, 100)] * 2
 
 
 def test_role_curves_have_a_line_per_view(probed_run: ProbedRun) -> None:

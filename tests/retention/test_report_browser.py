@@ -44,6 +44,9 @@ class Browser:
     def console(self) -> list[Any]:
         return self._call("POST", f"{self._session}/se/log", {"type": "browser"})  # type: ignore[no-any-return]
 
+    def resize(self, width: int) -> None:
+        self._call("POST", f"{self._session}/window/rect", {"width": width, "height": 900})
+
     def quit(self) -> None:
         self._call("DELETE", self._session)
 
@@ -139,6 +142,85 @@ def test_a_click_on_a_heading_sorts_and_a_second_one_turns_it_round(page: Browse
     assert order == "ascending"
     assert [float(value) for value in values] == sorted(float(value) for value in values)
     assert page.console() == []
+
+
+@pytest.fixture
+def comparison(browser: Browser, report: Path) -> Iterator[Browser]:
+    """The report of two runs of long names; the window is as wide as before afterwards."""
+    table = pd.concat([hits(), hits().assign(category="shape", item_id=lambda t: "s" + t["item_id"])])
+    table["group_id"] = table["item_id"]
+    table["episode_id"] = table["item_id"] + ":" + table["layout"].str[0]
+    runs = []
+    for name, outcome in (("a-policy-of-a-long-name", "correct"), ("another-policy-of-a-long-name", "wrong")):
+        own = table.assign(outcome=[outcome, "oob", "correct", "wrong"] * (len(table) // 4))
+        runs.append(ArrayRun(report.parent / name, name, "suite@1#0123456789ab", own.reset_index(drop=True), {}))
+    browser.open(write_report(runs, report.parent / "two.html"))
+    yield browser
+    browser.resize(1400)
+
+
+def hits() -> pd.DataFrame:
+    """Twelve items of one category in both layouts."""
+    return pd.DataFrame(
+        {
+            "item_id": str(number // 2),
+            "category": "color",
+            "layout": ("original", "swapped")[number % 2],
+            "side_correct": ("left", "right")[number % 2],
+            "side_placed": ("left", "right", "none")[number % 3],
+        }
+        for number in range(24)
+    )
+
+
+WIDE = """
+    return [...document.querySelectorAll(".scroll")].filter(one => one.offsetParent).map(one => {
+      const said = getComputedStyle(one.parentElement.querySelector(".cue")).display !== "none";
+      const rest = one.scrollWidth - one.clientWidth;
+      one.scrollLeft = rest;
+      const last = one.querySelector("thead th:last-child").getBoundingClientRect();
+      const first = one.querySelector("tbody td").getBoundingClientRect();
+      const box = one.getBoundingClientRect();
+      return [rest > 1, said, last.right <= box.right + 1, first.left >= box.left - 1];
+    });
+"""
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_a_column_beside_the_page_is_announced_and_can_be_reached(comparison: Browser, width: int) -> None:
+    comparison.resize(width)
+    across = "return [document.documentElement.scrollWidth, window.innerWidth]"
+    page_width, window = comparison.run(across)
+    assert page_width <= window, "the page itself never scrolls sideways"
+    time.sleep(0.1)  # one frame, in which sizes are watched
+    found = comparison.run(WIDE)
+    assert found
+    assert width == 1400 or any(wide for wide, *_ in found)
+    for wide, said, reached, first_stays in found:
+        assert said == wide
+        assert reached
+        assert first_stays
+    assert comparison.console() == []
+
+
+def test_sorting_keeps_differences_below_runs_and_a_third_click_undoes_it(comparison: Browser) -> None:
+    script = """
+        const table = document.querySelector("#behaviour table.sortable");
+        const rows = () => [...table.tBodies[0].rows].map(row => row.className);
+        const before = rows();
+        const button = table.tHead.rows[0].cells[1].firstElementChild;
+        const seen = [0, 1, 2].map(() => { button.click(); return rows(); });
+        return [before, ...seen];
+    """
+    before, up, down, again = comparison.run(script)
+    assert before == ["", "", "difference"] * 2
+    assert up == down == [""] * 4 + ["difference"] * 2
+    assert again == before
+
+
+def test_the_title_names_every_run(comparison: Browser) -> None:
+    title = comparison.run("return document.querySelector('h1').textContent")
+    assert title == "a-policy-of-a-long-name and another-policy-of-a-long-name"
 
 
 def test_filters_show_exactly_the_episodes_they_name(page: Browser) -> None:

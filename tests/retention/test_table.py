@@ -113,7 +113,7 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
         assert undefined[name].map(math.isnan).all(), name
         assert frame[name].notna().any()
     assert math.isnan(frame["delta"][3]), "a mean has none"
-    raw = [row["retention"] for row in json.loads(table.to_json())[:3]]
+    raw = [row["retention"] for row in json.loads(table.to_json())["rows"][:3]]
     assert raw[1] == pytest.approx(0.08 / 0.05), "json keeps the raw ratio"
 
 

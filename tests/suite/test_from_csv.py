@@ -137,3 +137,13 @@ def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) ->
     assert result.exit_code == 0, result.output
     assert "1 items in 1 groups" in result.output
     assert "suite validate" in result.output
+
+
+def test_the_command_says_what_a_licence_is_for_when_there_is_none(pictures: Path) -> None:
+    table = pictures / "fruit.csv"
+    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n")
+    result = CliRunner().invoke(app, ["from-csv", str(table), "--out", str(pictures / "suite")])
+    assert result.exit_code != 0
+    assert isinstance(result.exception, UsageError)
+    assert "--license CC0-1.0" in str(result.exception)
+    assert not (pictures / "suite").exists()

@@ -16,11 +16,13 @@ from probe_kit.retention.displays.heat_table import (
 )
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
 from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
+from probe_kit.retention.displays.known_used import KnownUsedDisplay
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
 from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
 from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
+from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_side_by_side
 
 __all__ = [
     "CallCurveDisplay",
@@ -30,6 +32,7 @@ __all__ = [
     "HeatTableDisplay",
     "IterationMapDisplay",
     "KnowledgeActionDisplay",
+    "KnownUsedDisplay",
     "LayerCurveDisplay",
     "ModelDepthDisplay",
     "OutcomeRulesDisplay",
@@ -40,10 +43,12 @@ __all__ = [
     "SuccessTableDisplay",
     "aligned_curves",
     "call_curves",
+    "curves_side_by_side",
     "final_positions",
     "gallery",
     "iteration_maps",
     "layer_curve",
+    "maps_side_by_side",
     "model_depths",
     "role_curves",
     "save_figures",

@@ -13,9 +13,11 @@ from probe_kit.retention.displays.selection import known_view
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import (
     PARTS,
+    accuracy_axis,
     axes_for,
     caption,
     legend_above,
+    mark_below,
     panels,
     plain,
     significance_handles,
@@ -27,11 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
 
 _RELABELLED = "best relabelled probe, 95 %"
-_ROOM = 18.0
-"""Points below chance that the names of events need."""
 
 
 @dataclass
@@ -92,8 +93,6 @@ class CallCurveDisplay(Shown):
             axes.plot(
                 line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
             )
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, 100 * self.chance - _ROOM * bool(self.events)), high)
         for number, event in enumerate(self.events):
             _draw_event(axes, event, len(self.events) - number)
         _finish(axes, spell(self.category), "call (captured inference, from 0)")
@@ -150,15 +149,16 @@ def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
     return figure
 
 
-def _draw(axes: "Axes", places: "object", line: CallLine | AlignedLine) -> None:
+def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> None:
     style = PARTS[line.part]
     accuracy = 100 * line.accuracy
     arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
-    axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)  # type: ignore[arg-type]
+    axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
     axes.plot(
-        places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",  # type: ignore[arg-type]
+        places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",
         label=label_of(line.stream),
     )  # fmt: skip
+    mark_below(axes, places, accuracy, style.colour)
 
 
 def _draw_event(axes: "Axes", event: EventTimes, number: int) -> None:
@@ -176,6 +176,7 @@ def _finish(axes: "Axes", title: str, below: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     plain(axes)
+    accuracy_axis(axes)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
     axes.set_title(title, fontsize=9, loc="left")
     axes.set_xlabel(below, fontsize=8.5)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.retention.call_curves import CallCurves, event_calls
+from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -20,11 +21,15 @@ from probe_kit.retention.displays.heat_table import (
 )
 from probe_kit.retention.displays.iteration_maps import iteration_maps
 from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
+from probe_kit.retention.displays.known_used import KnownUsedDisplay
 from probe_kit.retention.displays.layer_curves import layer_curve
 from probe_kit.retention.displays.model_depth import model_depths
 from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
+from probe_kit.retention.displays.side_by_side import curves_side_by_side, has_maps, maps_side_by_side
+from probe_kit.retention.joins import joins_of
+from probe_kit.retention.known import KnownUsed
 from probe_kit.retention.measure import Iterations
 from probe_kit.retention.ruled import by_rule, can_be_judged
 from probe_kit.retention.success import listened
@@ -79,7 +84,10 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
     if strangers := [str(run.location) for run in runs if str(run.location) not in known]:
         raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
     results = [table.results.get(str(run.location)) for run in runs]
-    exhibits = [*_of_table(table, [one for one in results if one is not None]), *_of_rules(runs)]
+    called = {row.run: model_name(row) for row in table.rows}
+    names = [called[str(run.location)] for run in runs]
+    exhibits = [*_of_table(table, results, names), *_of_rules(runs)]
+    exhibits += [*_side_by_side(results, names, table.iterations), *exhibit_joins(joins_of(runs, table).found)]
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
         if can_be_judged(run, table.rule, table.last_steps):
             exhibits += _of_run(name, position, by_rule(run, table.rule, table.last_steps))
@@ -122,7 +130,9 @@ def run_names(runs: Sequence[RunReader]) -> list[str]:
     return names
 
 
-def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Exhibit]:
+def _of_table(
+    table: RetentionTable, results: Sequence[ProbeResults | None], names: Sequence[str]
+) -> list[Exhibit]:
     def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
         return Exhibit(name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True)
 
@@ -145,16 +155,70 @@ def _of_table(table: RetentionTable, results: Sequence[ProbeResults]) -> list[Ex
         )  # fmt: skip
     if any(row.retention is not None for row in table.rows):
         exhibits.append(show(RetentionTableDisplay, "retention", "Retention", "retention"))
-    if len(results) > 1:
+    probed = [(one, name) for one, name in zip(results, names, strict=True) if one is not None]
+    if len(probed) > 1:
+        known, called = zip(*probed, strict=True)
         exhibits.append(
             Exhibit(
                 "model-depths", "Models by depth", "probes",
                 "How far above chance the answer can be read, against depth as a fraction, so that models with "
                 "different numbers of layers can be compared.",
-                None, partial(model_depths, results, iterations=table.iterations),
+                None, partial(model_depths, known, iterations=table.iterations, names=called),
             )
         )  # fmt: skip
     return exhibits
+
+
+def _side_by_side(
+    results: Sequence[ProbeResults | None], names: Sequence[str], iterations: Iterations
+) -> list[Exhibit]:
+    """Of every view that two or more runs were probed in."""
+    probed = [(one, name) for one, name in zip(results, names, strict=True) if one is not None]
+    views = list(dict.fromkeys(view for one, _ in probed for view in one.settings.views))
+    exhibits = []
+    for view in views:
+        own = [(one, name) for one, name in probed if view in one.settings.views]
+        if len(own) < 2:
+            continue
+        known, called = zip(*own, strict=True)
+        exhibits.append(
+            Exhibit(
+                f"curves-side-by-side{_suffix(view, views)}",
+                "Layer curves side by side" + (f", view {view}" * (len(views) > 1)), "probes",
+                "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
+                "on one scale; of several iterations the best of every layer. Only filled markers are evidence. "
+                "Bars are 95 % intervals at each line's best layer; the table says whether two runs differ.",
+                None, partial(curves_side_by_side, known, called, view, iterations),
+            )
+        )  # fmt: skip
+        if sum(has_maps(one, view) for one in known) > 1:
+            exhibits.append(
+                Exhibit(
+                    f"maps-side-by-side{_suffix(view, views)}",
+                    "Layer × iteration side by side" + (f", view {view}" * (len(views) > 1)), "probes",
+                    "Where and when the answer can be read while the action is made, a column per run. Colours "
+                    "run from chance to 100 % in every map. Dots mark what is above chance.",
+                    None, partial(maps_side_by_side, known, called, view),
+                )
+            )  # fmt: skip
+    return exhibits
+
+
+def exhibit_joins(joins: Sequence[KnownUsed]) -> list[Exhibit]:
+    """A figure per join of an asked and an acting run."""
+    return [
+        Exhibit(
+            f"known-used-{number}", "Known, encoded, used", "join",
+            "Every question once: does the reader know the answer, does a probe read it in the policy, and does "
+            "the action follow, each in both layouts. Red is lost: known and encoded, not used.",
+            None, partial(_known_used, joined),
+        )
+        for number, joined in enumerate(joins, 1)
+    ]  # fmt: skip
+
+
+def _known_used(joined: KnownUsed) -> "Figure":
+    return _figure(KnownUsedDisplay.from_join(joined))
 
 
 def _of_rules(runs: Sequence[RunReader]) -> list[Exhibit]:
@@ -274,7 +338,8 @@ def _suffix(view: str, views: Sequence[str]) -> str:
 
 
 def _figure(
-    display: "HeatTableDisplay | OutcomeRulesDisplay | KnowledgeActionDisplay | PairedLayoutsDisplay",
+    display: "HeatTableDisplay | KnownUsedDisplay | OutcomeRulesDisplay | KnowledgeActionDisplay"
+    " | PairedLayoutsDisplay",
 ) -> "Figure":
     from matplotlib.figure import Figure
 

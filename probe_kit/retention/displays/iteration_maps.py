@@ -1,5 +1,6 @@
 """Layer × iteration maps: where and when in the action expert the answer can be read."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
@@ -28,15 +29,14 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
 
-_LEAST_SPAN = 0.2  # so that noise around chance does not look like signal
-
 
 @dataclass
 class IterationMapDisplay(Shown):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
     accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream.
-    layers, iterations: the numbers along both sides, (L,) and (I,).
+    layers, iterations: the numbers along both sides, (L,) and (I,). Colours run from chance to 100 % in every map
+    of every run.
     """
 
     category: str
@@ -87,17 +87,14 @@ class IterationMapDisplay(Shown):
         best = np.argwhere(self.accuracy >= self.accuracy.max() - 1e-12)
         return tuple((int(iteration), int(layer)) for iteration, layer in best)
 
-    def plot(self, ax: "Axes | None" = None, top: float | None = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with colour bar and caption.
-
-        top: share at the dark end of the scale; the map's own maximum by default.
-        """
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with colour bar and caption."""
         axes, figure = axes_for(ax, 5.2, 3.6)
-        drawn = _draw(axes, self, top or _top([self]))
+        drawn = draw_map(axes, self)
         if figure is not None:
             axes.set_ylabel("iteration", fontsize=9)
-            _scale(figure, [axes], drawn, self)
-            _draw_legend(figure)
+            draw_scale(figure, [axes], drawn, [self])
+            draw_legend(figure)
             caption(figure, self.certificate)
         self.ax_ = axes
         return self
@@ -112,24 +109,21 @@ def iteration_maps(results: ProbeResults, view: str | None = None, stream: str |
     displays = [IterationMapDisplay.from_results(results, name, view, stream) for name in categories]
     figure, grid = panels(len(displays), width=2.7, height=2.1)
     for display, axes in zip(displays, grid, strict=True):
-        drawn = _draw(axes, display, _top(displays))
+        drawn = draw_map(axes, display)
     figure.supylabel("iteration", fontsize=9)
-    _scale(figure, grid, drawn, displays[0])
-    _draw_legend(figure)
+    draw_scale(figure, grid, drawn, displays)
+    draw_legend(figure)
     caption(figure, displays[0].certificate)
     return figure
 
 
-def _top(displays: list[IterationMapDisplay]) -> float:
-    return max(max(float(d.accuracy.max()), d.chance + _LEAST_SPAN) for d in displays)
-
-
-def _draw(axes: "Axes", display: IterationMapDisplay, top: float) -> "ScalarMappable":
+def draw_map(axes: "Axes", display: IterationMapDisplay) -> "ScalarMappable":
+    """One map on `axes`; what it returns makes the colour bar."""
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
     from matplotlib.patheffects import withStroke
 
-    norm = Normalize(100 * display.chance, 100 * top)
+    norm = Normalize(100 * display.chance, 100)
     colours = _colours(display.part)
     image = axes.imshow(100 * display.accuracy, cmap=colours, norm=norm, aspect="auto", origin="lower")
     iterations, layers = display.accuracy.shape
@@ -161,7 +155,8 @@ def _colours(part: str) -> "Colormap":
     return LinearSegmentedColormap.from_list(part, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
 
 
-def _draw_legend(figure: "Figure") -> None:
+def draw_legend(figure: "Figure") -> None:
+    """What dots, frames and grey cells are."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -185,8 +180,17 @@ def _ink(value: float, norm: "Normalize") -> str:
     return "white" if norm(value) > 0.45 else "black"
 
 
-def _scale(figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable", display: IterationMapDisplay) -> None:
+def draw_scale(
+    figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable", displays: Sequence[IterationMapDisplay]
+) -> None:
+    """The colour bar of maps in one view; where chance differs between them it is named instead of numbered."""
     bar = figure.colorbar(drawn, ax=grid, extend="min", aspect=30, shrink=0.9, pad=0.01)
-    bar.set_label(f"held-out accuracy (%), view {display.view}", fontsize=8)
+    bar.set_label(f"held-out accuracy (%), view {displays[0].view}", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
+    chances = {round(display.chance, 6) for display in displays}
+    low = 100 * displays[-1].chance
+    if len(chances) > 1:
+        bar.set_ticks([low, 100], labels=["chance", "100"])
+    else:
+        bar.set_ticks([low, *(tick for tick in range(50, 101, 10) if tick > low + 4)])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import floor
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
@@ -46,7 +45,8 @@ class GapPoint:
 class KnowledgeActionDisplay(Shown):
     """Success rate against the best probe of a stream, a point per category and model.
 
-    On the diagonal the policy acts on what can be read; below it, it knows more than it does.
+    On the diagonal the policy acts on what can be read; below it, it knows more than it does. Both axes run from 0
+    to 100 %, whatever is shown.
     """
 
     stream: str
@@ -80,7 +80,7 @@ class KnowledgeActionDisplay(Shown):
         """Draw on `ax`, or on a figure of its own with legend and captions."""
         models = list(dict.fromkeys(point.model for point in self.points))
         axes, figure = axes_for(ax, 6.2, 6.7 + 0.17 * len(models))
-        _draw_ground(axes, _lower_end(self.points))
+        _draw_ground(axes)
         for position, model in enumerate(models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
         plain(axes)
@@ -115,31 +115,24 @@ def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     )
 
 
-def _lower_end(points: Sequence[GapPoint]) -> float:
-    """Where both axes begin, in percent: a ten below the lowest value, so that points have room."""
-    lowest = min(min(point.accuracy, point.sr) for point in points)
-    return max(0.0, min(40.0, 10 * floor(10 * lowest - 0.5)))
-
-
-def _draw_ground(axes: "Axes", low: float) -> None:
+def _draw_ground(axes: "Axes") -> None:
     axes.fill_between([0, 100], [0, 100], [0, 0], color="0.955", lw=0, zorder=0)
     axes.plot([0, 100], [0, 100], color="0.45", lw=1, zorder=1)
     for draw in (axes.axvline, axes.axhline):
         draw(50, color="0.45", lw=0.8, ls="--", zorder=1)
     axes.text(
         99,
-        low + 0.02 * (100 - low),
+        2,
         "knows more than it does",
         ha="right",
         fontsize=8,
         style="italic",
         color="0.35",
     )
-    axes.text(low + 0.5, 50.5, "guessing", fontsize=7, color="0.35")
+    axes.text(0.5, 50.5, "guessing", fontsize=7, color="0.35")
     axes.text(50.5, 100, "chance", fontsize=7, color="0.35", rotation=90, va="top")
-    margin = 0.02 * (100 - low)
-    axes.set_xlim(low - margin, 100 + margin)
-    axes.set_ylim(low - margin, 100 + margin)
+    axes.set_xlim(-2, 102)
+    axes.set_ylim(-2, 102)
     axes.set_aspect("equal")
 
 

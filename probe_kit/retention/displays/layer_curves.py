@@ -16,9 +16,11 @@ from probe_kit.retention.displays.style import (
     DPI,
     PARTS,
     Line,
+    accuracy_axis,
     caption,
     layer_axis,
     legend_above,
+    mark_below,
     plain,
     significance_handles,
     spell,
@@ -196,6 +198,7 @@ def _colours() -> "Colormap":
 
 def _finish(axes: "Axes", layers: int, title: str) -> None:
     plain(axes)
+    accuracy_axis(axes)
     layer_axis(axes, layers)
     axes.tick_params(labelleft=True)
     axes.set_title(title, fontsize=9, loc="left")
@@ -249,6 +252,7 @@ def draw_line(
     )  # fmt: skip
     clear = line.significant
     axes.plot(layers[clear], accuracy[clear], color=style.colour, ls="none", marker=style.marker, ms=size)
+    mark_below(axes, layers, accuracy, style.colour)
 
 
 def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:

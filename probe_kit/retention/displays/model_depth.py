@@ -13,6 +13,7 @@ from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.selection import known_view, of_iterations, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import (
+    ABOVE_CHANCE,
     axes_for,
     caption,
     layer_axis,
@@ -21,6 +22,7 @@ from probe_kit.retention.displays.style import (
     series,
 )
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.names import full_name
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:
@@ -60,19 +62,23 @@ class ModelDepthDisplay(Shown):
         stream: str = "backbone",
         view: str | None = None,
         iterations: Iterations = "best",
+        names: Sequence[str] | None = None,
     ) -> Self:
         """From the stored probes of several runs; view: the first probed one of each by default.
 
+        names: what runs are called, in order; by default as when they were probed.
+
         Raises UnknownSiteError for a view that was not probed, UsageError if no run has that stream.
         """
-        found = [(one, known_view(one, view)) for one in results]
-        kept = [(one, shown) for one, shown in found if (one.scores["stream"] == stream).any()]
+        called = [_name(one) for one in results] if names is None else names
+        found = [(one, known_view(one, view), name) for one, name in zip(results, called, strict=True)]
+        kept = [one for one in found if (one[0].scores["stream"] == stream).any()]
         if not kept:
             raise UsageError(f"none of the {len(results)} runs has probes of stream {stream!r}")
         return cls(
             stream=stream,
-            models=tuple(_curve(one, stream, shown, iterations) for one, shown in kept),
-            certificates=tuple(Certificate.of_results(one, shown) for one, shown in kept),
+            models=tuple(_curve(one, stream, shown, iterations, name) for one, shown, name in kept),
+            certificates=tuple(Certificate.of_results(one, shown) for one, shown, _ in kept),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -87,6 +93,7 @@ class ModelDepthDisplay(Shown):
                 last * model.depth, 100 * model.above_chance, color=line.colour, ls=line.dash, lw=1.6, label=label
             )
         plain(axes)
+        axes.set_ylim(*ABOVE_CHANCE)
         layer_axis(axes, last + 1)
         if any(model.layers.max() < last for model in self.models):
             axes.set_xlabel("layer (of the deepest model)", fontsize=8.5)
@@ -101,7 +108,10 @@ class ModelDepthDisplay(Shown):
 
 
 def model_depths(
-    results: Sequence[ProbeResults], view: str | None = None, iterations: Iterations = "best"
+    results: Sequence[ProbeResults],
+    view: str | None = None,
+    iterations: Iterations = "best",
+    names: Sequence[str] | None = None,
 ) -> "Figure":
     """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
     from probe_kit.retention.displays.shown_figure import ShownFigure
@@ -112,7 +122,7 @@ def model_depths(
         for part, name in zip(one.scores["part"], one.scores["stream"], strict=True)
     }
     streams = [name for part in ("backbone", "action") for own, name in sorted(found) if own == part]
-    displays = [ModelDepthDisplay.from_results(results, stream, view, iterations) for stream in streams]
+    displays = [ModelDepthDisplay.from_results(results, stream, view, iterations, names) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")
     figure = ShownFigure(figsize=(4.1 * max(len(displays), 1.5), 3.6), layout="constrained", dpi=150)
@@ -123,7 +133,7 @@ def model_depths(
     for axes in grid:
         handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     legend_above(figure, list(handles.values()))
-    figure.supylabel("accuracy above chance (points, mean of categories)", fontsize=8)
+    figure.supylabel("above chance (points, mean of categories)", fontsize=8)
     caption(figure, *(certificate for display in displays for certificate in display.certificates))
     return figure
 
@@ -143,7 +153,11 @@ def _draw_fractions(axes: "Axes", last: int) -> None:
     above.spines["top"].set_visible(False)
 
 
-def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations) -> ModelCurve:
+def _name(results: ProbeResults) -> str:
+    return full_name(results.settings.model, results.settings.random_weights)
+
+
+def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations, name: str) -> ModelCurve:
     curves = []
     for category in results.settings.categories:
         scores = scores_of(results, category, view)
@@ -153,7 +167,6 @@ def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations
             curves.append(scores.groupby("layer")["accuracy"].max() - scores["chance"].iloc[0])
     layers = curves[0].index.to_numpy(dtype=np.int64)
     depth = layers / max(1, layers.max())
-    name = results.settings.model + (" (random weights)" if results.settings.random_weights else "")
     return ModelCurve(
         name, layers, depth, np.mean([curve.to_numpy(dtype=float) for curve in curves], axis=0), len(curves)
     )

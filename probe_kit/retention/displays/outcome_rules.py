@@ -9,6 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
+from probe_kit.retention.names import full_names
 from probe_kit.retention.ruled import Judged
 from probe_kit.retention.success import shares_of
 from probe_kit.train.reader import RunReader
@@ -46,7 +47,7 @@ class OutcomeRulesDisplay(Shown):
         """One that keeps no trajectories has a bar by `disc` alone. Raises UsageError without episodes."""
         if not runs or any(run.episodes.empty for run in runs):
             raise UsageError("there are no episodes to judge; give runs that have some")
-        bars = [bar for run in runs for bar in _bars(run)]
+        bars = [bar for run, name in zip(runs, full_names(runs), strict=True) for bar in _bars(run, name)]
         return cls(tuple(bars), tuple(Certificate.of_run(run) for run in runs))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -73,16 +74,16 @@ class OutcomeRulesDisplay(Shown):
         return self
 
 
-def _bars(run: RunReader) -> list[RuleBar]:
+def _bars(run: RunReader, name: str) -> list[RuleBar]:
     judged = Judged.of(run, DEFAULT_RULE)
     if judged.verdicts is None:
-        stored = {name: float(shares_of(run.episodes, name).mean()) for name, *_ in _PARTS}
-        return [RuleBar(run.label, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
+        stored = {part: float(shares_of(run.episodes, part).mean()) for part, *_ in _PARTS}
+        return [RuleBar(name, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
     return [
         RuleBar(
-            run.label,
+            name,
             rule,
-            {name: float(verdicts[name].mean()) for name, *_ in _PARTS},
+            {part: float(verdicts[part].mean()) for part, *_ in _PARTS},
             float((verdicts["idle"] == "correct").mean()),
         )
         for rule, verdicts in judged.verdicts.items()

@@ -12,6 +12,7 @@ from probe_kit.retention.displays.selection import curve_of, scores_of
 from probe_kit.retention.displays.showing import Shown
 from probe_kit.retention.displays.stream_curve import StreamCurve
 from probe_kit.retention.displays.style import (
+    accuracy_axis,
     axes_for,
     caption,
     layer_axis,
@@ -85,6 +86,7 @@ class RoleCurvesDisplay(Shown):
             sidestep = spread * (position - (len(self.curves) - 1) / 2)
             draw_line(axes, curve.lines[0], series(position), view, sidestep)
         plain(axes)
+        accuracy_axis(axes)
         layer_axis(axes, int(max(curve.layers.max() for curve in self.curves.values())) + 1)
         axes.set_title(spell(self.category), fontsize=10, loc="left")
         if figure is not None:

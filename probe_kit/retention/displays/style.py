@@ -6,6 +6,8 @@ from math import ceil
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -14,12 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from numpy.typing import ArrayLike
 
 # Okabe and Ito's palette: apart for every kind of colour vision.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 
 DPI = 150
+ACCURACY = (20.0, 102.0)
+"""Percent along the axis of held-out accuracies, the same in every figure of every run."""
+ABOVE_CHANCE = (-30.0, 51.0)
+"""The same of accuracies above chance, in points."""
 _CAPTION_SIZE = 6.5
 _LEGEND_SIZE = 8.0
 _USED = 0.97  # of the width, by a caption
@@ -112,6 +119,22 @@ def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
         axes.set_xlabel("layer", fontsize=8.5)
 
 
+def accuracy_axis(axes: "Axes") -> None:
+    """The fixed scale of accuracies; what lies below is marked at the lower edge by `mark_below`."""
+    axes.set_ylim(*ACCURACY)
+
+
+def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour: str) -> None:
+    """A mark at the lower edge, with the number, for every accuracy (percent) that the scale does not reach."""
+    for place, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
+        if value < ACCURACY[0]:
+            axes.plot([place], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
+            axes.annotate(
+                f"{value:.0f}", (place, ACCURACY[0] + 1.5), (0, 5), textcoords="offset points", fontsize=6.5,
+                ha="center", color=colour,
+            )  # fmt: skip
+
+
 def plain(axes: "Axes") -> None:
     """No frame above and to the right, small tick labels."""
     axes.spines[["top", "right"]].set_visible(False)
@@ -129,6 +152,15 @@ def caption(figure: "Figure | None", *certificates: Certificate) -> None:
     known = tuple(dict.fromkeys(certificates))
     figure.caption = "; ".join(certificate.line for certificate in known)  # type: ignore[attr-defined]
     figure.supxlabel(_footer(known, figure.get_figwidth()), fontsize=_CAPTION_SIZE, color="0.25")
+
+
+def footer(figure: "Figure", text: str) -> None:
+    """A line under a figure that belongs to several runs at once, and its whole caption."""
+    figure.caption = text  # type: ignore[attr-defined]
+    parts = text.split(" · ")
+    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * figure.get_figwidth():
+        parts.pop()
+    figure.supxlabel(" · ".join(parts), fontsize=_CAPTION_SIZE, color="0.25")
 
 
 def _footer(certificates: Sequence[Certificate], width: float) -> str:

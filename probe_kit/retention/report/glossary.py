@@ -53,6 +53,10 @@ GLOSSARY = MappingProxyType(
             "side cannot produce these."
         ),
         "p (twice)": "Probability that luck alone gives so many questions right twice rather than wrong twice.",
+        "p (difference)": (
+            "Of a difference between two runs: probability that two equally good ones differ so much on these "
+            "questions, whole groups turned together; in brackets corrected by Holm for all categories and pairs."
+        ),
         "reading": (
             "Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so "
             "far. Failure: as far below; the policy misses both pictures or prefers the wrong one."
@@ -102,6 +106,10 @@ GLOSSARY = MappingProxyType(
         "gap": "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
         "groups": "Independent groups of questions; questions that share a picture count once.",
         "n/a": "The backbone itself is not above chance, so there is nothing that could be retained.",
+        "A − B": (
+            "Difference of two runs on the same questions: of both the same groups of questions are drawn, over "
+            "and over, and the interval holds 95 % of what that gives. Zero inside it: they may be equal."
+        ),
         "selectivity": "Accuracy above that of the same probe on random labels.",
         "position, instruction, pixels": (
             "The same probe on the layout, the words, or the two pictures alone. Red: the suite gives the "

@@ -1,6 +1,7 @@
 "use strict";
 (() => {
-  // -- tables: a click on a heading sorts, a second one turns the order round; empty cells stay last ------------
+  // -- tables: a click on a heading sorts, a second one turns the order round, a third one puts it back; empty
+  // cells stay last, and differences below the runs ---------------------------------------------------------------
   const number = (text) => (text === "" || Number.isNaN(Number(text)) ? null : Number(text));
 
   function compare(a, b, sign) {
@@ -10,19 +11,41 @@
     return sign * a.localeCompare(b, undefined, { numeric: true });
   }
 
+  const NEXT = { none: "ascending", ascending: "descending", descending: "none" };
+  const original = new Map();
+
   function sort(table, column) {
     const heading = table.tHead.rows[0].cells[column];
-    const up = heading.getAttribute("aria-sort") !== "ascending";
-    for (const other of table.tHead.rows[0].cells) other.removeAttribute("aria-sort");
-    heading.setAttribute("aria-sort", up ? "ascending" : "descending");
     const body = table.tBodies[0];
+    if (!original.has(table)) original.set(table, [...body.rows]);
+    const order = NEXT[heading.getAttribute("aria-sort") ?? "none"];
+    for (const other of table.tHead.rows[0].cells) other.removeAttribute("aria-sort");
+    if (order === "none") return body.append(...original.get(table));
+    heading.setAttribute("aria-sort", order);
     const key = (row) => row.cells[column].dataset.sort;
-    body.append(...[...body.rows].sort((a, b) => compare(key(a), key(b), up ? 1 : -1)));
+    const apart = (row) => Number(row.classList.contains("difference"));
+    const sign = order === "ascending" ? 1 : -1;
+    body.append(...[...body.rows].sort((a, b) => apart(a) - apart(b) || compare(key(a), key(b), sign)));
   }
 
   for (const table of document.querySelectorAll("table.sortable")) {
     [...table.tHead.rows[0].cells].forEach((cell, column) =>
       cell.firstElementChild.addEventListener("click", () => sort(table, column)));
+  }
+
+  // -- wide tables say that there is more to the side --------------------------------------------------------------
+  function cue(scroll) {
+    const rest = scroll.scrollWidth - scroll.clientWidth;
+    const box = scroll.parentElement;
+    box.classList.toggle("wide", rest > 1);
+    box.classList.toggle("more-left", scroll.scrollLeft > 1);
+    box.classList.toggle("more-right", scroll.scrollLeft < rest - 1);
+  }
+
+  for (const scroll of document.querySelectorAll(".scroll")) {
+    scroll.addEventListener("scroll", () => cue(scroll), { passive: true });
+    new ResizeObserver(() => cue(scroll)).observe(scroll);
+    cue(scroll);
   }
 
   // -- episodes: a page of cards at a time, made when they are wanted --------------------------------------------

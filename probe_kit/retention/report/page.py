@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.cells import model_name
 from probe_kit.retention.conditions import condition_tables, rule_sentences
-from probe_kit.retention.displays.gallery import Exhibit, gallery, run_names
+from probe_kit.retention.displays.gallery import Exhibit, gallery
 from probe_kit.retention.heat import heat_key
+from probe_kit.retention.joins import joins_of
+from probe_kit.retention.known_tables import join_tables
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.pictures import data_uri
@@ -18,7 +21,6 @@ from probe_kit.retention.report.readings import Summary, summarise
 from probe_kit.retention.report.tables import (
     behaviour_table,
     control_table,
-    difference_tables,
     more_behaviour_table,
     plain_tables,
     retention_table,
@@ -72,26 +74,32 @@ def report_html(
     if not runs:
         raise UsageError("a report needs at least one run")
     table = table or retention(runs)
-    names, as_judged = run_names(runs), [by_rule(run, table.rule, table.last_steps) for run in runs]
+    called = {row.run: model_name(row) for row in table.rows}
+    as_judged = [by_rule(run, table.rule, table.last_steps) for run in runs]
     exhibits = [exhibit for exhibit in gallery(runs, table) if not exhibit.is_table]
+    names = [called[str(run.location)] for run in runs]
+    joins = joins_of(runs, table)
     sentence, bibtex = citation(runs)
     rows = table.all_rows
     return _render(
-        title=" and ".join(dict.fromkeys(run.label for run in runs)),
+        title=listed(names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         random_weights=any(run.random_weights for run in runs),
         summaries=_summaries(table),
         notes=table.notes,
-        behaviour=behaviour_table(rows),
+        behaviour=behaviour_table(rows, table.differences, table.unpaired),
         more_behaviour=more_behaviour_table(rows),
-        retention=retention_table(rows),
+        retention=retention_table(rows, table.differences),
         controls=control_table(rows),
         rules=rule_sentences(rows),
         conditions=plain_tables(condition_tables(rows, table.wordings)),
-        differences=[*difference_tables(table.differences), *plain_tables(table.further_tables)],
+        further=plain_tables(table.further_tables),
+        joined=plain_tables([one for joined in joins.found for one in join_tables(joined)]),
+        join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
         pictures={
-            subject: _pictures(exhibits, subject, names) for subject in ("behaviour", "probes", "retention")
+            subject: _pictures(exhibits, subject, names)
+            for subject in ("behaviour", "probes", "retention", "join")
         },
         grid=episode_grid(as_judged, names, pictures),
         several=len(runs) > 1,
@@ -127,13 +135,32 @@ def _summaries(table: RetentionTable) -> list[list[Summary]]:
     return list(found.values())
 
 
-def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -> list[Picture]:
-    """Figures of one subject; all but the first of a kind and run are extra, to be unfolded."""
-    found: list[Picture] = []
-    for exhibit in exhibits:
-        if exhibit.subject == subject:
-            run = "" if exhibit.run is None else names[exhibit.run]
-            kind = exhibit.title.partition(",")[0]
-            extra = any(other.run == run and other.title.partition(",")[0] == kind for other in found)
-            found.append(Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit), extra))
-    return found
+def listed(names: Sequence[str]) -> str:
+    """A, B and C."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -> list[list[Picture]]:
+    """Figures of one subject by kind: those of several runs stand beside each other.
+
+    All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
+    figure shows side by side.
+    """
+    found: dict[str, list[Picture]] = {}
+    own = [exhibit for exhibit in exhibits if exhibit.subject == subject]
+    together = {_kind(exhibit) for exhibit in own if exhibit.run is None}
+    for exhibit in own:
+        run = "" if exhibit.run is None else names[exhibit.run]
+        kind = _kind(exhibit)
+        before = [other for pictures in found.values() for other in pictures]
+        extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
+        extra |= exhibit.run is not None and f"{kind} side by side" in together
+        found.setdefault(exhibit.title, []).append(
+            Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit), extra)
+        )
+    return list(found.values())
+
+
+def _kind(exhibit: Exhibit) -> str:
+    return exhibit.title.partition(",")[0]

@@ -1,34 +1,45 @@
 """Tables of the report: cells with what they show, what they sort by, and their heat."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from probe_kit.retention.cells import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
-    DIFFERENCE_COLUMNS,
     FOLLOWED_COLUMNS,
     action_place,
+    action_value,
     area_value,
     beats,
     bounded_value,
     call_value,
+    category_name,
     controlled,
     debiased_value,
-    difference_title,
+    difference_test,
     model_name,
     number,
     once_per_category,
     percent,
     plain_value,
     prefix_place,
+    prefix_value,
     probed,
     success_interval,
-    with_limits,
+    view_name,
 )
 from probe_kit.retention.differences import Difference
 from probe_kit.retention.displays.style import spell
 from probe_kit.retention.heat import heat_colour
+from probe_kit.retention.lines import (
+    Line,
+    behaviour_lines,
+    cell_of,
+    compared,
+    difference_legend,
+    difference_name,
+    probe_lines,
+)
 from probe_kit.retention.plain_tables import PlainTable
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.rows import MEAN, RetentionRow
@@ -46,7 +57,8 @@ _REGIMES: dict[str | None, str] = {
 class HtmlCell:
     """sort: what the column sorts by, None for last. heat: background, `#RRGGBB`. strong: bold. alarm: red.
 
-    note: shown on pointing at it.
+    note: shown on pointing at it. below: a second line, of smaller letters: whose row it is. difference: whether
+    the row is that of a difference, which stays below those of runs when these are sorted.
     """
 
     text: str
@@ -55,6 +67,19 @@ class HtmlCell:
     strong: bool = False
     alarm: bool = False
     note: str = ""
+    below: str = ""
+    difference: bool = False
+
+    @property
+    def value(self) -> str:
+        """The text without an interval in square brackets at its end."""
+        return self.text.removesuffix(self.limits).rstrip()
+
+    @property
+    def limits(self) -> str:
+        """That interval with its brackets, empty without one: it may go to a line of its own."""
+        start = self.text.find("[")
+        return self.text[start:] if start > 0 and self.text.endswith("]") else ""
 
 
 @dataclass(frozen=True)
@@ -68,12 +93,13 @@ class HtmlColumn:
 
 @dataclass(frozen=True)
 class HtmlTable:
-    """body is sorted by a click on a heading; foot, the means, stays."""
+    """body is sorted by a click on a heading; foot, the means, stays. captions: sentences below it."""
 
     title: str
     columns: tuple[HtmlColumn, ...]
     body: tuple[tuple[HtmlCell, ...], ...]
     foot: tuple[tuple[HtmlCell, ...], ...] = ()
+    captions: tuple[str, ...] = ()
 
 
 _Value = Callable[[RetentionRow], float | int | str | None]
@@ -137,25 +163,18 @@ def _reading(row: RetentionRow) -> str:
     return _REGIMES.get(row.regime) or f"score {number(row.normalised_score, 1)}"
 
 
-_NAMES = [
-    _Column("model", model_name, model_name, "The policy; marked if its weights are random."),
-    _Column("category", lambda row: spell(row.category), lambda row: row.category, "Kind of question."),
-]
-_VIEW = _Column(
-    "view",
-    lambda row: row.view or "–",
-    lambda row: row.view or "",
-    "How the tokens of an episode became one vector.",
-)
+_CATEGORY = _Column("category", category_name, category_name, "Kind of question, and of several runs which one.")
+_VIEW = _Column("view", view_name, lambda row: row.view or "", "How the tokens of an episode became one vector.")
 
 _CALL = _Column("call", call_value, lambda row: row.call, "call")
 
 _BEHAVIOUR = [
-    *_NAMES,
+    _CATEGORY,
     _Column(
         "SR % [95 %]", success_interval, lambda row: row.sr, "SR", lambda row: row.sr,
         lambda row: row.regime == Regime.KNOWLEDGE,
     ),
+    _Column("p (Holm)", difference_test, lambda _: None, "p (difference)"),
     *(
         _Column(
             f"{name} %" if name != "used" else name, cell, lambda row: row.follows_net, name,
@@ -183,7 +202,7 @@ _BEHAVIOUR = [
 ]  # fmt: skip
 
 _MORE_BEHAVIOUR = [
-    *_NAMES,
+    _CATEGORY,
     _share("original %", "sr_original", "original"),
     _share("swapped %", "sr_swapped", "swapped"),
     _share("goes left %", "side_preference", "goes left"),
@@ -191,7 +210,7 @@ _MORE_BEHAVIOUR = [
 ]
 
 _RETENTION = [
-    *_NAMES,
+    _CATEGORY,
     _VIEW,
     _CALL,
     _Column(
@@ -201,13 +220,13 @@ _RETENTION = [
     _Column("debiased [95 %]", debiased_value, _debiased, "debiased", _debiased),
     _Column("published", plain_value, _retention, "retention", _retention),
     _Column(
-        "backbone % [95 %]", lambda row: with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent),
+        "backbone % [95 %]", prefix_value,
         lambda row: row.prefix_accuracy, "backbone", strong=lambda row: row.prefix_signal,
     ),
     _Column("layer", prefix_place, lambda row: row.prefix_layer, "layer"),
     _Column("p", lambda row: _p(row.prefix_p_fwe), lambda row: row.prefix_p_fwe, "p"),
     _Column(
-        "action % [95 %]", lambda row: with_limits(percent(row.action_accuracy), row.action_ci, percent),
+        "action % [95 %]", action_value,
         lambda row: row.action_accuracy, "action", strong=lambda row: row.action_signal,
     ),
     _Column("layer @iteration", action_place, lambda row: row.action_layer, "layer"),
@@ -229,21 +248,32 @@ _CONTROL_MEANINGS = {
 }  # fmt: skip
 
 
-def behaviour_table(rows: Sequence[RetentionRow]) -> HtmlTable:
-    """Success rates and what they are made of, once per category."""
-    return _table("Success rate", once_per_category(rows), _BEHAVIOUR)
+def behaviour_table(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), unpaired: Sequence[str] = ()
+) -> HtmlTable:
+    """Success rates and what they are made of, once per category. unpaired: why runs have no differences."""
+    lines = behaviour_lines(once_per_category(rows), differences)
+    return replace(_table("Success rate", lines, _BEHAVIOUR), captions=(*_captions(lines), *unpaired))
 
 
 def more_behaviour_table(rows: Sequence[RetentionRow]) -> HtmlTable:
     """Success rates by layout and at other zone radii, and the habit of going to one side."""
     radii = dict.fromkeys(radius for row in rows for radius in row.sr_by_epsilon)
     columns = [*_MORE_BEHAVIOUR, *(_radius(radius) for radius in radii)]
-    return _table("Success rate by layout and zone radius", once_per_category(rows), columns)
+    return _table("Success rate by layout and zone radius", compared(once_per_category(rows)), columns)
 
 
-def retention_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
+def retention_table(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> HtmlTable | None:
     """Probes and retention; None if no run was probed."""
-    return _table("Probes and retention", probed(rows), _RETENTION) if probed(rows) else None
+    if not probed(rows):
+        return None
+    lines = probe_lines(probed(rows), differences)
+    return replace(_table("Probes and retention", lines, _RETENTION), captions=_captions(lines, behaviour=False))
+
+
+def _captions(lines: Sequence[Line], behaviour: bool = True) -> tuple[str, ...]:
+    legend = difference_legend([line for line in lines if isinstance(line, Difference)], behaviour)
+    return (f"{legend[0].upper()}{legend[1:]}.",) if legend else ()
 
 
 def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
@@ -251,46 +281,23 @@ def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
     if not controlled(rows):
         return None
     columns = [
-        _NAMES[0],
+        _CATEGORY,
         _VIEW,
         _CALL,
-        *(_Column(name, cell, cell, _CONTROL_MEANINGS.get(name)) for name, cell in CONTROL_COLUMNS),
+        *(_Column(name, cell, cell, _CONTROL_MEANINGS.get(name)) for name, cell in CONTROL_COLUMNS[1:]),
     ]
-    return _table("Controls", probed(rows), columns)
-
-
-def difference_tables(differences: Sequence[Difference]) -> list[HtmlTable]:
-    """One table per pair of groups."""
-    columns = (
-        HtmlColumn("category", "", numeric=False),
-        *(HtmlColumn(name, "", name != "view") for name, _ in DIFFERENCE_COLUMNS),
-    )
-    titles = dict.fromkeys(difference_title(row) for row in differences)
-    return [
-        HtmlTable(
-            title,
-            columns,
-            tuple(
-                (
-                    HtmlCell(spell(row.category), row.category),
-                    *(HtmlCell(cell(row), cell(row)) for _, cell in DIFFERENCE_COLUMNS),
-                )
-                for row in differences
-                if difference_title(row) == title
-            ),
-        )
-        for title in titles
-    ]
+    return _table("Controls", compared(probed(rows)), columns)
 
 
 def plain_tables(tables: Sequence[PlainTable]) -> list[HtmlTable]:
     """As they are; rows of means stay below when others are sorted."""
     return [
         HtmlTable(
-            f"{table.title} ({table.note})",
+            table.title,
             tuple(HtmlColumn(_unbroken(name), "", name not in _WORDS) for name in table.columns),
             tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN not in cells[:2]),
             tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN in cells[:2]),
+            (f"{table.note[:1].upper()}{table.note[1:]}.",) if table.note else (),
         )
         for table in tables
     ]
@@ -308,25 +315,25 @@ def _radius(radius: str) -> _Column:
     return _Column(f"SR % at {1000 * float(radius):g} mm", lambda row: percent(value(row)), value, meaning, value)
 
 
-def _table(title: str, rows: Sequence[RetentionRow], columns: Sequence[_Column]) -> HtmlTable:
-    one_model = len({(row.group, row.run) for row in rows}) == 1
-    dull = ("–", model_name(rows[0])) if one_model else ("–",)
-    shown = [column for column in columns if any(column.text(row) not in dull for row in rows)]
-    return HtmlTable(
-        title,
-        tuple(_heading(column, rows) for column in shown),
-        tuple(tuple(_cell(column, row) for column in shown) for row in rows if row.category != MEAN),
-        tuple(tuple(_cell(column, row) for column in shown) for row in rows if row.category == MEAN),
-    )
+def _table(title: str, lines: Sequence[Line], columns: Sequence[_Column]) -> HtmlTable:
+    rows = [line for line in lines if isinstance(line, RetentionRow)]
+    several = len({(row.group, row.run) for row in rows}) > 1
+    shown = [column for column in columns if any(_text(column, line) not in ("–", "") for line in lines)]
+    found = {
+        is_mean: tuple(
+            tuple(_cell(column, line, several) for column in shown)
+            for line in lines
+            if (line.category == MEAN) == is_mean
+        )
+        for is_mean in (False, True)
+    }
+    return HtmlTable(title, tuple(_heading(column, rows) for column in shown), found[False], found[True])
 
 
 def _heading(column: _Column, rows: Sequence[RetentionRow]) -> HtmlColumn:
     meaning = column.meaning or ""
-    return HtmlColumn(
-        _unbroken(column.name),
-        GLOSSARY.get(meaning, meaning),
-        any(column.text(row)[:1].isdigit() for row in rows),
-    )
+    numeric = column.text is difference_test or any(column.text(row)[:1].isdigit() for row in rows)
+    return HtmlColumn(_unbroken(column.name), GLOSSARY.get(meaning, meaning), numeric)
 
 
 def _unbroken(name: str) -> str:
@@ -334,14 +341,41 @@ def _unbroken(name: str) -> str:
     return name.replace(" %", "\u00a0%").replace("± ", "±\u00a0")
 
 
-def _cell(column: _Column, row: RetentionRow) -> HtmlCell:
-    heat = None if column.heat is None else column.heat(row)
-    text = column.text(row)
+def _text(column: _Column, line: Line) -> str:
+    return cell_of(column.text, line)
+
+
+def _cell(column: _Column, line: Line, several: bool) -> HtmlCell:
+    """several: whether the category says whose row it is."""
+    text = _text(column, line)
+    below = ""
+    if column is _CATEGORY:
+        text = spell(text)
+        below = _name(line) if several else ""
+    if isinstance(line, Difference):
+        return HtmlCell(text, _sort_of(text, column), below=below, difference=True)
+    heat = None if column.heat is None else column.heat(line)
     return HtmlCell(
         text=text,
-        sort=column.sort(row),
+        sort=column.sort(line),
         heat=heat_colour(heat) if isinstance(heat, float) else None,
-        strong=column.strong is not None and column.strong(row),
+        strong=column.strong is not None and column.strong(line),
         alarm=text.endswith(ABOVE_CHANCE),
-        note=column.note(row) if column.note else "",
+        note=column.note(line) if column.note else "",
+        below=below,
     )
+
+
+def _name(line: Line) -> str:
+    return difference_name(line) if isinstance(line, Difference) else model_name(line)
+
+
+def _sort_of(text: str, column: _Column) -> float | str | None:
+    """Differences are sorted among themselves, by the number that they begin with."""
+    if column is _CATEGORY:
+        return text
+    number_, *_ = text.split() or [""]
+    try:
+        return float(number_)
+    except ValueError:
+        return None

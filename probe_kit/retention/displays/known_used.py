@@ -1,0 +1,108 @@
+"""Known, encoded, used: what becomes of the items of each category, as one bar of shares."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    axes_for,
+    footer,
+    legend_above,
+    plain,
+    spell,
+)
+from probe_kit.retention.known import KnownUsed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_LOOKS: Mapping[str, tuple[str, str]] = {
+    "111": (GREEN, ""),
+    "101": ("#7FCEB9", "..."),
+    "011": (SKY, ""),
+    "001": (BLUE, "..."),
+    "110": (VERMILION, ""),
+    "100": (ORANGE, "///"),
+    "010": (PURPLE, "///"),
+    "000": ("#D9D9D9", ""),
+    "1-1": (GREEN, ""),
+    "0-1": (SKY, "..."),
+    "1-0": (VERMILION, "///"),
+    "0-0": ("#D9D9D9", ""),
+}
+"""Colour and hatch of what is known, encoded, used: used first, then what is not."""
+_LEAST = 6.0  # percent of a bar that has room for a number
+
+
+@dataclass
+class KnownUsedDisplay(Shown):
+    """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
+
+    counts: items by category and code, such as `101` for known, not encoded, used (`1-1` without probes). title:
+    who was asked and who acted.
+    """
+
+    title: str
+    counts: Mapping[str, Mapping[str, int]]
+    note: str
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_join(cls, joined: KnownUsed) -> Self:
+        """From what `probe_kit.retention.known.join` gives."""
+        seen = f"probes in view {joined.view}" if joined.view else "no probes"
+        return cls(
+            title=f"{joined.asked} (by {joined.score}) · {joined.acted}",
+            counts={row.category: row.counts for row in joined.rows},
+            note=f"{joined.asked} · {joined.acted} · items right in both layouts, a coin: 25 % · {seen}",
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 7.2, 0.36 * len(self.counts) + 2.0)
+        for place, counts in enumerate(self.counts.values()):
+            _draw_bar(axes, place, counts)
+        axes.set_yticks(range(len(self.counts)), [spell(name) for name in self.counts], fontsize=8)
+        axes.set_ylim(len(self.counts) - 0.4, -0.6)
+        axes.set_xlim(0, 100)
+        axes.set_xlabel("items (%)", fontsize=9)
+        axes.set_title(self.title, fontsize=9, loc="left")
+        plain(axes)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        if figure is not None:
+            handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+            legend_above(figure, list(handles.values()))
+            footer(figure, self.note)
+        self.ax_ = axes
+        return self
+
+
+def words_of(code: str) -> str:
+    """`101` as "known, not encoded, used"."""
+    parts = zip(("known", "encoded", "used"), code, strict=True)
+    return ", ".join(name if mark == "1" else f"not {name}" for name, mark in parts if mark != "-")
+
+
+def _draw_bar(axes: "Axes", place: int, counts: Mapping[str, int]) -> None:
+    total, left = sum(counts.values()), 0.0
+    for code, (colour, hatch) in _LOOKS.items():
+        if code not in counts:
+            continue
+        width = 100 * counts[code] / total if total else 0.0
+        axes.barh(place, width, 0.72, left, color=colour, hatch=hatch, ec="white", lw=0.5, label=words_of(code))
+        if width >= _LEAST:
+            ground = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.85}
+            axes.text(
+                left + width / 2, place, str(counts[code]), ha="center", va="center", fontsize=8, bbox=ground
+            )
+        left += width
+    axes.text(101, place, f"n {total}", va="center", fontsize=7.5, color=GREY, clip_on=False)

@@ -1,0 +1,42 @@
+"""Every asked run of a table joined with every acting one that began with the same frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.retention.asked import ask_of
+from probe_kit.retention.known import KnownUsed, join
+from probe_kit.retention.ruled import by_rule, can_be_judged
+from probe_kit.retention.success import listened
+from probe_kit.retention.table import RetentionTable
+from probe_kit.train.reader import RunReader
+
+
+@dataclass(frozen=True)
+class Joins:
+    """found: what could be joined. refused: why other pairs could not, a sentence each."""
+
+    found: tuple[KnownUsed, ...]
+    refused: tuple[str, ...]
+
+
+def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
+    """Known, encoded, used of every pair of an asked and an acting run.
+
+    runs: those that the table is made of, as it reads them; probes and outcome rule are the table's.
+    """
+    asked = [run for run in runs if ask_of(run) is not None]
+    acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
+    found, refused = [], []
+    for reader, policy in product(asked, acted):
+        own = by_rule(policy, table.rule, table.last_steps)
+        try:
+            found.append(join(reader, own, table.results.get(str(policy.location))))
+        except (UsageError, OtherFramesError) as error:
+            refused.append(f"Not joined: {error}.")
+    return Joins(tuple(found), tuple(refused))
+
+
+def _judged(run: RunReader, table: RetentionTable) -> bool:
+    return not listened(run.episodes) and can_be_judged(run, table.rule, table.last_steps)
