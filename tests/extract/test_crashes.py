@@ -72,7 +72,9 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     suite: Suite, whole: Path, tmp_path: Path
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
-    for orphan in ("commits/abc.tmp", "data.zarr/backbone/pooled/c/0/x.partial", "columns.zarrx.tmp/zarr.json"):
+    aside = ("commits", "failed", "certificates", "provenance", "sealed", "frames", "videos")
+    data = ("data.zarr/backbone/pooled/c/0/x.partial", "columns.zarrx.tmp/zarr.json")
+    for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(exist_ok=True)
         (run / orphan).write_text("torn")
     assert start(run, suite).wait() == 0

@@ -71,7 +71,7 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
 
 def open_array(store: Store, name: str) -> zarr.Array[Any]:
     """Open one array for reading; a missing chunk is an error, never a fill value."""
-    return zarr.open_array(store, path=name, mode="r", config={"read_missing_chunks": False})
+    return zarr.open_array(store, path=name, mode="r", zarr_format=3, config={"read_missing_chunks": False})
 
 
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -23,10 +23,10 @@ from probe_kit.extract.store.commits import (
     wrong_size,
 )
 from probe_kit.extract.store.deep import content_problems
-from probe_kit.extract.store.layout import COMMITS, DATA, RUN_FILE
+from probe_kit.extract.store.layout import COMMITS, DATA, PROVENANCE, RUN_FILE
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.provenance import PROVENANCE, read_provenances
+from probe_kit.extract.store.provenance import read_provenances
 from probe_kit.extract.store.root import RESTORE, Root, read_root
 from probe_kit.extract.store.strays import stray_keys
 from probe_kit.identity import sha256_json

@@ -8,8 +8,12 @@ protocol needs. What folders have besides, locks and renaming, is missing, and r
 * A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
   same bytes, or one of them is refused.
 * Derived groups carry their stamp in their key, so that processes that saw different commits never mix them.
+
+A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
+it has answered once, what is wrong is rather the address, and it is given up within seconds.
 """
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,12 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 from urllib.parse import urlsplit
 
-from zarr.abc.store import ByteRequest, Store
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
+from zarr.abc.store import Store
 
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.object_stores import LONGEST_PAUSE, BlankStore, PatientStore, pauses_between
 from probe_kit.extras import require
 
 if TYPE_CHECKING:
@@ -34,7 +37,10 @@ if TYPE_CHECKING:
 
 # Small objects are read side by side, because each of them takes a round trip.
 READERS = 32
-RETRY_TIMEOUT = timedelta(seconds=60)
+PATIENCE = timedelta(seconds=60)
+"""So long requests are repeated; the last of them may then take its own time, 30 s unless AWS_TIMEOUT says so."""
+_QUICK = timedelta(seconds=5)
+"""For a store that never answered."""
 STAMP_DIGITS = 16
 _NO_BUCKET = "NoSuchBucket"
 # Where a client looks last for credentials: what a machine of a cloud is told about itself.
@@ -51,6 +57,7 @@ class Bucket(Location):
     def __init__(self, url: str) -> None:
         require("obstore", "remote")
         self._url = url.rstrip("/")
+        self._answered = False
         parts = urlsplit(self._url)
         if not (parts.netloc and parts.path.strip("/")):
             raise UsageError(f"{url} names no run; expected {parts.scheme}://BUCKET/PREFIX/RUN")
@@ -81,18 +88,55 @@ class Bucket(Location):
         """No bound."""
         return
 
-    @cached_property
+    @property
     def _objects(self) -> "ObjectStore":
+        return self._patient if self._answered else self._quick
+
+    @cached_property
+    def _patient(self) -> "ObjectStore":
         return self._below("")
 
-    def _below(self, folder: str) -> "ObjectStore":
+    @cached_property
+    def _quick(self) -> "ObjectStore":
+        return self._below("", quick=True)
+
+    def _below(self, folder: str, quick: bool = False) -> "ObjectStore":
         from obstore.store import from_url
 
         with self.in_words():
             store: ObjectStore = from_url(
-                f"{self._url}/{folder}".rstrip("/"), retry_config={"retry_timeout": RETRY_TIMEOUT}
+                f"{self._url}/{folder}".rstrip("/"),
+                retry_config={
+                    "retry_timeout": _QUICK if quick else PATIENCE,
+                    "max_retries": 10 if quick else 10_000,
+                    "backoff": {"max_backoff": timedelta(seconds=LONGEST_PAUSE)},
+                },
             )
         return store
+
+    def _asked[T](self, ask: Callable[["ObjectStore"], T]) -> T:
+        """What the store answers.
+
+        obstore repeats requests that change nothing, and is repeated here: a listing that breaks off, a
+        conditional put or a deletion that nobody answered. All of them may be done twice.
+        """
+        from obstore.exceptions import AlreadyExistsError, GenericError
+
+        pauses, end = pauses_between(), time.monotonic() + PATIENCE.total_seconds()
+        while True:
+            try:
+                answer = ask(self._objects)
+            except (FileNotFoundError, AlreadyExistsError):
+                self._answered = True
+                raise
+            except GenericError:
+                pause = next(pauses)
+                if not self._answered or time.monotonic() + pause > end:
+                    raise
+            else:
+                self._answered = True
+                return answer
+            time.sleep(pause)
 
     @contextmanager
     def in_words(self) -> Iterator[None]:
@@ -131,7 +175,7 @@ class Bucket(Location):
 
         try:
             with self.in_words():
-                obstore.head(self._objects, key)
+                self._asked(lambda objects: obstore.head(objects, key))
         except FileNotFoundError:
             return False
         return True
@@ -141,14 +185,14 @@ class Bucket(Location):
         import obstore
 
         with self.in_words():
-            return bytes(obstore.get(self._objects, key).bytes())
+            return self._asked(lambda objects: bytes(obstore.get(objects, key).bytes()))
 
     def open(self, key: str) -> BinaryIO:
         """Reads ranges when they are asked for."""
         import obstore
 
         with self.in_words():
-            return BufferedReader(_Ranges(obstore.open_reader(self._objects, key)))
+            return BufferedReader(_Ranges(self._asked(lambda objects: obstore.open_reader(objects, key)), self))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """A listing, then many requests side by side."""
@@ -166,11 +210,35 @@ class Bucket(Location):
         there = self._listing(folder)
         return {key: there[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in there}
 
+    def confirm(self, lengths: Mapping[str, int]) -> None:
+        """A request for the head of each, side by side."""
+        import obstore
+
+        def length(key: str) -> int:
+            try:
+                with self.in_words():
+                    return int(self._asked(lambda objects: obstore.head(objects, key))["size"])
+            except FileNotFoundError:
+                return 0
+
+        with ThreadPoolExecutor(READERS) as readers:
+            for key, found in zip(lengths, readers.map(length, lengths), strict=True):
+                if found != lengths[key]:
+                    raise StoreError(
+                        f"{self} took {lengths[key]:,} bytes of {key}, said that all was well, and holds "
+                        f"{found:,}. Nothing was committed that needs it. See what is wrong with the store; then the same "
+                        "command continues"
+                    )
+
     def _listing(self, folder: str) -> dict[str, int]:
         import obstore
 
         with self.in_words():
-            return {meta["path"]: meta["size"] for page in obstore.list(self._objects, folder) for meta in page}
+            return self._asked(
+                lambda objects: {
+                    meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page
+                }
+            )
 
     def create(self, key: str, content: bytes) -> bool:
         """A conditional put."""
@@ -185,7 +253,7 @@ class Bucket(Location):
 
         with self.in_words():
             try:
-                obstore.put(self._objects, key, content, mode=mode)
+                self._asked(lambda objects: obstore.put(objects, key, content, mode=mode))
             except obstore.exceptions.AlreadyExistsError:
                 return False
             except FileNotFoundError as error:  # no object can be missing here, only the bucket
@@ -205,14 +273,14 @@ class Bucket(Location):
 
         if keys:
             with self.in_words():
-                obstore.delete(self._objects, keys)
+                self._asked(lambda objects: obstore.delete(objects, keys))
 
     def store(self, folder: str, read_only: bool = False) -> Store:
-        """Zarr's own, over obstore."""
+        """Zarr's own, over obstore; its errors in our words."""
         from zarr.storage import ObjectStore
 
-        store: Store = ObjectStore(self._below(folder), read_only=read_only)
-        return store
+        store = ObjectStore(self._below(folder), read_only=read_only)
+        return PatientStore(store, self.in_words, _may_pass, PATIENCE.total_seconds())
 
     def found(self, objects: Mapping[str, bytes], last: str) -> None:
         """One after another, none over another's."""
@@ -220,11 +288,15 @@ class Bucket(Location):
         if strange and not self.exists(last):
             raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
         for key, content in objects.items():
-            if key != last and not self.create(key, content) and self.read(key) != content:
+            if key == last or self.create(key, content) or (there := self.read(key)) == content:
+                continue
+            if not content.startswith(there):
                 raise SettingsMismatchError(
                     f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
                     "or beginning now in another process. Choose another --out, or remove it"
                 )
+            self.write(key, content)  # a store kept a part of it and said that all was well
+        self.confirm({key: len(content) for key, content in objects.items() if key != last})
         self.create(last, objects[last])
 
     @contextmanager
@@ -249,39 +321,22 @@ class Bucket(Location):
         Two processes that build it at once write the same bytes, and neither removes what the other wrote.
         """
         here = self.derived(folder, stamp)
-        yield _Blank(self.store(here))
+        yield BlankStore(self.store(here))
         self._delete([key for key in self.keys(folder) if not key.startswith(f"{here}/")])
 
 
-class _Blank(WrapperStore[Store]):
-    """A store that shows only what was written through it."""
+def _may_pass(error: StoreError) -> bool:
+    """Whether the store failed, and did not refuse."""
+    from obstore.exceptions import GenericError
 
-    def __init__(self, store: Store) -> None:
-        super().__init__(store)
-        self._written: set[str] = set()
-
-    async def set(self, key: str, value: Buffer) -> None:
-        self._written.add(key)
-        await super().set(key, value)
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        return await super().get(key, prototype, byte_range) if key in self._written else None
-
-    async def exists(self, key: str) -> bool:
-        return key in self._written
-
-    async def delete_dir(self, prefix: str) -> None:
-        for key in [key for key in self._written if key.startswith(prefix)]:
-            await self.delete(key)
+    return isinstance(error.__cause__, GenericError)
 
 
 class _Ranges(RawIOBase):
     """What obstore can read of an object here and there, as Python's own file type."""
 
-    def __init__(self, file: "ReadableFile") -> None:
-        self._file = file
+    def __init__(self, file: "ReadableFile", bucket: Bucket) -> None:
+        self._file, self._bucket = file, bucket
 
     def readable(self) -> bool:
         return True
@@ -293,6 +348,7 @@ class _Ranges(RawIOBase):
         return self._file.seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        content = self._file.read(len(buffer))
+        with self._bucket.in_words():
+            content = self._file.read(len(buffer))
         buffer[: len(content)] = bytes(content)
         return len(content)

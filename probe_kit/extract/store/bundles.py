@@ -117,13 +117,15 @@ def write_bundle(
     """
     before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
     kept = _files_of(before) if before else {}
-    named = dict(kept)
+    named, written = dict(kept), dict[str, int]()
     for name, content in files.items():
         known = Sum.of(content)
         if name not in kept or kept[name][1] != known:
             actual = name if before is None else _renamed(name, known)
             location.write(f"{home}/{key}/{actual}", content)
+            written[f"{home}/{key}/{actual}"] = known.length
             named[name] = actual, known
+    location.confirm(written)
     stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
     whose = {"key": key, "run": _identity(location)}
     location.write(f"{home}/{key}/{HEAD}", as_record({**head, **whose, "files": stored}))

@@ -8,17 +8,30 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from probe_kit.errors import DiskSpaceError, SettingsMismatchError
-from probe_kit.extract.store.layout import COLUMNS, COMMITS, DATA, FRAMES, PLAN_FILE, RUN_FILE, VIDEOS
+from probe_kit.extract.store.layout import (
+    CERTIFICATES,
+    COLUMNS,
+    COMMITS,
+    DATA,
+    FAILED,
+    FRAMES,
+    PLAN_FILE,
+    PROVENANCE,
+    RUN_FILE,
+    SEALED,
+    VIDEOS,
+)
 from probe_kit.extract.store.location import Location
 
 # What a killed process leaves: objects and columns that never got their final name.
-_ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in (COMMITS, FRAMES, VIDEOS)), f"{DATA}/**/*.partial")
+_WRITTEN_ASIDE = (COMMITS, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
+_ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
 
 
 class Folder(Location):
@@ -93,6 +106,9 @@ class Folder(Location):
         paths = {key: self._path / folder / key for key in keys}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
+    def confirm(self, lengths: Mapping[str, int]) -> None:
+        """A file system says so itself when it is written."""
+
     def create(self, key: str, content: bytes) -> bool:
         """Written aside, flushed to the disk, then linked to its name."""
         path = self._path / key
@@ -146,18 +162,17 @@ class Folder(Location):
     def held(self, clear: Callable[[], None]) -> Iterator[None]:
         """Every process that works holds a shared lock, so only one that finds itself alone may clear.
 
-        What looks like a leftover could be another's work in progress.
+        What looks like a leftover could be another's work in progress. Whoever is alone at the end clears what
+        others left that were killed meanwhile.
         """
         with (self._path / RUN_FILE).open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                pass
-            else:
+            if _alone(file):
                 self._clear_orphans()
                 clear()
             fcntl.flock(file, fcntl.LOCK_SH)
             yield
+            if _alone(file):
+                self._clear_orphans()
 
     def _clear_orphans(self) -> None:
         for pattern in _ORPHANS:
@@ -192,6 +207,15 @@ class Folder(Location):
             aside.rename(self._path / self.derived(folder, stamp))
         finally:
             shutil.rmtree(aside, ignore_errors=True)
+
+
+def _alone(file: IO[str]) -> bool:
+    """Hold the lock alone, if nobody else holds it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextmanager

@@ -34,7 +34,7 @@ PROTECTED_SINCE = 3
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
-FRAMES, CERTIFICATES, SEALED, PROBES = "frames", "certificates", "sealed", "probes"
+FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 INTERVENTIONS = "interventions"
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """What no hash covers: pictures for people."""

@@ -74,6 +74,13 @@ class Location(ABC):
         """Bytes of the objects `keys` below `folder`, as far as they are there."""
 
     @abstractmethod
+    def confirm(self, lengths: Mapping[str, int]) -> None:
+        """Ask once more whether these objects, just written, are there, each of so many bytes.
+
+        Called before anything is written that names them. Raises StoreError.
+        """
+
+    @abstractmethod
     def create(self, key: str, content: bytes) -> bool:
         """Write an object unless it exists; True if this call wrote it. Whole or not at all, and durable."""
 

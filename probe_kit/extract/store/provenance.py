@@ -18,13 +18,13 @@ import probe_kit.version
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract.store.commits import create_once
 from probe_kit.extract.store.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.layout import PROVENANCE
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.root import Root
 from probe_kit.identity import sha256_json, sha256_text
 
 Provenance = Mapping[str, Any]
 
-PROVENANCE = "provenance"
 DIGITS = 16
 _NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
 _RESTORE = "Restore it from a copy, or extract the run again"

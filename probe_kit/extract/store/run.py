@@ -34,10 +34,10 @@ from probe_kit.extract.store.commits import (
 )
 from probe_kit.extract.store.hashes import Sum
 from probe_kit.extract.store.judging import Watched, judged, watch, with_outcomes
-from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
+from probe_kit.extract.store.layout import DATA, PROVENANCE, RUN_FILE, StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.provenance import PROVENANCE, Provenance, differences, read_provenances
+from probe_kit.extract.store.provenance import Provenance, differences, read_provenances
 from probe_kit.extract.store.root import RESTORE, read_root
 from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.summary import run_html, run_text
@@ -253,9 +253,10 @@ class Run:
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
-        """One row per committed episode: the plan's columns, then the outcome's."""
+        """One row per committed episode: the plan's columns, then the outcome's, if there is one."""
         plan = self.root.planned
-        return pd.DataFrame([{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers])
+        rows = [{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers]
+        return pd.DataFrame(rows or None, columns=None if rows else list(self.root.plan[0]))
 
     # -- trajectories ----------------------------------------------------------------------------------
 

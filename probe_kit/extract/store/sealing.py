@@ -44,6 +44,8 @@ def _seal(run: Run) -> bool:
             _write_pooled(run, name, group)
             _write_roles(run, name, group)
         group.attrs["stamp"] = run.stamp
+        folder = run.location.derived(COLUMNS, run.stamp)
+        run.location.confirm({f"{folder}/{key}": one.length for key, one in store.sums.items()})
     if run.protected:
         write_seal(run.root, run.stamp, store.sums)  # what makes them count, so last
     return True

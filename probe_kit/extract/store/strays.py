@@ -7,8 +7,7 @@ from probe_kit.extract.store.bundles import BUNDLES, HEAD, PARTIAL, bundle_keys,
 from probe_kit.extract.store.certificates import certificate_keys
 from probe_kit.extract.store.columns import Columns, seal_key
 from probe_kit.extract.store.commits import Commit, commit_key, numbered
-from probe_kit.extract.store.layout import DATA, FAILED, ILLUSTRATIONS, RUN_FILE
-from probe_kit.extract.store.provenance import PROVENANCE
+from probe_kit.extract.store.layout import DATA, FAILED, ILLUSTRATIONS, PROVENANCE, RUN_FILE
 from probe_kit.extract.store.root import Root
 
 

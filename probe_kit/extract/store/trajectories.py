@@ -53,7 +53,7 @@ def names_trajectory(commit: Mapping[str, Any]) -> bool:
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
     """Store the frames (T + 1, C) of episode `number`."""
-    array: zarr.Array[Any] = zarr.open_array(store, path=NAME, mode="r+", config=config)
+    array: zarr.Array[Any] = zarr.open_array(store, path=NAME, mode="r+", zarr_format=3, config=config)
     row = np.full(array.shape[1:], np.nan, np.float32)
     row[: len(frames)] = frames
     array[number] = row

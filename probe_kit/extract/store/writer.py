@@ -154,12 +154,15 @@ class RunWriter:
         store = RecordingStore(self.location.store(DATA))
         for kind, by_stream in episode.arrays.items():
             for stream, values in by_stream.items():
-                array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", config=_WRITE_ALL)
+                array = zarr.open_array(
+                    store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=_WRITE_ALL
+                )
                 if array.shards:
                     store.shards[f"{stream}/{kind}"] = prod(array.shards) // prod(array.chunks)
                 array[planned.index] = values
         if episode.trajectory is not None and self._keeps_trajectories:
             write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
+        self.location.confirm({f"{DATA}/{key}": one.length for key, one in store.sums.items()})
         commit = {
             "run": self.root.identity,
             "episode": planned.index,

@@ -1,0 +1,172 @@
+"""An S3 server of our own on a port of this machine: moto's, which can be stopped and made to fail."""
+
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from random import Random
+from threading import Event, Thread
+from typing import Any, NoReturn
+from urllib.request import Request, urlopen
+
+import pytest
+
+BUCKET = "probe-kit-tests"
+App = Callable[..., Iterable[bytes]]
+
+
+class S3Server:
+    """Moto's server. What it holds stays while it is stopped.
+
+    wrap: what stands between it and its clients.
+    """
+
+    def __init__(self, wrap: Callable[[App], App] = lambda app: app) -> None:
+        server = pytest.importorskip("moto.server", reason="moto is not installed")
+        pytest.importorskip("obstore", reason="obstore is not installed (extra `remote`)")
+        self._app = wrap(server.DomainDispatcherApplication(server.create_backend_app))
+        self._port = 0
+        self.start()
+
+    def start(self) -> None:
+        """Listen, on the port that it had before."""
+        from werkzeug.serving import WSGIRequestHandler, make_server
+
+        class Quiet(WSGIRequestHandler):
+            def log_request(self, *_: object) -> None:
+                """Say nothing of requests."""
+
+            def log(self, *_: object) -> None:
+                """Nor of clients that are gone."""
+
+        self._listening = make_server("127.0.0.1", self._port, self._app, threaded=True, request_handler=Quiet)
+        self._port = self._listening.port
+        self._thread = Thread(target=self._listening.serve_forever, kwargs={"poll_interval": 0.02})
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Nobody answers at its port any more."""
+        self._listening.shutdown()
+        self._thread.join()
+        self._listening.server_close()
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What leads a client here."""
+        return {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{self._port}",
+            "AWS_ACCESS_KEY_ID": "nobody",
+            "AWS_SECRET_ACCESS_KEY": "nothing",
+            "AWS_REGION": "us-east-1",
+            "AWS_ALLOW_HTTP": "true",
+        }
+
+    def empty(self) -> str:
+        """Forget everything; the URL of a new bucket."""
+        self._ask("moto-api/reset", "POST")
+        self._ask(BUCKET, "PUT")
+        return f"s3://{BUCKET}"
+
+    def _ask(self, path: str, method: str) -> None:
+        headers = {
+            "Authorization": "AWS4-HMAC-SHA256 Credential=nobody/20260101/us-east-1/s3/aws4_request",
+            "X-Trusted": "yes",
+        }
+        urlopen(Request(f"{self.environment['AWS_ENDPOINT_URL']}/{path}", method=method, headers=headers)).close()
+
+
+def without_conditions(app: App) -> App:
+    """The same server, deaf to If-None-Match."""
+
+    def deaf(environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        environ.pop("HTTP_IF_NONE_MATCH", None)
+        return app(environ, start_response)
+
+    return deaf
+
+
+class Unreliable:
+    """The same server on a bad day: `ail` says of every request what happens to it, None for nothing.
+
+    Every other answer is the name of a method here. seen: how often each happened.
+    """
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self.ail: Callable[[str, str], str | None] = lambda _method, _path: None
+        self.seen: Counter[str] = Counter()
+        self.over = Event()
+
+    def __call__(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        ill = None if "HTTP_X_TRUSTED" in environ else self.ail(environ["REQUEST_METHOD"], environ["PATH_INFO"])
+        if ill is None:
+            return self._app(environ, start_response)
+        self.seen[ill] += 1
+        answer: Iterable[bytes] = getattr(self, ill)(environ, start_response)
+        return answer
+
+    def busy(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It asks to slow down."""
+        environ["wsgi.input"].read(_length(environ))
+        start_response("503 Slow Down", [("Content-Type", "application/xml")])
+        return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
+
+    def torn(self, environ: dict[str, Any], _start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It is gone when half of an upload has arrived, and keeps nothing."""
+        environ["wsgi.input"].read(_length(environ) // 2)
+        return _hang_up(environ)
+
+    def unanswered(self, environ: dict[str, Any], _start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It does what it was asked, and is gone before it says so."""
+        list(self._app(environ, lambda *_: None))
+        return _hang_up(environ)
+
+    def cut(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """Its answer ends in the middle."""
+        content = b"".join(self._app(environ, start_response))
+        yield content[: len(content) // 2]
+        _hang_up(environ)
+
+    def slow(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It answers late."""
+        time.sleep(0.1)
+        return self._app(environ, start_response)
+
+    def silent(self, environ: dict[str, Any], _start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It listens and says nothing until everything is over."""
+        self.over.wait()
+        return _hang_up(environ)
+
+    def half(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It keeps half of what it is given and says that all is well."""
+        environ["CONTENT_LENGTH"] = str(_length(environ) // 2)
+        return self._app(environ, start_response)
+
+
+class BadServer(S3Server):
+    """A server whose days are bad at will. url: of its bucket."""
+
+    day: Unreliable
+    url: str
+
+    def __init__(self) -> None:
+        super().__init__(self._wrapped)
+
+    def _wrapped(self, app: App) -> App:
+        self.day = Unreliable(app)
+        return self.day
+
+
+def _length(environ: dict[str, Any]) -> int:
+    return int(environ.get("CONTENT_LENGTH") or 0)
+
+
+def _hang_up(environ: dict[str, Any]) -> NoReturn:
+    environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
+    raise ConnectionResetError  # werkzeug then says nothing
+
+
+def now_and_then(ills: Iterable[str], share: float, seed: int) -> Callable[[str, str], str | None]:
+    """This share of all requests has one of these, drawn at random."""
+    draw, chosen = Random(seed), list(ills)
+    return lambda _method, _path: draw.choice(chosen) if draw.random() < share else None
