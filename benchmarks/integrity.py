@@ -108,16 +108,33 @@ def read_all(files: list[Path]) -> None:
         path.read_bytes()
 
 
+def forget(files: list[Path]) -> None:
+    """Have the system read them from the disk again, if it listens to advice."""
+    for path in files:
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
 def bench_verifying(folder: Path, repeats: int) -> None:
-    """Every byte of the runs that were just written, against reading the same files."""
+    """Every byte of the runs that were just written, against reading the same files, from disk and from memory."""
     runs = [folder / f"none-blake2b-{repeat}" for repeat in range(repeats)]
-    for run in runs:
-        files = [path for path in run.rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files) / 1e6
-        read = seconds(partial(read_all, files))
-        deep = seconds(partial(verify_run, run, deep=True))
-        print(f"verify --deep {size:.0f} MB: {size / deep[0]:.0f} MB/s ({size / deep[1]:.0f} per CPU-second); "
-              f"reading alone {size / read[0]:.0f} MB/s ({size / read[1]:.0f})")  # fmt: skip
+    files = {run: [path for path in run.rglob("*") if path.is_file()] for run in runs}
+    size = sum(path.stat().st_size for path in files[runs[0]]) / 1e6
+    for where in ("disk", "memory"):
+        found: dict[str, list[Seconds]] = {"reading": [], "verify --deep": []}
+        for run in runs:
+            ways = {"reading": partial(read_all, files[run]), "verify --deep": partial(verify_run, run, deep=True)}
+            for name, work in ways.items():
+                (forget if where == "disk" else read_all)(files[run])
+                found[name].append(seconds(work))
+        (read_wall, read_cpu), (wall, cpu) = (medians(turns) for turns in found.values())
+        ways = ((read_wall, read_cpu, "reading alone"), (wall, cpu, "verify --deep"))
+        for wall_of, cpu_of, name in ways:
+            print(
+                f"{size:.0f} MB from {where}, {name:13} {size / wall_of:6.0f} MB/s ({size / cpu_of:.0f} per CPU-s)"
+            )
+        print(f"verify --deep from {where}: {read_wall / wall:.2f} of the speed of reading alone")
 
 
 def large_run(suite: Suite, run: Path, episodes: int) -> None:

@@ -131,8 +131,6 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
 @pytest.fixture(scope="session")
 def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of two runs without a model, `run` and `other`, of other seeds, with everything a run can hold."""
-    from probe_kit.extract.store.locate import locate
-    from probe_kit.extract.store.thumbnails import write_thumbnail
     from tests.little_run import intervene_on_little_run, probe_little_run, write_little_run
 
     folder = tmp_path_factory.mktemp("little")
@@ -140,8 +138,6 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
         made = write_little_run(folder / name, small_suite.select(["color"]), seed)
         probe_little_run(made)
         intervene_on_little_run(made)
-        picture = np.full((60, 80, 3), 100 * seed, np.uint8)
-        write_thumbnail(locate(folder / name), 0, (picture, picture))
     return folder
 
 

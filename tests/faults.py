@@ -14,7 +14,6 @@ from typing import Any
 from probe_kit.errors import ProbeKitError, RunNotFoundError
 from probe_kit.extract import verify_run
 from probe_kit.extract.store.audit import Audit
-from probe_kit.extract.store.layout import ILLUSTRATIONS
 from tests.reading import readings
 
 Change = Mapping[Path, bytes | None]
@@ -62,7 +61,6 @@ class Stored:
     def verdict(self, fault: Fault) -> str:
         """`found`, `harmless` if nothing changed for anybody, or what is wrong with the instrument."""
         changed = next(iter(fault.change)).relative_to(self.run).parts
-        protected = not fault.harmless and changed[0] not in ILLUSTRATIONS
         hint = {"data.zarr": changed[-4] if len(changed) > 4 else "", "columns.zarr": "columns"}.get(
             changed[0], ""
         )
@@ -81,7 +79,7 @@ class Stored:
         seen = not audit.ok or _summary(audit) != _summary(self.audit)
         if read.startswith("SILENT"):
             return read
-        if not seen and protected:
+        if not seen and not fault.harmless:
             return f"UNSEEN by run verify --deep, reading says {read}"
         return "harmless" if read == "same" and not seen else "found"
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.env.trajectory import CHANNELS
 from probe_kit.extract import Run, open_run, seal
@@ -12,6 +13,7 @@ from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.store.layout import StoredStream
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.identity import derive_seed
 from probe_kit.intervene import Answers, Follow
@@ -26,6 +28,8 @@ STREAMS = (
     StoredStream("expert", 1, 4, 2, 3, ("mean", "mean:action"), quantities=("residual",)),
 )
 STEPS = 2
+PICTURED = 2
+"""Episodes that keep frames."""
 PLACED = ("left", "right", "none")
 
 
@@ -77,7 +81,13 @@ def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:
     }
     roles = [{"backbone": [("language", 0, 130)], "expert": [("action", 0, 3)]}]
     trajectory = draw.normal(size=(STEPS + 1, len(CHANNELS))).astype(np.float32)
-    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number))
+    pictures = {thumbnail_key(number): as_thumbnail(still(seed, number))} if number < PICTURED else {}
+    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number), pictures)
+
+
+def still(seed: int, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two frames that differ by seed and episode."""
+    return np.full((60, 80, 3), 100 * seed + number, np.uint8), np.full((60, 80, 3), 50, np.uint8)
 
 
 def write_little_run(

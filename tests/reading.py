@@ -11,6 +11,7 @@ import numpy as np
 
 from probe_kit.extract import open_run
 from probe_kit.extract.store.run import NotSealedWarning, Run
+from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.intervene import load_effects, stored_interventions
 from probe_kit.train import load_results
 from probe_kit.train.inventory import inventory
@@ -41,6 +42,7 @@ def _of_run(run: Run) -> Readings:
         "certificate": lambda: run.certificate,
         "columns labelled": lambda: [array.values for array in run.xarray().data_vars.values()],
         "trajectory": lambda: [run.trajectory(row).frames for row in rows],
+        "pictures": lambda: [read_thumbnail(run.location, number) for number in run.episodes["episode"]],
         "instructions": lambda: [run.instruction_ids(row) for row in rows],
     }
     for stream in run.streams:

@@ -14,10 +14,10 @@ from probe_kit.errors import RunDamagedError, RunIncompleteError
 from probe_kit.extract import open_run, verify_run
 from probe_kit.extract.store.commits import write_failure
 from probe_kit.extract.store.hashes import as_record
-from probe_kit.extract.store.layout import ILLUSTRATIONS
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.strays import known_keys
+from probe_kit.extract.store.thumbnails import read_thumbnail, thumbnail_key
 from probe_kit.intervene import stored_following
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
@@ -312,6 +312,53 @@ def test_reasons_of_failures_are_protected(run: Path) -> None:
         _ = open_run(run, allow_partial=True).failed
 
 
+# -- pictures ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["edited", "exchanged", "another's", "cut", "lost alone"])
+def test_pictures_of_a_report_are_protected(run: Path, other: Path, how: str) -> None:
+    first, second = sorted((run / "frames").iterdir())
+    content = bytearray(first.read_bytes())
+    if how == "exchanged":
+        swap(first, second)
+    elif how == "another's":
+        shutil.copy(other / "frames" / first.name, first)
+    elif how == "lost alone":
+        first.unlink()
+    else:
+        content[len(content) // 2] ^= 1
+        first.write_bytes(bytes(content) if how == "edited" else bytes(content[:-9]))
+    assert_found(run, f"frames/{first.name}", deep=True)
+
+
+def test_whoever_wants_no_pictures_may_delete_all_of_them(run: Path, little_runs: Path) -> None:
+    shutil.rmtree(run / "frames")
+    assert read_thumbnail(run, 0) is None
+    assert verify_run(run, deep=True).ok
+    told, before = readings(run), readings(little_runs / "run")
+    assert {name for name in told if told[name] != before[name]} == {"pictures"}
+
+
+def test_a_picture_that_no_commit_names_is_not_shown(run: Path) -> None:
+    shutil.copy(run / thumbnail_key(0), run / thumbnail_key(7))
+    assert read_thumbnail(run, 7) is None
+    assert verify_run(run, deep=True).ok
+
+
+def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run: Path) -> None:
+    from tests.rehashing import rehash, write_record
+
+    for path in (run / "commits").iterdir():
+        commit = json.loads(path.read_text())
+        del commit["pictures"]
+        write_record(path, commit)
+    shutil.rmtree(run / "probes")
+    rehash(run)
+    shutil.copy(run / thumbnail_key(0), run / thumbnail_key(7))
+    assert read_thumbnail(run, 7) == read_thumbnail(run, 0) != read_thumbnail(run, 1)
+    assert verify_run(run, deep=True).ok
+
+
 # -- probes ------------------------------------------------------------------------------------------------
 
 
@@ -498,10 +545,10 @@ def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_ru
 
 
 def unprotected(run: Run) -> set[str]:
-    """Files that no hash covers and that are no pictures."""
+    """Files that no hash covers."""
     known = set(known_keys(run.root, dict(zip(run.episodes["episode"], run.commits(), strict=True)), run.columns,
                            run.stamp))  # fmt: skip
-    return {key for key in run.location.keys("") if key not in known and key.split("/")[0] not in ILLUSTRATIONS}
+    return {key for key in run.location.keys("") if key not in known}
 
 
 def test_no_file_of_a_run_is_without_protection(little_runs: Path) -> None:
@@ -515,9 +562,7 @@ def test_no_file_of_a_real_run_is_without_protection(recorded_run: Run) -> None:
 def test_a_flipped_bit_in_any_kind_of_file_is_found(run: Path) -> None:
     kinds = Stored(run, run, {}, verify_run(run)).files()
     assert len(kinds) > 20
-    for name, paths in kinds.items():
-        if name.split("/")[0].strip() in ILLUSTRATIONS:
-            continue
+    for paths in kinds.values():
         path = paths[len(paths) // 2]
         before = path.read_bytes()
         path.write_bytes(before[:-2] + bytes([before[-2] ^ 4]) + before[-1:])

@@ -15,7 +15,8 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.thumbnails import read_thumbnail, write_thumbnail
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
@@ -191,7 +192,7 @@ def framed_run(folder: Path, episodes: pd.DataFrame) -> ArrayRun:
     run = plain_run(folder, episodes)
     for number in range(len(episodes)):
         frame = np.full((12, 16, 3), 3 * number, np.uint8)
-        write_thumbnail(folder, number, (frame, frame))
+        locate(folder).write(thumbnail_key(number), as_thumbnail((frame, frame)))
     return run
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.extract.store.thumbnails import write_thumbnail
+from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.retention.report import write_report
 from probe_kit.train import ArrayRun
 
@@ -91,7 +92,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     frame = np.full((12, 16, 3), 200, np.uint8)
     for number in range(0, 60, 2):
-        write_thumbnail(folder, number, (frame, 255 - frame))
+        locate(folder).write(thumbnail_key(number), as_thumbnail((frame, 255 - frame)))
     run = ArrayRun(folder, "pi0", "suite@1#0123456789ab", pd.DataFrame(rows), {})
     return write_report([run], folder / "report.html")
 

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -23,8 +24,7 @@ from probe_kit.extract.play.stage_process import ProcessStage
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
 from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.layout import VIDEOS
-from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.thumbnails import write_thumbnail
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import RunWriter
 
 # Buffers beyond those on stage: one is being written while another waits.
@@ -106,11 +106,7 @@ class Worker:
             rollout.buffers.wait()
             with self._writer.location.in_words():
                 self._writer.write_certificate(self._controller.certificate())
-                if rollout.ends:
-                    write_thumbnail(self._writer.location, rollout.planned.index, rollout.ends)
-                self._writer.write(rollout.record)
-                if rollout.frames:
-                    _save_film(self._writer.location, rollout)
+                self._writer.write(replace(rollout.record, pictures=dict(_pictures(rollout))))
         finally:
             self._ring.give_back(rollout.buffers)
         return Done(rollout.planned.index, rollout.outcome)
@@ -135,7 +131,15 @@ def torch_threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _save_film(location: Location, rollout: Rollout) -> None:
+def _pictures(rollout: Rollout) -> Iterator[tuple[str, bytes]]:
+    """Key and content of what is kept for people."""
+    if rollout.ends:
+        yield thumbnail_key(rollout.planned.index), as_thumbnail(rollout.ends)
+    if rollout.frames:
+        yield _film(rollout)
+
+
+def _film(rollout: Rollout) -> tuple[str, bytes]:
     frames = [
         np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
     ]
@@ -143,4 +147,4 @@ def _save_film(location: Location, rollout: Rollout) -> None:
     name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
     with tempfile.TemporaryDirectory() as folder:
         save_gif(Path(folder) / name, frames)
-        location.write(f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes())
+        return f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes()

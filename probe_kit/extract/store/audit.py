@@ -16,6 +16,7 @@ from probe_kit.extract.store.commits import (
     commit_key,
     committed_sizes,
     numbered,
+    picture_problems,
     read_commit,
     read_failures,
     redo,
@@ -78,6 +79,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
         except RunDamagedError as error:
             problems.append(str(error))
     problems += _commit_problems(root, commits)
+    problems += picture_problems(location, commits)
     problems += _provenance_problems(root, commits)
     if commits and root.protected:
         problems += _caught(partial(read_certificate, root))

@@ -226,8 +226,8 @@ class Bucket(Location):
                 if found != lengths[key]:
                     raise StoreError(
                         f"{self} took {lengths[key]:,} bytes of {key}, said that all was well, and holds "
-                        f"{found:,}. Nothing was committed that needs it. See what is wrong with the store; then the same "
-                        "command continues"
+                        f"{found:,}. Nothing was committed that needs it. See what is wrong with the store; then "
+                        "the same command continues"
                     )
 
     def _listing(self, folder: str) -> dict[str, int]:

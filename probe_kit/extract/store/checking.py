@@ -1,6 +1,7 @@
 """A store that gives nothing out unchecked: every object, or the part of one that is read, against its sum."""
 
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping, Sequence
+from itertools import count
 from typing import Any
 
 from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteRequest
@@ -18,7 +19,8 @@ class CheckedStore(WrapperStore[Store]):
     """Reads objects that are known by their sums; whatever else lies in the store does not exist for it.
 
     where: full name of an object, for messages. advice: what to do if one is wrong.
-    A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked.
+    A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. Of
+    several wrong objects that are read at once, the one that was asked for first is named, whichever comes first.
     """
 
     def __init__(
@@ -27,6 +29,8 @@ class CheckedStore(WrapperStore[Store]):
         super().__init__(store)
         self._sums, self._where, self._advice = sums, where, advice
         self._indexes: dict[str, dict[tuple[int, int], str]] = {}
+        self._numbers = count()
+        self._underway: dict[int, str] = {}
 
     @property
     def _supports_sync_io(self) -> bool:
@@ -46,10 +50,26 @@ class CheckedStore(WrapperStore[Store]):
         """One object or a part of it."""
         if key not in self._sums:
             return None
-        value = await super().get(key, prototype, byte_range)
-        if isinstance(byte_range, RangeByteRequest) and key not in self._indexes:
-            await self._read_index(key, prototype)
-        return self._checked(key, value, byte_range)
+        number = next(self._numbers)
+        self._underway[number] = key
+        try:
+            value = await super().get(key, prototype, byte_range)
+            if isinstance(byte_range, RangeByteRequest) and key not in self._indexes:
+                await self._read_index(key, prototype)
+            return self._checked(key, value, byte_range)
+        except RunDamagedError as error:
+            raise await self._first(number, prototype) or error from None
+        finally:
+            del self._underway[number]
+
+    async def _first(self, number: int, prototype: BufferPrototype) -> RunDamagedError | None:
+        """What is wrong with objects that were asked for before and have not come yet."""
+        for key in [key for earlier, key in sorted(self._underway.items()) if earlier < number]:
+            try:
+                self._checked(key, await super().get(key, prototype, None), None)
+            except RunDamagedError as error:
+                return error
+        return None
 
     async def _read_index(self, key: str, prototype: BufferPrototype) -> None:
         count = len(self._sums[key].blocks) // _BLOCK - 1

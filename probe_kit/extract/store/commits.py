@@ -7,8 +7,17 @@ from typing import Any
 import google_crc32c
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.hashes import HASH, Sum, as_record, expect, read_plain, read_record, read_sums
-from probe_kit.extract.store.layout import COMMITS, DATA, FAILED
+from probe_kit.extract.store.hashes import (
+    HASH,
+    Sum,
+    as_record,
+    expect,
+    is_record,
+    read_plain,
+    read_record,
+    read_sums,
+)
+from probe_kit.extract.store.layout import COMMITS, DATA, FAILED, ILLUSTRATIONS
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.root import Root
 from probe_kit.identity import canonical_json, sha256_json
@@ -100,6 +109,41 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
 def redo(number: int) -> str:
     """What to do about a damaged episode."""
     return f"Delete {commit_key(number)} and run the same `probe-kit extract` again to redo the episode"
+
+
+def redo_picture(number: int) -> str:
+    """What to do about a damaged picture of an episode."""
+    return f"No number comes from it; to have it again: {redo(number)[0].lower()}{redo(number)[1:]}"
+
+
+def pictures_of(commit: Commit) -> dict[str, Sum] | None:
+    """Sums of the pictures of an episode by key in the run; None in commits that bind none, as former ones."""
+    return read_sums(commit["pictures"]) if "pictures" in commit else None
+
+
+def read_pictures(location: Location, number: int) -> dict[str, Sum] | None:
+    """The same from the commit as it is stored; None also where there is no commit. Raises RunDamagedError."""
+    try:
+        raw = location.read(commit_key(number))
+    except FileNotFoundError:
+        return None
+    return (
+        pictures_of(read_record(raw, f"{location}/{commit_key(number)}", redo(number))) if is_record(raw) else None
+    )
+
+
+def picture_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
+    """Pictures that are missing or have another size. Whoever wants none may delete a whole folder of them."""
+    there = {key for folder in ILLUSTRATIONS for key in location.keys(folder)}
+    kept = {key.partition("/")[0] for key in there}
+    promised = {number: pictures_of(commit) or {} for number, commit in commits.items()}
+    sizes = location.sizes("", (key for pictures in promised.values() for key in pictures if key in there))
+    for number, pictures in promised.items():
+        for key, known in pictures.items():
+            if key not in there and key.partition("/")[0] in kept:
+                yield f"{key} is missing. {redo_picture(number)}"
+            elif key in there and sizes[key] != known.length:
+                yield f"{key} has {sizes[key]} bytes; {known.length} were written. {redo_picture(number)}"
 
 
 def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[str, int]:

@@ -1,5 +1,6 @@
 """The deep half of verifying a run: every byte against its hash, and the columns against the rows."""
 
+import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -8,7 +9,7 @@ import numpy as np
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.columns import Columns
-from probe_kit.extract.store.commits import Commit, crc32c, redo
+from probe_kit.extract.store.commits import Commit, crc32c, pictures_of, redo, redo_picture
 from probe_kit.extract.store.hashes import Sum
 from probe_kit.extract.store.layout import DATA
 from probe_kit.extract.store.location import Location
@@ -16,8 +17,8 @@ from probe_kit.extract.store.root import Root
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.sealing import columns_of_rows
 
-READERS = 4
-"""Objects that are read and hashed at once: hashing lets other threads work."""
+READERS = min(8, max(4, os.cpu_count() or 1))
+"""Objects that are read and hashed at once: hashing lets other threads work. Each may be some 80 MB."""
 BATCH = 256
 
 Job = tuple[str, int, str, str, str]
@@ -42,6 +43,8 @@ def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
     for number, commit in commits.items():
         for key, (length, checksum, *_) in commit["objects"].items():
             yield f"{DATA}/{key}", length, checksum, f" of episode {commit['episode_id']}", redo(number)
+        for key, (length, checksum, _) in (pictures_of(commit) or {}).items():
+            yield key, length, checksum, f" of episode {commit['episode_id']}", redo_picture(number)
 
 
 def _sealed(columns: Columns | None) -> Iterator[Job]:

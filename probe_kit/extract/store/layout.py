@@ -14,8 +14,7 @@ RUN/
   videos/            GIFs, if asked for
   frames/<n>.webp    first and last frame of an episode, see `thumbnails`
 
-Every object is bound to the root by hashes, see `hashes`; videos and frames alone are not, because no number,
-label or claim comes from them.
+Every object is bound to the root by hashes, see `hashes`.
 """
 
 from collections.abc import Mapping
@@ -37,7 +36,7 @@ COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "colu
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 INTERVENTIONS = "interventions"
 ILLUSTRATIONS = (FRAMES, VIDEOS)
-"""What no hash covers: pictures for people."""
+"""Pictures for people, which a run can do without."""
 CODECS = ("zstd", "fast", "none")
 LISTENED = "listened"
 """Outcome of an episode in which the model was heard and did not act: there is no success rate."""

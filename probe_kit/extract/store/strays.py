@@ -6,13 +6,13 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.bundles import BUNDLES, HEAD, PARTIAL, bundle_keys, read_bundle
 from probe_kit.extract.store.certificates import certificate_keys
 from probe_kit.extract.store.columns import Columns, seal_key
-from probe_kit.extract.store.commits import Commit, commit_key, numbered
+from probe_kit.extract.store.commits import Commit, commit_key, numbered, pictures_of
 from probe_kit.extract.store.layout import DATA, FAILED, ILLUSTRATIONS, PROVENANCE, RUN_FILE
 from probe_kit.extract.store.root import Root
 
 
 def stray_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None, stamp: str) -> list[str]:
-    """Keys of all objects that no hash covers and that are no pictures for people either."""
+    """Keys of all objects that no hash covers; pictures that nobody promised are neither read nor told."""
     known = set(known_keys(root, commits, columns, stamp))
     return [key for key in root.location.keys("") if key not in known and not _expected(key)]
 
@@ -25,6 +25,7 @@ def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
         yield commit_key(number)
         yield f"{PROVENANCE}/{commit['provenance']}.json"
         yield from (f"{DATA}/{key}" for key in commit["objects"])
+        yield from pictures_of(commit) or {}
     yield from certificate_keys(root.location)
     yield from (key for _, key, _ in numbered(root.location, FAILED))
     if columns is not None:

@@ -1,6 +1,7 @@
 """First and last frame of an episode, small enough to keep them for every episode of a run.
 
-They illustrate and are derived: no commit names them, no number depends on them, and they are safe to delete.
+They illustrate: no number depends on them. The commit of their episode names them with their hash, because who
+looks at a report believes what it shows. All of them may be deleted, not single ones.
 """
 
 from io import BytesIO
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit.errors import RunDamagedError
+from probe_kit.extract.store.commits import read_pictures, redo_picture
 from probe_kit.extract.store.layout import FRAMES
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
@@ -29,19 +32,32 @@ def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
 
 
-def write_thumbnail(run: Path | Location, number: int, ends: Ends) -> None:
-    """Store the frames of episode `number` side by side as one WebP, whole or not at all."""
+def as_thumbnail(ends: Ends) -> bytes:
+    """The frames side by side as one WebP."""
     encoded = BytesIO()
     Image.fromarray(np.hstack(ends)).save(encoded, "WEBP", quality=QUALITY, method=4)
-    locate(run).write(thumbnail_key(number), encoded.getvalue())
+    return encoded.getvalue()
 
 
 def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
-    """The WebP of episode `number`, first frame left and last frame right; None if the run keeps none."""
-    try:
-        return locate(run).read(thumbnail_key(number))
-    except FileNotFoundError:
+    """The WebP of episode `number`, first frame left and last frame right; None if the run keeps none.
+
+    Raises RunDamagedError if it is not the one that was stored when the episode was committed, or is lost alone.
+    Pictures of former versions, and those beside arrays that are no run, are bound to nothing.
+    """
+    location, key = locate(run), thumbnail_key(number)
+    promised = read_pictures(location, number)
+    if promised is not None and key not in promised:
         return None
+    try:
+        content = location.read(key)
+    except FileNotFoundError:
+        if promised is None or not location.keys(FRAMES):
+            return None
+        raise RunDamagedError(f"{location}/{key} is missing. {redo_picture(number)}") from None
+    if promised is not None and (problem := promised[key].problem(content)):
+        raise RunDamagedError(f"{location}/{key} {problem}. {redo_picture(number)}")
+    return content
 
 
 def thumbnail_key(number: int) -> str:

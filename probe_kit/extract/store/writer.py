@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
 from typing import Any
@@ -20,7 +20,7 @@ from probe_kit.extract.settings import refuse_other_plan, refuse_other_settings
 from probe_kit.extract.store.arrays import create_arrays
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.commits import read_commits, write_commit, write_failure
-from probe_kit.extract.store.hashes import as_json
+from probe_kit.extract.store.hashes import Sum, as_json
 from probe_kit.extract.store.layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
 from probe_kit.extract.store.location import Location
 from probe_kit.extract.store.provenance import (
@@ -47,7 +47,7 @@ class EpisodeRecord:
 
     arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
     roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
-    instruction_ids: the instruction as the policy was delivered it.
+    instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run.
     """
 
     planned: PlannedEpisode
@@ -56,6 +56,7 @@ class EpisodeRecord:
     roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
     trajectory: NDArray[np.float32] | None = None
     instruction_ids: Sequence[int] | None = None
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
 class RunWriter:
@@ -162,7 +163,11 @@ class RunWriter:
                 array[planned.index] = values
         if episode.trajectory is not None and self._keeps_trajectories:
             write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
-        self.location.confirm({f"{DATA}/{key}": one.length for key, one in store.sums.items()})
+        for key, content in episode.pictures.items():
+            self.location.write(key, content)
+        pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
+        written = {**{f"{DATA}/{key}": one for key, one in store.sums.items()}, **pictures}
+        self.location.confirm({key: one.length for key, one in written.items()})
         commit = {
             "run": self.root.identity,
             "episode": planned.index,
@@ -172,6 +177,7 @@ class RunWriter:
             "provenance": name_of(self.provenance),
             **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
             "objects": {key: one.to_json() for key, one in store.sums.items()},
+            "pictures": {key: one.to_json() for key, one in pictures.items()},
         }
         write_commit(self.location, planned.index, commit)
 
