@@ -26,7 +26,7 @@ from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
 from probe_kit.extract.play.stage import Ending, Stage
 from probe_kit.extract.store.layout import COMMITS, StoredStream
 from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.thumbnails import write_thumbnail
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.generators import GENERATORS
@@ -121,8 +121,7 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
         for number in remaining:
             planned = plan.episodes[number]
             record, one = episode(planned, played, planned.episode.item.category in known)
-            write_thumbnail(location, number, one.ends)
-            writer.write(record)
+            writer.write(replace(record, pictures={thumbnail_key(number): as_thumbnail(one.ends)}))
         say(f"written: {len(remaining)} episodes, {time.process_time() - began:.0f} CPU-s")
         began = time.process_time()
         seal(folder / "run")
