@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.errors import MissingExtraError, UsageError
+from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.settings import AskSettings, RunSettings, refuse_other_settings
 from probe_kit.extract.store.layout import RUN_FILE
 from probe_kit.identity import canonical_json
@@ -50,7 +50,8 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     """Refuse a place that cannot be written, or where a run with other settings lies.
 
     Only settings that are known without the model are compared; the writer compares all of them.
-    Raises UsageError, SettingsMismatchError, or RunDamagedError if what lies there was changed.
+    Raises UsageError, DiskSpaceError for a read-only disk, SettingsMismatchError, or RunDamagedError if what lies
+    there was changed.
     """
     from probe_kit.extract.store.root import read_root
 
@@ -83,5 +84,7 @@ def _check_writable(location: "Location") -> None:
     there = next(folder for folder in (place, *place.parents) if folder.exists())
     if not there.is_dir():
         raise UsageError(f"{location} cannot be used: {there} is no folder. Give another path")
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        raise DiskSpaceError(f"{location} cannot be used: the disk of {there} is read-only. Choose another --out")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UsageError(f"{location} cannot be used: {there} cannot be written. Give another path")
