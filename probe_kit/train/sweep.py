@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.errors import NoProbesError, UnknownCategoryError, UsageError
+from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.notebook import notebook_progress
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.add_controls import add_baselines, add_twin, check_twin, prepare_baselines
@@ -71,12 +71,14 @@ def train_probes(
     The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
     interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
     stored before all of it is fitted: where this raises, `load_results` finds what it found before.
-    Raises NoProbesError for a run without activations, UnknownCategoryError, UnknownSiteError for a view no
-    stream has, TooFewGroupsError, UnbalancedEpisodesError, ProbeNotConvergedError, UsageError, and SuiteError for
-    another suite.
+    Raises RunIncompleteError for a run without episodes, NoProbesError for one without activations,
+    UnknownCategoryError, UnknownSiteError for a view no stream has, TooFewGroupsError, UnbalancedEpisodesError,
+    ProbeNotConvergedError, UsageError, and SuiteError for another suite.
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
     crew = CrewSettings(jobs, device, ray)
+    if len(run.episodes) == 0:
+        raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
     run = at_call(run, call)
     asked = _settings(
         run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call

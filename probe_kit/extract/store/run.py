@@ -52,6 +52,10 @@ if TYPE_CHECKING:
     from probe_kit.env.trajectory import Trajectory
 
 
+_OUTCOME = ("outcome", "side_placed")
+"""What every outcome says, and so a table of no episodes too."""
+
+
 class NotSealedWarning(UserWarning):
     """A column was read from rows, which gives the same numbers slowly."""
 
@@ -253,10 +257,10 @@ class Run:
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
-        """One row per committed episode: the plan's columns, then the outcome's, if there is one."""
+        """One row per committed episode: the plan's columns, then the outcome's."""
         plan = self.root.planned
         rows = [{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers]
-        return pd.DataFrame(rows or None, columns=None if rows else list(self.root.plan[0]))
+        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME])
 
     # -- trajectories ----------------------------------------------------------------------------------
 
