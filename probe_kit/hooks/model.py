@@ -148,10 +148,15 @@ class Model(ABC):
     def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """As `roles`, and those of the memory's tokens."""
         roles = self.roles(seen)
-        backbone = first_of("backbone", self.streams.values())
-        if self.memory is not None and backbone is not None:
-            roles[self.memory.name] = roles[backbone]
+        if self.memory is not None:
+            roles[self.memory.name] = roles[self.tokens_of(self.memory.name)]
         return roles
+
+    def tokens_of(self, stream: str) -> str:
+        """The stored stream whose tokens a stream has: the backbone for the memory, else itself."""
+        if self.memory is None or stream != self.memory.name:
+            return stream
+        return first_of("backbone", self.streams.values()) or stream
 
     def stream_of(self, site: Site) -> Stream:
         """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""

@@ -13,6 +13,7 @@ QUANTITIES = ("residual", "attention", "mlp", "final_norm")
 """What the streams of today's families have; a family may declare others."""
 MEMORY = ("keys", "values")
 """What a memory has, per block and token: all heads side by side, as attention reads them, keys after rotation."""
+MEMORY_STREAM = "memory"
 
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
@@ -120,7 +121,7 @@ class Stream:
 
 def memory_stream(blocks: int, width: int) -> Stream:
     """The memory of a backbone of so many blocks; width: heads times size of a head."""
-    return Stream("memory", blocks + 1, width, part="bridge", label="memory of the prompt", quantities=MEMORY)
+    return Stream(MEMORY_STREAM, blocks + 1, width, part="bridge", label="memory of the prompt", quantities=MEMORY)
 
 
 def part_of(stream: str) -> Part:

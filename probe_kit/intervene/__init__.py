@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from probe_kit.intervene.interchange import Interchange
     from probe_kit.intervene.intervening import intervene_on
     from probe_kit.intervene.passing import Passing, stored_passing
+    from probe_kit.intervene.sensitivity import Sensitivity
     from probe_kit.intervene.steer import Steer
     from probe_kit.intervene.stored import Answers, stored_interventions
     from probe_kit.intervene.verdict import Judgement, Verdict, judge, judgements
+    from probe_kit.intervene.words import Words
 
 __all__ = [
     "Answers",
@@ -28,9 +30,11 @@ __all__ = [
     "Interchange",
     "Judgement",
     "Passing",
+    "Sensitivity",
     "Source",
     "Steer",
     "Verdict",
+    "Words",
     "intervene_on",
     "judge",
     "judgements",
@@ -44,6 +48,8 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
+        "Sensitivity": "sensitivity",
+        "Words": "words",
         "stored_passing": "passing",
         "Passing": "passing",
         "Steer": "steer",

@@ -26,6 +26,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hooks.foreign_code import acting
 from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
+from probe_kit.suite.asked_both_ways import twins_of
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.train.baselines import embedded_suite_of, suite_of
 
@@ -75,11 +76,14 @@ class Question:
 
 
 class Bench:
-    """A policy and a scene; a context manager, because it holds a simulator."""
+    """A policy and a scene; a context manager, because it holds a simulator.
+
+    items: of the run's suite, by id. twins: of those that have one, see `twins_of`.
+    """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
-        self._items = items
+        self.items, self.twins = items, twins_of(items.values())
         self._stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
@@ -101,7 +105,7 @@ class Bench:
         found = []
         for row in rows:
             record = episodes.iloc[int(row)]
-            item = replace(self._items[item_id], instruction=str(record["instruction"]))
+            item = replace(self.items[item_id], instruction=str(record["instruction"]))
             for layout in LAYOUTS:
                 if layout not in frames:
                     frames[layout] = self._look(item, layout, int(record["scene_seed"]))

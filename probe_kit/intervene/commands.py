@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.conditions import Intervention
     from probe_kit.intervene.effects import Effects
 
-KINDS = ("follow", "interchange", "steer")
+KINDS = ("follow", "words", "interchange", "steer")
 INSIDE = "Inside the network (interchange, steer)"
 _FORMATS = ("table", "json", "csv")
 
@@ -22,7 +22,8 @@ def intervene(
     kind: Annotated[
         str,
         typer.Option(
-            help="follow: with the two pictures exchanged, does the action change sides? interchange: where "
+            help="follow: with the two pictures exchanged, does the action change sides? words: before the "
+            "same pictures, asked for the other one? interchange: where "
             "inside does that pass? steer: a direction added, beside matched controls."
         ),
     ] = "follow",
@@ -31,7 +32,7 @@ def intervene(
     sites: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4; default backbone.*.",
+            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4, memory.*; default backbone.*.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
@@ -93,6 +94,7 @@ def intervene(
     from probe_kit.extract import open_run
     from probe_kit.hooks.options import read_pairs
     from probe_kit.intervene import Source, intervene_on
+    from probe_kit.intervene.intervening import refuse_unsupported
     from probe_kit.intervene.settings import refuse_unfit
 
     if kind not in KINDS:
@@ -108,6 +110,7 @@ def intervene(
          "seed": seed or None},
     )  # fmt: skip
     refuse_unfit(opened)
+    refuse_unsupported(opened, asked)
     asked.chosen(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
     source = Source(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
@@ -119,6 +122,7 @@ def intervene(
 
 _OPTIONS = {
     "follow": (),
+    "words": (),
     "interchange": ("sites", "roles", "direction", "controls", "seed"),
     "steer": ("sites", "roles", "direction", "controls", "doses", "toward", "seed"),
 }
@@ -126,15 +130,15 @@ _OPTIONS = {
 
 def _asked(kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
     """What was asked. Raises UsageError for an option that this kind does not have."""
-    from probe_kit.intervene import Follow, Interchange, Steer
+    from probe_kit.intervene import Follow, Interchange, Steer, Words
 
     given = {name: value for name, value in inside.items() if value is not None}
     if meaningless := [name for name in given if name not in _OPTIONS[kind]]:
         raise UsageError(
             f"--{meaningless[0]} means nothing to --kind {kind}; leave it out, or choose another kind"
         )
-    if kind == "follow":
-        return Follow(**common)
+    if kind in ("follow", "words"):
+        return Words(**common) if kind == "words" else Follow(**common)
     if kind == "interchange":
         controls = given.pop("controls", 5 if "direction" in given else 0)
         return Interchange(**common, **given, controls=controls)

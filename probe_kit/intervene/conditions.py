@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.intervene.bench import Bench, Chunk, Question
 from probe_kit.intervene.patching import LEDGER, Ledger
 from probe_kit.intervene.settings import Asked
@@ -47,6 +48,16 @@ class Condition(Protocol):
 
 class Intervention(Asked, ABC):
     """What is asked, and the conditions that answer it."""
+
+    @property
+    def needs(self) -> tuple[InterventionKind, ...]:
+        """What of the interventions a family must support for it."""
+        return ("edit",)
+
+    def playable(self, bench: Bench, items: Sequence[str]) -> list[str]:
+        """Those of the items' ids that it can be asked of; the others are passed over, and counted."""
+        del bench
+        return list(items)
 
     @abstractmethod
     def conditions(self, bench: Bench) -> Sequence[Condition]:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.following import Following, following, following_frame, stored_following
 from probe_kit.intervene.passing import Passing, passing, passing_frame, stored_places
-from probe_kit.intervene.stored import EXCHANGED, Answers, Stored, find_stored
+from probe_kit.intervene.sensitivity import sensitivity
+from probe_kit.intervene.stored import EXCHANGED, NOISE, PICTURES, Answers, Stored, find_stored
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from probe_kit.fitting_tables import FittingTable
 
 
-FOLLOW = "follow"
+FOLLOW, WORDS = "follow", "words"
 LARGE = 2.0
 """Token norms beyond which a dose is said to be large."""
 
@@ -52,12 +53,14 @@ class Effects:
 
     @property
     def changes(self) -> list[Passing]:
-        """What changes inside the network did, one per category and change; empty for `follow`."""
+        """What changes inside the network did, one per category and change; empty for `follow` and `words`."""
         return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
 
     @property
     def table(self) -> "pd.DataFrame":
         """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`."""
+        if self.kind == WORDS:
+            return words_frame(self.answers, self.suite, self.key)
         if self.kind != FOLLOW:
             return passing_frame(self.changes)
         frame = following_frame(self.rows)
@@ -69,7 +72,20 @@ class Effects:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader must know, a sentence each."""
-        return (*self._replayed(), *self._large_doses())
+        return (*self._replayed(), *self._passed_over(), *self._one_step(), *self._large_doses())
+
+    def _passed_over(self) -> list[str]:
+        counts = self.certificate.get("items", {"asked": 0, "played": 0})
+        left_out = counts["asked"] - counts["played"]
+        return [f"{left_out} of {counts['asked']} items have no twin and were passed over."] if left_out else []
+
+    def _one_step(self) -> list[str]:
+        if self.certificate.get("supported", {}).get("readout") != "shadow":
+            return []
+        return [
+            "This family's inference is one action in greedy bins: what the first one does says little of where "
+            "the hand will go, and small effects stay within a bin."
+        ]
 
     def _large_doses(self) -> list[str]:
         large = {row.name: row.norm_ratio for row in self.changes if row.dose and row.norm_ratio > LARGE}
@@ -108,8 +124,10 @@ class Effects:
 
     def to_rich(self) -> "FittingTable":
         """The table for a console."""
-        from probe_kit.intervene.tables import following_table, passing_table
+        from probe_kit.intervene.tables import following_table, passing_table, words_table
 
+        if self.kind == WORDS:
+            return words_table(self.rows, sensitivity(self.answers), self.label, self.suite, self.random_weights)
         if self.kind != FOLLOW:
             return passing_table(self.changes, self.kind, self.label, self.suite, self.random_weights)
         return following_table(self.rows, self.verdicts, self.label, self.suite, self.random_weights)
@@ -149,5 +167,15 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
 def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED) -> str:
     """As stored beside the answers, without verdicts, which later probes may change."""
     changes = passing(answers, suite, toward)
+    if {PICTURES, NOISE} <= set(answers.conditions):
+        return words_frame(answers, suite).drop(columns="key").to_csv(index=False)
     frame = passing_frame(changes) if changes else following_frame(following(answers, suite))
     return frame.drop(columns="key").to_csv(index=False)
+
+
+def words_frame(answers: Answers, suite: str, key: str = "") -> "pd.DataFrame":
+    """One line per category: the fields of `Following`, of exchanged words, and of `Sensitivity`."""
+    frame = following_frame(following(answers, suite, key))
+    for name in ("words", "pictures", "noise", "words_changed", "pictures_changed"):
+        frame[name] = [getattr(row, name) for row in sensitivity(answers)]
+    return frame

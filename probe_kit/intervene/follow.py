@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain
 
@@ -15,6 +16,11 @@ class Follow(Intervention):
     def kind(self) -> str:
         """`follow`."""
         return "follow"
+
+    @property
+    def needs(self) -> tuple[InterventionKind, ...]:
+        """Two inferences that can be compared."""
+        return ("follow",)
 
     def conditions(self, bench: Bench) -> Sequence[Condition]:
         """As the run made it, and exchanged."""

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.interventions import InterventionKind
+from probe_kit.hooks.sites import MEMORY_STREAM, Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
 from probe_kit.intervene.directions import Axes, axes_of
@@ -51,6 +52,12 @@ class Interchange(Intervention):
     def kind(self) -> str:
         """`interchange`."""
         return "interchange"
+
+    @property
+    def needs(self) -> tuple[InterventionKind, ...]:
+        """Edits; and a memory, where one of its places is."""
+        memory = any(pattern.partition(".")[0] == MEMORY_STREAM for pattern in self.sites)
+        return ("edit", "memory") if memory else ("edit",)
 
     def own_settings(self) -> dict[str, Any]:
         """Where, which tokens and along what."""

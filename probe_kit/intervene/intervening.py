@@ -9,6 +9,7 @@ from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
+from probe_kit.hooks.registry import known_families
 from probe_kit.intervene.bench import Bench, Source, open_bench
 from probe_kit.intervene.conditions import Condition, Intervention, Replayed, replay
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
@@ -49,6 +50,7 @@ def intervene_on(
     """
     asked = asked or Follow()
     refuse_unfit(run)
+    refuse_unsupported(run, asked)
     settings = settings_of(asked, run)
     key = key_of(settings)
     if not is_stored(run.location, key):
@@ -66,20 +68,30 @@ def _carry_out(
     progress: Progress | None,
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
-    items = items_of(run, asked)
+    wanted = items_of(run, asked)
     with open_bench(run, source, load) as bench, bench.ready():
+        items = asked.playable(bench, wanted)
         conditions = asked.conditions(bench)
         parts = _replayed(bench, items, conditions, pieces, progress or notebook_progress("items replayed"))
         certificate = {
             "policy": bench.policy.card.to_json(),
             "provenance": _provenance(bench),
             "replay": _replay_check(parts),
+            "items": {"asked": len(wanted), "played": len(items)},
+            "supported": bench.policy.interventions.to_json(),
             "edits": _ledgers(conditions, parts),
         }
     answers = _answers(run, [condition.name for condition in conditions], parts)
     effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)))
     save(run.location, settings, key, answers, effects, certificate)
     pieces.discard()
+
+
+def refuse_unsupported(run: Run, asked: Intervention) -> None:
+    """Raise UnsupportedInterventionError, before anything is loaded, for what the run's family does not do."""
+    if (family := known_families().get(run.model)) is not None:
+        for kind in asked.needs:
+            family.check_intervention(kind)
 
 
 def items_of(run: Run, asked: Intervention) -> list[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.following import following
 from probe_kit.intervene.patching import LEDGER
-from probe_kit.intervene.stored import EXCHANGED, PLAIN, Answers, stored_interventions
+from probe_kit.intervene.stored import EXCHANGED, PLAIN, UNCHANGED, Answers, stored_interventions
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -128,7 +128,7 @@ def pushed_to(answers: Answers, toward: str) -> NDArray[np.float64]:
 
 def _of_category(answers: Answers, category: str, suite: str, toward: str, key: str) -> list[Passing]:
     push, plain = pushed_to(answers, toward), answers.of(PLAIN)
-    rows = [row for row, name in enumerate(answers.conditions) if name not in (PLAIN, EXCHANGED)]
+    rows = [row for row, name in enumerate(answers.conditions) if name not in UNCHANGED]
     if not rows:
         return []
     names = [Named.of(answers.conditions[row]) for row in rows]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError
 from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.sites import MEMORY, MEMORY_STREAM, Site
+from probe_kit.hooks.views import plays
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy, Stream
@@ -47,16 +48,21 @@ def places(pattern: str, policy: "Policy") -> list[Place]:
     """The places that a pattern names.
 
     `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
-    changed at each of them; `expert.03` over all. Raises UnknownSiteError.
+    changed at each of them; `expert.03` over all; `memory.02` what block 2 hands over to what acts, keys and
+    values together. Raises UnknownSiteError, and UnsupportedInterventionError for the memory of a family that has
+    none.
     """
-    match, streams = _PATTERN.fullmatch(pattern), {**policy.streams, **policy.further_streams}
+    match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
+    if match is not None and match["stream"] == MEMORY_STREAM:
+        policy.interventions.check("memory", policy.card.family)
     if match is None or match["stream"] not in streams:
         raise UnknownSiteError(
             f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02 or expert.03@0-4, "
             f"of the streams {', '.join(streams)}"
         )
     stream = streams[match["stream"]]
-    layers = range(stream.layers) if match["layer"] == "*" else [int(match["layer"])]
+    every = range(stream.layers if stream is not policy.memory else stream.layers - 1)
+    layers = every if match["layer"] == "*" else [int(match["layer"])]
     return [_place(stream, layer, match["first"], match["last"]) for layer in layers]
 
 
@@ -64,13 +70,16 @@ def _place(stream: "Stream", layer: int, first: str | None, last: str | None) ->
     name = f"{stream.name}.{layer:02d}"
     if first is not None:
         name += f"@{first}" if last is None else f"@{first}-{last}"
+    quantities = MEMORY if stream.name == MEMORY_STREAM else ("residual",)
     low, high = int(first or 0), int(last or first or 0)
     sites = tuple(
         site
-        for site in stream.sites()
+        for quantity in quantities
+        for site in stream.sites(quantity)
         if site.layer == layer and (first is None or low <= (site.iteration or 0) <= high)
     )
     expected = 1 if stream.iterations is None else stream.iterations if first is None else high - low + 1
+    expected *= len(quantities)
     if len(sites) != expected or (stream.iterations is None and first is not None):
         there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
         raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
@@ -79,7 +88,7 @@ def _place(stream: "Stream", layer: int, first: str | None, last: str | None) ->
 
 def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> NDArray[np.bool_]:
     """(T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
-    roles = policy.roles([seen])[stream][0]
+    roles = policy.token_roles([seen])[stream][0]
     mask = roles.valid if role == ALL else roles.mask(role)
     if not mask.any():
         there = ", ".join(dict.fromkeys(span.role for span in roles.spans))
@@ -89,9 +98,5 @@ def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> N
 
 def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
     """Those of the wanted roles that tokens of a stream play, `all` included."""
-    return [
-        role
-        for role in wanted
-        if role == ALL
-        or any(name == role or name.startswith(f"{role}.") for name in policy.role_names.get(stream, ()))
-    ]
+    named = policy.role_names.get(policy.tokens_of(stream), ())
+    return [role for role in wanted if role == ALL or any(plays(name, role) for name in named)]

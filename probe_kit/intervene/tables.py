@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.intervene.following import WORTH, Following
 from probe_kit.intervene.passing import Passing
+from probe_kit.intervene.sensitivity import Sensitivity
 from probe_kit.intervene.verdict import Judgement
 
 if TYPE_CHECKING:
@@ -45,6 +46,49 @@ def following_table(
             ),
         ),
     )
+
+
+_WORDS_LEGEND = (
+    "follows: goes to the correct picture, and to the other one once it is asked for that, with the same "
+    "pictures, state and noise; one step: median distance across between where the two actions "
+    "bring the hand, and in how many episodes any number changed; with the noise drawn anew for comparison"
+)
+
+
+def words_table(
+    rows: Sequence[Following], steps: Sequence[Sensitivity], label: str, suite: str, random_weights: bool
+) -> "FittingTable":
+    """One line per category."""
+    from probe_kit.fitting_tables import Cell, FittingTable, Part
+
+    return FittingTable(
+        title=f"Is the question read? {f'{label} (random weights)' if random_weights else label} on {suite}",
+        caption=_WORDS_LEGEND,
+        name="category",
+        names=tuple(row.category for row in rows),
+        styles=("",) * len(rows),
+        parts=(
+            Part(
+                "Does the action follow the words?",
+                ("follows %", "against %", "net [95 %]", "p", "median shift cm", "n (items)"),
+                tuple(_cells(row) for row in rows),
+            ),
+            Part(
+                "What one step owes to",
+                ("words cm", "pictures cm", "noise cm", "words change it %", "pictures change it %"),
+                tuple(
+                    tuple(
+                        Cell(f"{100 * value:.{digits}f}")
+                        for value, digits in (
+                            (own.words, 2), (own.pictures, 2), (own.noise, 2), (own.words_changed, 1),
+                            (own.pictures_changed, 1),
+                        )
+                    )
+                    for own in steps
+                ),
+            ),
+        ),
+    )  # fmt: skip
 
 
 def _cells(row: Following) -> "tuple[Cell, ...]":
