@@ -3,47 +3,40 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError
-from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.statistics.folds import Fold
 from probe_kit.train.arrays import to_numpy
 from probe_kit.train.features import Coordinates
+from probe_kit.train.joint_probe import can_be_joint, cross_validate_jointly
+from probe_kit.train.joint_site import JointSite
+from probe_kit.train.nested import (
+    INNER_FOLDS,
+    OUTER_FOLDS,
+    STRENGTHS,
+    FittedFold,
+    Matrix,
+    NestedFold,
+    least_loss,
+    nested_folds,
+)
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness, log_loss
 from probe_kit.train.solver import LogisticSolver
 
-Matrix = NDArray[np.float64]
-
-STRENGTHS: Matrix = np.array([1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
-OUTER_FOLDS = 5
-INNER_FOLDS = 4
-
-
-@dataclass(frozen=True)
-class NestedFold:
-    """An outer fold, and the inner folds that divide its training side to choose C."""
-
-    outer: Fold
-    inner: list[Fold]
-
-
-def nested_folds(labels: NDArray[np.bool_], groups: ArrayLike, seed: int) -> list[NestedFold]:
-    """Outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
-
-    labels, groups: (E,). Raises TooFewGroupsError.
-    """
-    group_of = np.asarray(groups)
-    return [
-        NestedFold(
-            outer,
-            [
-                Fold(outer.train[inner.train], outer.train[inner.test])
-                for inner in grouped_folds(labels[outer.train], group_of[outer.train], INNER_FOLDS, seed)
-            ],
-        )
-        for outer in grouped_folds(labels, groups, OUTER_FOLDS, seed)
-    ]
+__all__ = [
+    "INNER_FOLDS",
+    "OUTER_FOLDS",
+    "STRENGTHS",
+    "FittedFold",
+    "NestedFold",
+    "SiteProbe",
+    "cross_validate",
+    "nested_folds",
+    "probe_site",
+    "refuse_non_finite",
+]
 
 
 @dataclass(frozen=True)
@@ -99,27 +92,14 @@ def refuse_non_finite(samples: Samples) -> None:
         )
 
 
-@dataclass(frozen=True)
-class FittedFold:
-    """The probes of one outer fold.
-
-    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column.
-    weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
-    training samples along them.
-    """
-
-    decisions: Matrix
-    strengths: Matrix
-    weights: Matrix
-    intercept: float
-    spread: float
-
-
 def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
     """The probes of every outer fold, each column of (E, K) labels on its own.
 
-    Raises ProbeNotConvergedError.
+    Many tokens per feature are solved for all training sets together, where these have the same features.
+    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
     """
+    if can_be_joint(samples) and (site := JointSite.of(samples, folds)).alike:
+        return cross_validate_jointly(site, samples, labels, folds)
     return [_fit_fold(samples, labels, f.outer, choose_strengths(samples, labels, f.inner)) for f in folds]
 
 
@@ -133,7 +113,7 @@ def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fo
         solver = LogisticSolver(coordinates.train)
         for step, weights in enumerate(solver.path(train.repeat(labels[fold.train]), STRENGTHS)):
             loss[step] += log_loss(to_numpy(held_out @ weights), truth) * fold.test.size
-    chosen: Matrix = STRENGTHS[loss.round(9).argmin(axis=0)]  # rounded, so that equal losses are ties
+    chosen: Matrix = STRENGTHS[least_loss(loss)]
     return chosen
 
 

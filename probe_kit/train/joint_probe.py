@@ -1,0 +1,136 @@
+"""Nested cross-validation of a site with many samples: all training sets and relabellings in shared products."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import TooFewGroupsError
+from probe_kit.train.arrays import Array, namespace, to_numpy
+from probe_kit.train.joint_problems import JointProblems
+from probe_kit.train.joint_site import JointSite
+from probe_kit.train.mixed import solve
+from probe_kit.train.nested import STRENGTHS, FittedFold, Matrix, NestedFold, least_loss
+from probe_kit.train.samples import Samples
+from probe_kit.train.scores import log_loss
+
+COLUMN_MEMORY = 2**29
+"""Bytes that problems solved at once may take, beyond the samples and what is made of them once."""
+
+SAMPLES_PER_FEATURE = 3
+"""With fewer samples than this per feature, training sets differ too much to share axes."""
+
+LEAST_WIDTH = 96
+"""Features below which the training sets' own axes cost next to nothing, and sharing products saves nothing."""
+
+
+def can_be_joint(samples: Samples) -> bool:
+    """Whether a site's tokens are so many, and so wide, that its training sets should be solved together.
+
+    Never those on a device: there it was not tried.
+    """
+    if samples.pools or not isinstance(samples.means, np.ndarray):
+        return False
+    count, width = samples.features.shape
+    return bool(width >= LEAST_WIDTH and count >= SAMPLES_PER_FEATURE * width)
+
+
+def cross_validate_jointly(
+    site: JointSite, samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold]
+) -> list[FittedFold]:
+    """The probes of every outer fold, each column of (E, P) labels on its own, as many at once as memory allows.
+
+    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
+    """
+    share = site.sets.member @ labels / site.sets.member.sum(axis=1)[:, None]
+    if ((share == 0) | (share == 1)).any():
+        raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
+    step = labels_at_once(site, folds)
+    parts = [
+        _Columns(site, samples, labels[:, first : first + step], folds).fitted()
+        for first in range(0, labels.shape[1], step)
+    ]
+    return [_joined(fold) for fold in zip(*parts, strict=True)]
+
+
+def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
+    """Columns of labels whose problems fit into COLUMN_MEMORY; at least one.
+
+    A problem takes three curvatures of every sample in float32 while a step is found, and some 16 rows of weights.
+    """
+    count, width = site.features.shape
+    problems = sum(len(fold.inner) for fold in folds)
+    return max(1, COLUMN_MEMORY // (problems * (12 * count + 128 * (width + 1))))
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Some columns of labels, (E, L), on all training sets of a site."""
+
+    site: JointSite
+    samples: Samples
+    labels: NDArray[np.bool_]
+    folds: Sequence[NestedFold]
+
+    def fitted(self) -> list[FittedFold]:
+        chosen, starts = self._chosen()  # (F, L), and weights by C, outer fold and column
+        count, columns = chosen.shape
+        decisions = np.empty((count, columns, len(self.samples.counts)))
+        first: dict[int, tuple[Matrix, float, float]] = {}
+        inner = len(self.site.sets.outer) - count
+        for strength in np.unique(chosen):
+            fold, column = np.nonzero(chosen == strength)
+            problems = self._problems(inner + fold, column)
+            weights = solve(problems, float(STRENGTHS[strength]), starts[strength][fold, column])
+            decisions[fold, column] = to_numpy(problems.decisions(weights, self.samples.means))
+            first |= _kept(problems, weights, fold, np.flatnonzero(column == 0))
+        return [
+            FittedFold(decisions[number][:, nested.outer.test].T, STRENGTHS[chosen[number]], *first[number])
+            for number, nested in enumerate(self.folds)
+        ]
+
+    def _chosen(self) -> tuple[NDArray[np.intp], list[Array]]:
+        """Position of the chosen C by outer fold and column, and where to start there: the inner folds' mean."""
+        sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
+        of_fold, columns = np.array([number for number, _ in sets]), self.labels.shape[1]
+        problems = self._problems(np.repeat(np.arange(len(sets)), columns), np.tile(np.arange(columns), len(sets)))
+        xp, width = namespace(self.site.mean), len(self.site.mean) + 1
+        weights = xp.zeros((len(problems), width), dtype=xp.float64, device=self.site.mean.device)
+        loss, starts = np.zeros((STRENGTHS.size, len(self.folds), columns)), []
+        for step, strength in enumerate(STRENGTHS):
+            weights = solve(problems, float(strength), weights)
+            decided = to_numpy(problems.decisions(weights, self.samples.means)).reshape(len(sets), columns, -1)
+            for (number, inner), found in zip(sets, decided, strict=True):
+                loss[step, number] += log_loss(found[:, inner.test].T, self.labels[inner.test]) * inner.test.size
+            by_set = weights.reshape(len(sets), columns, width)
+            starts.append(xp.stack([by_set[of_fold == n].mean(axis=0) for n in range(len(self.folds))]))
+        return least_loss(loss), starts
+
+    def _problems(self, sets: NDArray[np.intp], columns: NDArray[np.intp]) -> JointProblems:
+        signs = np.where(self.labels, 1, -1).astype(np.int8).T
+        return JointProblems(self.site, sets, signs[columns])
+
+
+def _kept(
+    problems: JointProblems, weights: Array, fold: NDArray[np.intp], some: NDArray[np.intp]
+) -> dict[int, tuple[Matrix, float, float]]:
+    """Raw weights, intercept and spread of `some` problems, by their outer fold."""
+    if not some.size:
+        return {}
+    chosen = JointProblems(problems.site, problems.set_of[some], problems.signs[some])
+    found = (*chosen.raw(weights[some]), chosen.deviations(weights[some]))
+    raw, intercepts, along = (to_numpy(part) for part in found)
+    length = np.linalg.norm(raw, axis=1)
+    spread = np.where(length > 0, along / np.where(length > 0, length, 1.0), 0.0)
+    return {
+        int(number): (raw[position], float(intercepts[position]), float(spread[position]))
+        for position, number in enumerate(fold[some])
+    }
+
+
+def _joined(parts: Sequence[FittedFold]) -> FittedFold:
+    """One outer fold's probes, found in parts of the columns."""
+    decisions = np.concatenate([part.decisions for part in parts], axis=1)
+    strengths = np.concatenate([part.strengths for part in parts])
+    return FittedFold(decisions, strengths, parts[0].weights, parts[0].intercept, parts[0].spread)
