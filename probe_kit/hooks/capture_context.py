@@ -148,8 +148,12 @@ class _Listener:
 
 
 def _refuse_non_finite(tape: Tape) -> None:
-    for site, kept in tape._kept.items():
-        if not torch.isfinite(kept).all():
+    """One question to the device for all sites, not one each: every answer waits for what it has in hand."""
+    finite = [torch.isfinite(kept).all() for kept in tape._kept.values()]
+    if not finite or bool(torch.stack([one.to(finite[0].device) for one in finite]).all()):
+        return
+    for site, good in zip(tape._kept, finite, strict=True):
+        if not good:
             raise NonFiniteActivationError(
                 f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
             )

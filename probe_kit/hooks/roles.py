@@ -1,6 +1,6 @@
 """Token roles: what each position of a stream is, and the pooled views made from them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -83,7 +83,19 @@ def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
     return _matrix(roles, tuple(views), tokens.device) @ tokens.float()
 
 
-@lru_cache(maxsize=256)
+def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.device | str) -> None:
+    """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
+
+    Raises EmptyRoleError and UnknownSiteError as `pool` does.
+    """
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is None:
+        place = torch.device("cuda", torch.cuda.current_device())  # as its tensors say
+    for own in roles:
+        _matrix(own, tuple(views), place)
+
+
+@lru_cache(maxsize=1024)
 def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tensor:
     """(V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
     weights = np.stack([_weights(roles, view) for view in views]).astype(np.float32)

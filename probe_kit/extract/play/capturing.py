@@ -50,8 +50,11 @@ class Capturer:
         inference. Raises CaptureChangedActionError as `_prove_harmless` does, and what `capture` raises.
         """
         from probe_kit.hooks import capture
+        from probe_kit.hooks.roles import prepare_pool
 
         views = {stream.name: stream.views for stream in self._streams}
+        for name, own_views in views.items():
+            prepare_pool(roles[name], own_views, self._model.card.device)
 
         def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
             return _pool_rows(activation, roles[site.stream], views[site.stream])

@@ -1,6 +1,7 @@
 """Staging: host memory in which an episode's activations wait for the writer."""
 
 from collections.abc import Sequence
+from functools import cache
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from probe_kit.extract.store.layout import StoredStream
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from probe_kit.hooks import Roles
@@ -54,23 +56,57 @@ class EpisodeBuffers:
         self._copy(values, self.pooled[stream][len(self.roles) - 1])
 
     def keep_tokens(self, stream: str, bits: "Tensor") -> None:
-        """Copy (*lead, T, D) int16 bit patterns of the last inference begun."""
+        """Copy (*lead, T, D) int16 bit patterns of the last inference begun; behind them come zeros.
+
+        The zeros are added on the device: a copy into part of a row goes through memory that is not locked, and
+        the model would wait for it.
+        """
+        from torch.nn.functional import pad
+
         row = self.tokens[stream][len(self.roles) - 1].view(np.int16)
-        self._copy(bits, row[..., : bits.shape[-2], :])
+        behind = row.shape[-2] - bits.shape[-2]
+        self._copy(pad(bits, (0, 0, 0, behind)) if behind else bits, row)
 
     def _copy(self, source: "Tensor", target: NDArray[Any]) -> None:
         import torch
 
-        torch.from_numpy(target).copy_(source.reshape(target.shape), non_blocking=True)
-        if source.is_cuda:
-            copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            copied.record(torch.cuda.current_stream(source.device))
-            self._copies.append(copied)
+        arrival = copy_aside(source.reshape(target.shape), torch.from_numpy(target))
+        if arrival is not None:
+            self._copies.append(arrival)
 
     def wait(self) -> None:
         """Return when every copy has arrived."""
         while self._copies:
             self._copies.pop().synchronize()
+
+
+def copy_aside(source: "Tensor", target: "Tensor") -> Any:
+    """Copy to host memory while the device goes on computing; gives the event of its arrival, None on a CPU.
+
+    target: contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its own,
+    which begins when the source is computed; the source's memory is not used again before the copy is through.
+    """
+    import torch
+
+    if not source.is_cuda:
+        target.copy_(source)
+        return None
+    stream = _side_stream(source.device)
+    stream.wait_stream(torch.cuda.current_stream(source.device))
+    with torch.cuda.stream(stream):
+        target.copy_(source, non_blocking=True)
+        arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        arrival.record(stream)
+    source.record_stream(stream)
+    return arrival
+
+
+@cache
+def _side_stream(device: "torch.device") -> "torch.cuda.Stream":
+    """One per device: copies of several episodes queue there, behind each other and beside the model."""
+    import torch
+
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[Any]:

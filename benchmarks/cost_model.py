@@ -1,0 +1,131 @@
+"""What the paper's whole study would take: a formula over measured inputs. An extrapolation, not a measurement.
+
+    python benchmarks/cost_model.py [--inference 0.3] [--cores 8] [--models 7] [--set simulate=0.9 ...]
+
+A worker has one GPU and some cores. Simulation, inference and writing overlap, so an episode takes as long as the
+slowest of them:
+
+    seconds per episode and worker = max(calls x inference, simulate / cores, raw bytes / (writing cores x write))
+    hours = models x episodes x that / GPUs + models x load x ceil(GPUs / models) / GPUs, at least one load
+    disk  = models x episodes x (token bytes / ratio + 2 x pooled bytes / pooled_ratio + beside); columns are the 2
+
+`--set` changes an input; every one is printed with where it comes from. Bytes of activations are exact: shapes of
+the families at their released sizes.
+"""
+
+import argparse
+from dataclasses import dataclass
+from math import ceil
+
+from probe_kit.extract.store.layout import StoredStream
+
+RESIDUAL = ("residual",)
+FAMILIES: dict[str, tuple[StoredStream, ...]] = {
+    "pi0": (
+        StoredStream("backbone", 19, 2048, None, 816, ("mean", "last", "mean:language", "mean:image"), None, "",
+                     RESIDUAL),
+        StoredStream("expert", 19, 1024, 10, 51, ("mean", "mean:action"), None, "", RESIDUAL),
+    ),
+    "openvla": (
+        StoredStream("backbone", 33, 4096, None, 290, ("mean", "last", "mean:language", "mean:image"), None, "",
+                     RESIDUAL),
+        StoredStream("action", 33, 4096, 7, 1, ("mean",), None, "", RESIDUAL),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Input:
+    """A number of the formula. source: where it was measured, or that it was not."""
+
+    value: float
+    unit: str
+    source: str
+
+
+INPUTS = {
+    "episodes": Input(3440, "per model", "the paper's suite: 1,720 questions in two layouts"),
+    "models": Input(
+        7, "checkpoints", "the paper's count is larger where co-trained twins are added; an assumption"
+    ),
+    "calls": Input(12, "inferences per episode", "60 actions, 5 executed per inference; families differ"),
+    "inference": Input(0.3, "s on a GPU", "NOT MEASURED here (no GPU): an assumption, pass your own"),
+    "simulate": Input(0.25, "CPU-s per episode", "benchmarks/env.py speed: 60 actions, a picture every fifth"),
+    "cores": Input(8, "per GPU, that simulate", "an assumption about the machine"),
+    "writing": Input(2, "cores per GPU, that write", "an assumption about the machine"),
+    "write": Input(181e6, "raw bytes per CPU-s", "benchmarks/extract.py, --codec zstd, synthetic activations"),
+    "ratio": Input(
+        1.23, "raw bytes / stored", "benchmarks/extract.py, synthetic; storage design: 1.5 on a network"
+    ),
+    "pooled_ratio": Input(1.08, "raw bytes / stored", "benchmarks/full_run.py, noise"),
+    "beside": Input(6400.0, "bytes per episode", "benchmarks/full_run.py: commit, frames, trajectory"),
+    "load": Input(60, "s to load a model", "NOT MEASURED here at full size: an assumption"),
+}
+
+
+def raw_bytes(family: str, tokens: bool) -> int:
+    """Of one episode with one captured inference."""
+    return sum(stream.raw_bytes(tokens) for stream in FAMILIES[family])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Of the whole study. per_worker: seconds per episode; bound: what sets them."""
+
+    per_worker: float
+    bound: str
+    hours: float
+    disk: float
+
+
+def estimate(inputs: dict[str, float], pooled: int, tokens: int, gpus: int) -> Estimate:
+    """The formula of this file's first words. pooled, tokens: bytes per episode."""
+    parts = {
+        "inference": inputs["calls"] * inputs["inference"],
+        "simulation": inputs["simulate"] / inputs["cores"],
+        "writing": (pooled + tokens) / (inputs["writing"] * inputs["write"]),
+    }
+    bound = max(parts, key=lambda name: parts[name])
+    episodes = inputs["models"] * inputs["episodes"]
+    loads = max(inputs["models"], gpus) * inputs["load"] / gpus
+    seconds = ceil(episodes / gpus) * parts[bound] + loads
+    stored = tokens / inputs["ratio"] + 2 * pooled / inputs["pooled_ratio"] + inputs["beside"]
+    return Estimate(parts[bound], bound, seconds / 3600, episodes * stored)
+
+
+def main() -> None:
+    """Print the inputs, then the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--set", nargs="*", default=[], metavar="INPUT=VALUE")
+    parser.add_argument("--gpus", type=int, nargs="*", default=[1, 8, 64])
+    options = parser.parse_args()
+    inputs = {name: one.value for name, one in INPUTS.items()}
+    for text in options.set:
+        name, _, value = text.partition("=")
+        if name not in inputs:
+            parser.error(f"{name!r} is no input; expected one of {', '.join(inputs)}")
+        inputs[name] = float(value)
+    for name, one in INPUTS.items():
+        source = one.source if inputs[name] == one.value else "given"
+        print(f"{name:10}{inputs[name]:>14,g}  {one.unit:26} {source}")
+    heads = ("family", "tokens", "GPUs", "MB raw / episode", "episodes / s", "hours", "disk TB", "bound by")
+    print("\n" + _line(*heads))
+    for family in FAMILIES:
+        for tokens in (False, True):
+            raw, pooled = raw_bytes(family, tokens), raw_bytes(family, False)
+            for gpus in options.gpus:
+                found = estimate(inputs, pooled, raw - pooled, gpus)
+                rate, hours = f"{gpus / found.per_worker:.2f}", f"{found.hours:.1f}"
+                kept, disk = "all" if tokens else "pooled", f"{found.disk / 1e12:.2f}"
+                print(_line(family, kept, str(gpus), f"{raw / 1e6:.1f}", rate, hours, disk, found.bound))
+
+
+def _line(*cells: str) -> str:
+    widths = (-8, -7, 5, 17, 13, 7, 8, -12)
+    return " ".join(
+        f"{cell:{'<' if width < 0 else '>'}{abs(width)}}" for cell, width in zip(cells, widths, strict=True)
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""What a crew on Ray does when nodes are lost or full, against a stand-in for Ray that decides who lives.
+
+That real actors and nodes behave as the stand-in does is what `tests/extract/test_ray.py` tests (slow).
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import UnknownModelError, WorkerDiedError
+from probe_kit.extract.crews import ray as crew
+from probe_kit.extract.crews.ray import ClusterFullWarning, run_on_ray
+from probe_kit.extract.crews.scheduler import Scheduler
+from probe_kit.extract.play.events import Done, Event
+
+EPISODES = 40
+
+
+class ActorDiedError(Exception):
+    """As Ray raises it."""
+
+
+@dataclass(eq=False)
+class Actor:
+    """One that runs where there is room; its calls are answered in order."""
+
+    cluster: "Cluster"
+    running: bool = False
+    dead: bool = False
+
+    def call(self, name: str, *arguments: Any) -> "Call":
+        made = Call(self, name, arguments)
+        self.cluster.calls.append(made)
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        return SimpleNamespace(remote=lambda *arguments: self.call(name, *arguments))
+
+
+@dataclass(eq=False)
+class Call:
+    actor: Actor
+    name: str
+    arguments: tuple[Any, ...]
+
+
+@dataclass
+class Cluster:
+    """room: actors that can run at a time. dies: told each call that is due, whether its actor dies with it."""
+
+    room: int
+    dies: Callable[["Cluster", Call], bool]
+    begins_with: Any = None
+    actors: list[Actor] = field(default_factory=list)
+    calls: list[Call] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
+    waited_in_vain: int = 0
+    exceptions: Any = field(
+        default_factory=lambda: SimpleNamespace(RayActorError=ActorDiedError, ObjectLostError=ActorDiedError)
+    )
+
+    def remote(self, **options: Any) -> Callable[[type], Any]:
+        self.options = options
+        return lambda _kind: SimpleNamespace(remote=self._start)
+
+    def _start(self, *_: Any) -> Actor:
+        self.actors.append(Actor(self))
+        self._fill()
+        return self.actors[-1]
+
+    def _fill(self) -> None:
+        for actor in self.actors:
+            if not actor.running and not actor.dead and sum(one.running for one in self.actors) < self.room:
+                actor.running = True
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": self.room}
+
+    def available_resources(self) -> dict[str, float]:
+        return {}
+
+    def wait(self, refs: list[Call], num_returns: int, timeout: float) -> tuple[list[Call], list[Call]]:
+        assert num_returns == 1
+        assert timeout > 0, "a wait without end says nothing"
+        for ref in refs:
+            if ref.actor.running or ref.actor.dead:
+                return [ref], [one for one in refs if one is not ref]
+        self.waited_in_vain += 1
+        assert self.waited_in_vain < 5, "it waits for what never comes"
+        self.room += 1  # a node joins
+        self._fill()
+        return [], refs
+
+    def get(self, ref: Call) -> Any:
+        if not ref.actor.dead and self.dies(self, ref):
+            self.kill(ref.actor)
+        if ref.actor.dead:
+            raise ActorDiedError(f"in {ref.name}")
+        return self.begins_with if ref.name == "begin" else [Done(n, {"outcome": "oob"}) for n in ref.arguments[0]]
+
+    def kill(self, actor: Actor) -> None:
+        actor.running, actor.dead = False, True
+        self._fill()
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Scheduler, list[Event]]]:
+    def play(cluster: Cluster, workers: int) -> tuple[Scheduler, list[Event]]:
+        @contextmanager
+        def connected(_address: str, log_to_driver: bool) -> Iterator[Cluster]:
+            assert log_to_driver
+            yield cluster
+
+        monkeypatch.setattr(crew, "ray_cluster", connected)
+        scheduler, heard = Scheduler(range(EPISODES)), list[Event]()
+        settings: Any = SimpleNamespace(workers=workers, ray="a cluster", device="cpu")
+        run_on_ray(settings, str(tmp_path), scheduler, heard.append)
+        assert all(actor.dead for actor in cluster.actors), "none outlives the extraction"
+        return scheduler, heard
+
+    return play
+
+
+def test_a_lost_node_whose_worker_finds_no_room_again_holds_nobody_up(run: Any) -> None:
+    def dies(cluster: Cluster, call: Call) -> bool:
+        lost = call.name == "play" and cluster.room == 2
+        cluster.room -= lost
+        return lost
+
+    cluster = Cluster(2, dies)
+    scheduler, heard = run(cluster, 2)
+    assert scheduler.done == set(range(EPISODES))
+    assert not scheduler.given_up
+    assert sorted(event.number for event in heard if isinstance(event, Done)) == list(range(EPISODES))
+    assert len(cluster.actors) == 3
+    played = {call.actor for call in cluster.calls if call.name == "play"}
+    assert len(played) == 2, "the third never ran, and was given nothing to play"
+
+
+def test_workers_are_spread_and_hold_a_core(run: Any) -> None:
+    cluster = Cluster(2, lambda _cluster, _call: False)
+    run(cluster, 4)
+    assert (cluster.options["num_cpus"], cluster.options["scheduling_strategy"]) == (1, "SPREAD")
+    assert {call.actor.running for call in cluster.calls} == {False}
+
+
+def test_workers_that_die_before_they_begin_end_the_extraction(run: Any) -> None:
+    with pytest.raises(WorkerDiedError, match="3 workers in a row died on the Ray cluster"):
+        run(Cluster(2, lambda _cluster, call: call.name == "begin"), 2)
+
+
+def test_what_is_wrong_with_the_run_is_raised_as_it_is(run: Any) -> None:
+    with pytest.raises(UnknownModelError, match="nothing there"):
+        run(Cluster(2, lambda _cluster, _call: False, begins_with=UnknownModelError("nothing there")), 2)
+
+
+def test_a_cluster_without_room_is_not_waited_for_in_silence(run: Any) -> None:
+    cluster = Cluster(0, lambda _cluster, _call: False)
+    with pytest.warns(ClusterFullWarning, match="each needs a core, and the cluster has 0 cores"):
+        scheduler, _ = run(cluster, 2)
+    assert scheduler.done == set(range(EPISODES))
+
+
+def test_an_episode_that_kills_two_workers_is_given_up(run: Any) -> None:
+    cluster = Cluster(2, lambda _cluster, call: call.name == "play" and 7 in call.arguments[0])
+    scheduler, _ = run(cluster, 2)
+    assert set(scheduler.given_up) == {7}
+    assert scheduler.done == set(range(EPISODES)) - {7}
