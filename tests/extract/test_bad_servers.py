@@ -233,8 +233,9 @@ def test_who_reads_while_another_writes_sees_whole_episodes_only(
     little_writer(locate(run), little_plan(suite, episodes=EPISODES))
     writing = Thread(target=write, args=(run, suite), daemon=True)
     writing.start()
-    seen = set[int]()
-    while writing.is_alive() or EPISODES not in seen:
+    seen, alive = set[int](), True
+    while alive:
+        alive = writing.is_alive()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotSealedWarning)
             opened = open_run(run, allow_partial=True)
@@ -244,7 +245,7 @@ def test_who_reads_while_another_writes_sees_whole_episodes_only(
         for row, number in enumerate(opened.episodes["episode"]):
             np.testing.assert_array_equal(opened.rows("expert", "tokens")[row], expected[number])
         assert verify_run(run, deep=True).problems == ()
-    writing.join()
+    assert EPISODES in seen
     assert objects(run) == whole
 
 
