@@ -25,8 +25,8 @@ def demo(
 ) -> None:
     """Run the whole pipeline on the embedded default: episodes, activations, probes, retention.
 
-    Takes under 5 minutes on 2 cores and downloads nothing. With --compare it does so for three policies and
-    takes three times as long.
+    Takes under 5 minutes on 2 cores and downloads nothing. With --compare it does so for three policies,
+    asks the embedded reader the same questions, and takes three times as long.
     """
     from probe_kit.demo import compare_organisms, run_demo
 

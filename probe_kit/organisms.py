@@ -2,15 +2,17 @@
 
 `pi0-tiny` was trained to act on Color and Shape (*used*); the answer to State questions was made readable in
 its backbone and never trained into an action (*encoded, unused*); nothing was trained for the other categories
-(*absent*). Its early checkpoint and its random twin know nothing yet.
+(*absent*). Its early checkpoint and its random twin know nothing yet. `vlm-tiny` reads and does not act: it was
+trained to answer questions of Color, Shape, State and Traffic (*known*), and of nothing else.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Literal, cast
 
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
+from probe_kit.extract.asking.templates import TEMPLATES
 from probe_kit.intervene import Follow, Source, Verdict, intervene_on
 from probe_kit.retention import RetentionRow, retention
 from probe_kit.retention.cells import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
@@ -22,24 +24,26 @@ if TYPE_CHECKING:
     from probe_kit.fitting_tables import Cell, FittingTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
+Truth = Verdict | Literal["known", "unknown"]
 
 
 @dataclass(frozen=True)
 class Organism:
-    """A policy by its model name, and the verdict that is true of it per category; `absent` if not named.
+    """A model by its name, and the verdict that is true of it per category; `absent` or `unknown` if not named.
 
-    folder: what its run is called.
+    folder: what its run is called. asked: it reads and does not act.
     """
 
     name: str
     folder: str
     model: str
     random_weights: bool = False
-    truth: tuple[tuple[str, Verdict], ...] = ()
+    truth: tuple[tuple[str, Truth], ...] = ()
+    asked: bool = False
 
-    def expected(self, category: str) -> Verdict:
+    def expected(self, category: str) -> Truth:
         """What is true by construction."""
-        return dict(self.truth).get(category, "absent")
+        return dict(self.truth).get(category, "unknown" if self.asked else "absent")
 
 
 TRAINED = Organism(
@@ -47,6 +51,13 @@ TRAINED = Organism(
 )
 RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True)
 ORGANISMS = (TRAINED, Organism("early", "run-early", "pi0-tiny-early"), RANDOM_TWIN)
+READER = Organism(
+    "reader",
+    "run-reader",
+    "vlm-tiny",
+    truth=(("color", "known"), ("shape", "known"), ("state", "known"), ("traffic", "known")),
+    asked=True,
+)
 
 
 @dataclass(frozen=True)
@@ -55,8 +66,8 @@ class Finding:
 
     organism: str
     category: str
-    expected: Verdict
-    measured: Verdict
+    expected: Truth
+    measured: Truth
     row: RetentionRow
 
     @property
@@ -65,14 +76,16 @@ class Finding:
         return self.expected == self.measured
 
 
-def verdict(row: RetentionRow) -> Verdict:
+def verdict(row: RetentionRow) -> Truth:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
     In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the action
     follows the pictures when these are exchanged; without a stored intervention, the SR is in the regime of
     knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument missed what the
-    policy plainly reads.
+    policy plainly reads. A model that was asked knows a category in which it answers in the regime of knowledge.
     """
+    if row.kind == "asks":
+        return "known" if row.regime == Regime.KNOWLEDGE else "unknown"
     if row.used is not None:
         return cast("Verdict", row.used)
     if row.regime == Regime.KNOWLEDGE:
@@ -105,10 +118,20 @@ def probed(
     return run, results
 
 
+def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
+    """What a reader answers on `suite`, in the prompt nearest to an instruction; finished work is reused."""
+    settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
+    return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
+
+
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge every organism on `suite`, the trained ones against the random twin too; arguments as of `probed`."""
+    """Judge the reader and every organism on `suite`, the trained ones against the random twin too.
+
+    Arguments as of `probed`.
+    """
     twin, _ = probed(RANDOM_TWIN, suite, folder, permutations, stage)
-    runs = [
+    runs = [(READER, answered(READER, suite, folder, stage))]
+    runs += [
         (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
         for one in ORGANISMS
     ]

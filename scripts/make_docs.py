@@ -51,7 +51,8 @@ def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
         others = [one for one in stored if one["organism"] != TRAINED.name]
         findings = [_finding(_of_trained(row)) for row in rows] + others
     else:
-        findings = [_finding(one) for one in compare_organisms(folder, stage)]
+        acted = [one for one in compare_organisms(folder, stage) if one.row.kind == "acts"]
+        findings = [_finding(one) for one in acted]
     content = {
         "suite": made.run.suite,
         "weights": made.run.weights_sha256,

@@ -94,9 +94,10 @@ def write_intact(folder: Path, seed: int = 0) -> Path:
     from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies.pi0.configuration_pi0 import PI0Config
 
+    from probe_kit.models.embedded import embedded_checkpoint
     from probe_kit.models.initialisation import initialise
     from probe_kit.models.pi0 import build_pi0
-    from probe_kit.models.pi0_tiny import SIZE, embedded_checkpoint
+    from probe_kit.models.pi0_tiny import SIZE
 
     config = PI0Config(
         input_features={

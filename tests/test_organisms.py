@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.console import out
-from probe_kit.organisms import ORGANISMS, TRAINED, Finding, to_rich, verdict
+from probe_kit.organisms import ORGANISMS, READER, TRAINED, Finding, to_rich, verdict
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.success import regime
 
@@ -71,3 +71,10 @@ def test_the_table_counts_the_true_verdicts() -> None:
     text = printed.get()
     assert "1 of 2 verdicts are true" in text
     assert "encoded" in text
+
+
+@pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
+def test_a_reader_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
+    assert verdict(replace(row(sr, None), kind="asks")) == expected
+    assert READER.expected("state") == "known"
+    assert READER.expected("counting") == "unknown"

@@ -54,11 +54,6 @@ GUESSED: Statistics = {
 """About what the scripted expert does; for policies with random weights."""
 
 
-def embedded_checkpoint(name: str) -> Path:
-    """Folder of a checkpoint that comes with the package: `pi0-tiny` or `pi0-tiny-early`."""
-    return Path(__file__).parent / "checkpoints" / name
-
-
 def new_pi0_tiny(seed: int) -> PI0Policy:
     """The policy with seeded random weights, deaf and dumb in the action dimensions it does not decide.
 

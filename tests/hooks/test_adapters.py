@@ -8,7 +8,7 @@ from probe_kit.hooks import Model, Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.smolvla.adapter import SmolVLA, load_smolvla
 from probe_kit.hooks.testing import AdapterContract
-from probe_kit.models.pi0_tiny import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from tests.smolvla_checkpoints import write_smolvla
 
 

@@ -16,7 +16,7 @@ from probe_kit.errors import CheckpointError, MissingExtraError, ProbeKitError, 
 from probe_kit.hooks import Observation
 from probe_kit.hooks.foreign_code import acting
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.pi0_tiny import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 FOLDERS = {

@@ -8,7 +8,8 @@ from safetensors import safe_open
 
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.pi0_tiny import ACTION_DIMS, embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
+from probe_kit.models.pi0_tiny import ACTION_DIMS
 from probe_kit.suite import build_suite
 
 NAMES = ("pi0-tiny", "pi0-tiny-early")

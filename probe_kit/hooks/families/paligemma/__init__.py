@@ -1,9 +1,22 @@
-"""PaliGemma, on transformers' own network."""
+"""PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.6 million parameters."""
 
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
 
 FAMILIES = (
+    Family(
+        "vlm-tiny",
+        "PaliGemma at 0.6 million parameters, the embedded reader: knows Color, Shape, State and Traffic",
+        None,
+        "probe_kit.hooks.families.paligemma.adapter:load_vlm_tiny",
+        streams="backbone 4 layers, answer 4 layers",
+        embodiment="none: answers, does not act",
+        notes="its words are those of the embedded suite and of the prompts of `probe-kit ask`; no others",
+        verifier="probe_kit.hooks.families.paligemma.adapter:verify_paligemma",
+        config_types=("paligemma",),
+        acts=False,
+        reads=True,
+    ),
     Family(
         "paligemma",
         "PaliGemma 3B (SigLIP, Gemma 2B; the prompt attends both ways), pi0's source",

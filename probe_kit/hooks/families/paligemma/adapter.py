@@ -1,6 +1,7 @@
 """The adapter for PaliGemma: picture, beginning of sequence, question, newline. The prompt attends both ways."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,6 +17,7 @@ from probe_kit.hooks.families.vlm_text import Frame
 from probe_kit.hooks.families.vlm_verify import verify_vlm
 from probe_kit.hooks.model import Tap
 from probe_kit.hooks.verify import Comparison
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.packing import LeftPacked
 from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
 
@@ -78,6 +80,20 @@ def load_paligemma(
 ) -> PaliGemma:
     """Load PaliGemma from a folder or hub id; see `load_vlm`. tokenizer: folder of another one."""
     return PaliGemma(load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed), tokenizer)
+
+
+def load_vlm_tiny(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
+) -> PaliGemma:
+    """The embedded reader: PaliGemma at 0.6 million parameters, trained on the prompts of `probe-kit ask`."""
+    place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
+    reader = PaliGemma(load_vlm(_RECIPE, place, device, dtype, random_weights, weights_seed))
+    reader.card = replace(reader.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
+    return reader
 
 
 def verify_paligemma(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:

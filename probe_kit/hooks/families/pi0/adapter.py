@@ -22,9 +22,9 @@ from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.families.weighing import Note, returned, weighed
 from probe_kit.hooks.hub import unreachable
 from probe_kit.hooks.views import PADDING
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.pi0 import Pi0Size, build_pi0
 from probe_kit.models.pi0_keys import current_pi0_keys
-from probe_kit.models.pi0_tiny import embedded_checkpoint
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
 

@@ -1,0 +1,8 @@
+"""Where the checkpoints lie that come with the package. Imports nothing heavy."""
+
+from pathlib import Path
+
+
+def embedded_checkpoint(name: str) -> Path:
+    """Folder of a checkpoint that comes with the package: `pi0-tiny`, `pi0-tiny-early` or `vlm-tiny`."""
+    return Path(__file__).parent / "checkpoints" / name

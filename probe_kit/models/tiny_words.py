@@ -1,0 +1,42 @@
+"""The words of the embedded reader: a word-level tokenizer of the embedded suite's grammar and of questions."""
+
+import json
+from pathlib import Path
+
+from tokenizers import Regex, Tokenizer
+from tokenizers.models import WordLevel
+from tokenizers.normalizers import Lowercase
+from tokenizers.pre_tokenizers import Sequence, Split
+from tokenizers.processors import TemplateProcessing
+
+from probe_kit.suite.generators import vocabulary
+
+SPECIAL = ("<pad>", "<eos>", "<bos>", "<unk>", "<image>")
+IMAGE_TOKEN = SPECIAL.index("<image>")
+END = SPECIAL.index("<eos>")
+_OF_QUESTIONS = (
+    *("\n", ".", ",", ":", "?", '"', "a", "b", "answer", "center", "choices", "color", "directly", "do", "from"),
+    *("given", "if", "is", "left", "letter", "no", "option's", "or", "right", "see", "specify", "state", "there"),
+    *("traffic", "what", "where", "with", "yes", "you"),
+)
+"""Of the prompts of `probe-kit ask` and of the questions that `vlm-tiny` was trained on besides."""
+WORDS = tuple(dict.fromkeys((*SPECIAL, *_OF_QUESTIONS, *vocabulary())))
+VOCABULARY = -(-len(WORDS) // 64) * 64
+"""Rows of an embedding table for them."""
+
+
+def write_tokenizer(folder: Path, most: int) -> None:
+    """tokenizer.json and its card in `folder`. most: tokens of an instruction."""
+    tokenizer = Tokenizer(WordLevel({word: index for index, word in enumerate(WORDS)}, unk_token="<unk>"))
+    tokenizer.normalizer = Lowercase()
+    tokenizer.pre_tokenizer = Sequence(
+        [Split(Regex(r'\n|"|[.,:?](?=\s|$)'), "isolated"), Split(" ", "removed")]  # not the colon in 7:30
+    )
+    tokenizer.post_processor = TemplateProcessing(
+        single="<bos> $A", special_tokens=[("<bos>", SPECIAL.index("<bos>"))]
+    )
+    tokenizer.add_special_tokens(list(SPECIAL))
+    tokenizer.save(str(folder / "tokenizer.json"))
+    card = {"tokenizer_class": "PreTrainedTokenizerFast", "model_max_length": most}
+    tokens = {f"{name}_token": f"<{name}>" for name in ("pad", "eos", "bos", "unk")}
+    (folder / "tokenizer_config.json").write_text(json.dumps(card | tokens, indent=1))
