@@ -5,6 +5,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 """
 
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
+from probe_kit.retention.displays.causal_curve import CausalCurveDisplay, causal_curve
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
 from probe_kit.retention.displays.gallery import Exhibit, gallery, save_figures
@@ -26,6 +27,7 @@ from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_
 
 __all__ = [
     "CallCurveDisplay",
+    "CausalCurveDisplay",
     "Certificate",
     "Exhibit",
     "FinalPositionsDisplay",
@@ -43,6 +45,7 @@ __all__ = [
     "SuccessTableDisplay",
     "aligned_curves",
     "call_curves",
+    "causal_curve",
     "curves_side_by_side",
     "final_positions",
     "gallery",

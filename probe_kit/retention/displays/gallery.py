@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
+from probe_kit.intervene.passing import stored_passing
 from probe_kit.retention.call_curves import CallCurves, event_calls
 from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
+from probe_kit.retention.displays.causal_curve import causal_curve
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
     HeatTableDisplay,
@@ -94,6 +96,7 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
         if probed is not None:
             exhibits += _of_probes(name, position, probed, table.iterations)
             exhibits += _of_calls(name, position, run, probed)
+            exhibits += _of_causes(name, position, run, probed)
     return exhibits
 
 
@@ -297,6 +300,22 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
                 )
             )  # fmt: skip
     return exhibits
+
+
+def _of_causes(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
+    """Only where an interchange is stored with the run."""
+    if not set(stored_passing(run)) & set(results.settings.categories):
+        return []
+    view = results.settings.views[0]
+    return [
+        Exhibit(
+            f"{name}-causes", "Readable and used", "interventions",
+            "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
+            "layer are taken from the same inference before exchanged pictures. A layer that is readable and "
+            "turns nothing is read by nothing behind it.",
+            position, partial(causal_curve, run, results, view),
+        )
+    ]  # fmt: skip
 
 
 def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:

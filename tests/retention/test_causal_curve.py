@@ -1,0 +1,96 @@
+"""Readable, passes, read: what the figure shows is what is stored; and tables take the verdict from it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene.effects import effects_csv
+from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.intervene.stored import Answers, save
+from probe_kit.retention import retention
+from probe_kit.retention.displays import CausalCurveDisplay, causal_curve, gallery
+from probe_kit.train import ArrayRun, load_results
+from tests.intervene.answers import answers_of, follower, habit
+
+mpl.use("agg")
+SIGNAL = ([0.5, 0.9], [[0.7]])
+
+
+def store(run: ArrayRun, kind: str, answers: Answers) -> None:
+    categories = list(dict.fromkeys(answers.categories.tolist()))
+    settings = {
+        "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": categories,
+    }  # fmt: skip
+    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
+    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
+
+
+def inside(answers: Answers, **shares: float) -> Answers:
+    """shares: by place (`__` for `.`), how many of the episodes go where the exchange brings them."""
+    count = answers.episodes.size
+    rows = [
+        np.where(np.arange(count) < share * count, answers.of("exchanged"), answers.of("plain"))
+        for share in shares.values()
+    ]
+    lateral = np.vstack([answers.lateral, *rows])
+    names = tuple(f"{name.replace('__', '.')}|all" for name in shares)
+    return replace(
+        answers,
+        conditions=(*answers.conditions, *names),
+        lateral=lateral,
+        changed=np.abs(lateral - lateral[0]),
+        ledger=np.zeros((*lateral.shape, 5)),
+    )
+
+
+@pytest.fixture
+def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
+    """Color follows, shape does not; both can be read at layer 1."""
+    made = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    answers = answers_of({"color": follower(48), "shape": habit(48)})
+    store(made, "follow", answers)
+    return made
+
+
+def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
+    answers = answers_of({"color": follower(48)})
+    store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0))
+    display = CausalCurveDisplay.from_run(run, load_results(run), "color").plot()
+    np.testing.assert_allclose(display.readable.percent, [50.0, 90.0])
+    assert display.readable.significant.tolist() == [False, True]
+    np.testing.assert_allclose(display.passes["all"].percent, [100.0, 0.0])
+    assert display.passes["all"].significant.tolist() == [True, False]
+    assert display.read is None
+    assert display.ax_ is not None
+    labels = [line.get_label() for line in display.ax_.get_lines()]
+    assert "passes: all" in labels
+    names = [exhibit.name for exhibit in gallery([run], retention([run]))]
+    assert any("causes" in name for name in names)
+
+
+def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:
+    with pytest.raises(NoInterventionsError, match="--kind interchange"):
+        CausalCurveDisplay.from_run(run, load_results(run), "color")
+    with pytest.raises(NoInterventionsError):
+        causal_curve(run, load_results(run))
+    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+
+
+def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
+    rows = {row.category: row for row in retention([run]).rows}
+    assert (rows["color"].used, rows["shape"].used) == ("used", "encoded, unused")
+    assert rows["shape"].used_note == "positive control: color"
+    assert (rows["color"].follows, rows["color"].against) == (1.0, 0.0)
+
+
+def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
+    answers = answers_of({"color": follower(48)})
+    store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
+    rows = {row.category: row for row in retention([run]).rows}
+    assert rows["color"].used == "inconclusive"
+    assert rows["shape"].used == "encoded, unused"
