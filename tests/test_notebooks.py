@@ -11,15 +11,16 @@ from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, executed, kernel, notebooks
 from probe_kit.extract import open_run
+from probe_kit.intervene import stored_passing
 from probe_kit.retention import retention
 from probe_kit.train import load_results
 
 NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
-    "06-vlm-against-vla",
+    "06-vlm-against-vla", "07-from-readable-to-used",
 )  # fmt: skip
-BESIDE_EACH_OTHER = (NAMES[:3], NAMES[3:])
-"""The first three share a run; the others need none of them."""
+BESIDE_EACH_OTHER = ((*NAMES[:3], NAMES[6]), NAMES[3:6])
+"""The first three and the last share a run; the others need none of them."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
 
 PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^color|^sheet);?$", re.MULTILINE)
@@ -37,7 +38,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Note
 
     with ThreadPoolExecutor(2) as pool:
         fresh = [notebook for ran in pool.map(run, BESIDE_EACH_OTHER) for notebook in ran]
-    return folder, dict(zip(NAMES, fresh, strict=True))
+    names = [name for group in BESIDE_EACH_OTHER for name in group]
+    return folder, dict(zip(names, fresh, strict=True))
 
 
 def printed(notebook: NotebookNode) -> str:
@@ -112,6 +114,17 @@ def test_the_readers_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, di
     assert retention([habit]).rows[0].sr == 0.5
     assert (looking.episodes["outcome_debiased"] == "correct").mean() > 0.5
     assert looking.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
+
+
+def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
+    made: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    """Its hooks fired and moved tokens; what can be read there turns nothing."""
+    rows = stored_passing(open_run(made[0] / "work" / "runs" / "pi0-tiny"))["color"]
+    (last,) = (row for row in rows if (row.place, row.role) == ("backbone.03", "all"))
+    assert (last.changed, last.still) == (0.0, 0)
+    assert last.fires == last.n_episodes
+    assert last.norm_ratio > 0
 
 
 @pytest.mark.parametrize("name", NAMES)
