@@ -54,9 +54,14 @@ def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
 
 def little_writer(where: Location, plan: Plan, seed: int = 0, codec: str = "zstd") -> RunWriter:
     writer = RunWriter(where, plan, little_settings(seed, codec))
+    certify(writer)
+    return writer
+
+
+def certify(writer: RunWriter) -> None:
+    """What the process says of itself, which is part of the work on a run."""
     check = {f"actions_{how}_hooks_sha256": "a" * 64 for how in ("with", "without")}
     writer.write_certificate({"policy": {"family": "little"}, "capture_check": check})
-    return writer
 
 
 def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:

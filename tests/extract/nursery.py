@@ -17,10 +17,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from little_run import episode, little_plan, little_writer
+from little_run import certify, episode, little_plan, little_settings
 
 from probe_kit.extract import open_run, seal
 from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.writer import RunWriter
 from probe_kit.suite import load_suite
 from probe_kit.train import train_probes
 
@@ -28,8 +29,9 @@ from probe_kit.train import train_probes
 def extract(run: str, suite: str) -> None:
     """What an extraction does with its episodes."""
     plan = little_plan(load_suite(Path(suite)))
-    writer = little_writer(locate(run), plan)
+    writer = RunWriter(locate(run), plan, little_settings())
     with writer.owned():
+        certify(writer)
         for number in writer.remaining():
             writer.write(episode(plan, number))
         seal(run)

@@ -134,16 +134,22 @@ def read_pictures(location: Location, number: int) -> dict[str, Sum] | None:
 
 def picture_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
     """Pictures that are missing or have another size. Whoever wants none may delete a whole folder of them."""
-    there = {key for folder in ILLUSTRATIONS for key in location.keys(folder)}
+    there = {
+        f"{folder}/{name}": size
+        for folder in ILLUSTRATIONS
+        for name, size in location.sizes(folder, _names(location, folder)).items()
+    }
     kept = {key.partition("/")[0] for key in there}
-    promised = {number: pictures_of(commit) or {} for number, commit in commits.items()}
-    sizes = location.sizes("", (key for pictures in promised.values() for key in pictures if key in there))
-    for number, pictures in promised.items():
-        for key, known in pictures.items():
+    for number, commit in commits.items():
+        for key, known in (pictures_of(commit) or {}).items():
             if key not in there and key.partition("/")[0] in kept:
                 yield f"{key} is missing. {redo_picture(number)}"
-            elif key in there and sizes[key] != known.length:
-                yield f"{key} has {sizes[key]} bytes; {known.length} were written. {redo_picture(number)}"
+            elif key in there and there[key] != known.length:
+                yield f"{key} has {there[key]} bytes; {known.length} were written. {redo_picture(number)}"
+
+
+def _names(location: Location, folder: str) -> list[str]:
+    return [key.removeprefix(f"{folder}/") for key in location.keys(folder)]
 
 
 def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[str, int]:
