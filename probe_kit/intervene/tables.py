@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _LEGEND = (
     "follows: goes to the correct picture, and to the other side once the two are exchanged; against: the "
-    f"reverse; net: follows − against, {WORTH} of which count; p: exact, one-sided, by item"
+    f"reverse; net: follows − against, {WORTH} of which count; p: exact, by item and by group, the larger one"
 )
 
 
