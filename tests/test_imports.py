@@ -35,7 +35,8 @@ EXTRACT = {
     "needs": {"store", "plan", "settings"},
     "early": {"store", "plan", "settings", "asking"},
     "play": {"store", "plan", "settings", "asking"},
-    "prepared": {"store", "plan", "settings", "early", "play", "asking", "protocols"},
+    "calibration": {"plan", "settings", "play"},
+    "prepared": {"store", "plan", "settings", "early", "calibration", "play", "asking", "protocols"},
     "crews": {"store", "plan", "settings", "play", "prepared"},
     "extraction": {"store", "plan", "settings", "needs", "early", "play", "prepared", "crews"},
 }

@@ -119,8 +119,12 @@ def extract(
         str, typer.Option(help="ends: thumbnails of first and last frames, for the report. none: no pictures.")
     ] = "ends",
     batch: Annotated[
-        int, typer.Option(help="Observations per policy call; above 1, numbers repeat up to float rounding.")
-    ] = 1,
+        str,
+        typer.Option(
+            help="Observations per policy call; above 1, numbers repeat up to float rounding. auto: measure for "
+            "some seconds, and choose --env-workers too."
+        ),
+    ] = "1",
     env_workers: Annotated[
         int | None, typer.Option(help="Processes that simulate and draw; default two per observation of a batch.")
     ] = None,
@@ -184,7 +188,8 @@ def extract(
         dtype=dtype,
         video=video,
         frames=frames,
-        batch=batch,
+        batch=1 if batch == "auto" else read_batch(batch),
+        calibrate=batch == "auto",
         env_workers=env_workers,
         workers=workers,
         ray=ray,
@@ -209,6 +214,14 @@ def read_size(text: str) -> tuple[int, int]:
     return width, height
 
 
+def read_batch(text: str) -> int:
+    """A number of observations. Raises UsageError for anything else."""
+    number = whole_number(text)
+    if number is None:
+        raise UsageError(f"--batch {text!r} is neither a whole number nor auto")
+    return number
+
+
 def print_plan(extraction: "Extraction", location: "Location") -> None:
     """What is going to be run, how much it stores and where."""
     from rich.table import Table
@@ -231,6 +244,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),
+        **_pace_row(extraction),
         "run": str(location),
     }
     table = Table(show_header=False, title="plan", box=None)
@@ -246,6 +260,13 @@ def _describe_wordings(skipped: "Mapping[Wording, int]") -> str:
     return ", ".join(
         f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()
     )
+
+
+def _pace_row(extraction: "Extraction") -> dict[str, str]:
+    """What a calibration chose; nothing where batch and processes were given."""
+    if extraction.calibration is not None:
+        return {"pace": extraction.calibration.words}
+    return {"pace": "batch auto: every worker chooses its own"} if extraction.settings.calibrate else {}
 
 
 def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:

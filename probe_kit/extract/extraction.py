@@ -117,10 +117,11 @@ def prepare(
     location = None if out is None else locate(out)
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
-        planned = load(replace(settings, device="cpu"), location=location, reader=reader)
+        here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
+        planned = load(here, location=location, reader=reader)
         return Extraction(settings, planned.plan, planned.card, None)
     prepared = load(settings, location=location, reader=reader)
-    return Extraction(settings, prepared.plan, prepared.card, prepared.controller)
+    return Extraction(prepared.settings, prepared.plan, prepared.card, prepared.controller, prepared.calibration)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.asking.phrases import phrases
+from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import check_model, check_place
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.play.ask_controller import AskController
@@ -29,13 +30,15 @@ if TYPE_CHECKING:
 class Prepared:
     """What an extraction starts from: the model was loaded and the plan is made.
 
-    controller: None if the model is loaded again by workers elsewhere.
+    controller: None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if
+    nobody asked for that or it is left to workers.
     """
 
     settings: RunSettings
     plan: Plan
     card: dict[str, Any]
     controller: ActingController | AskController | None
+    calibration: Calibration | None = None
 
     def identity(self) -> dict[str, Any]:
         """Everything that names the stored numbers; two runs with equal identity are interchangeable."""
@@ -98,6 +101,9 @@ def load(
         controller = _acting(settings, instructions_of(asked))
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings)
+    if settings.calibrate and isinstance(controller, PolicyController):
+        settings, calibration = calibrated(settings, controller, plan)
+        return Prepared(settings, plan, controller.identity, controller, calibration)
     return Prepared(settings, plan, controller.identity, controller)
 
 

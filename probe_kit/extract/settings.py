@@ -46,7 +46,7 @@ _MOST = {
 }
 LONGEST_LABEL = 200
 LARGEST = 1_000_000
-_MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "env_workers", "workers", "ray"}
+_MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "calibrate", "env_workers", "workers", "ray"}
 
 
 _DEFAULT_SCENE = SceneSpec()
@@ -68,6 +68,7 @@ class RunSettings:
 
     The rest changes no stored number, only how fast it comes:
     batch: observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
+    calibrate: choose batch and env_workers by a measurement of some seconds, see `extract.calibration`.
     frames: `ends` keeps a thumbnail of the first and last frame of every episode, `none` does not.
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
@@ -93,6 +94,7 @@ class RunSettings:
     dtype: str | None = None
     frames: str = "ends"
     batch: int = 1
+    calibrate: bool = False
     env_workers: int | None = None
     workers: int = 0
     ray: str | None = None
@@ -238,6 +240,10 @@ class AskSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.calibrate:
+            raise UsageError(
+                "batch and processes are chosen for runs that act; ask with a number, such as batch=8"
+            )
         self._check_one_of("picture", PICTURES)
         self._check_one_of("asked", ASKED)
         if self.asked == "absent" and not self.prompt.yes_or_no:

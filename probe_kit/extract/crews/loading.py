@@ -15,4 +15,4 @@ def load_worker(settings: RunSettings, run: str) -> Worker:
     assert prepared.controller is not None
     writer = prepared.writer(locate(run))
     writer.begin(settings.allow_mixed)
-    return Worker(writer, settings, prepared.controller, len(writer.remaining()))
+    return Worker(writer, prepared.settings, prepared.controller, len(writer.remaining()))

@@ -176,6 +176,11 @@ class PolicyController:
             _check_chunks(chunks, len(turns))
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
 
+    def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
+        """One inference of which nothing is kept: what another one will take."""
+        with acting(self.identity["model"]):
+            self._infer(observations, list(seeds))
+
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids that the policy's own packing makes of it, frames around it included."""
         if instruction not in self._instruction_ids:

@@ -28,7 +28,7 @@ def refuse_meaningless(settings: RunSettings) -> None:
         "--listen": settings.listen,
         "--checkpoint": settings.checkpoint is not None,
         "--random-weights": settings.random_weights,
-        "--batch": settings.batch != 1,
+        "--batch": settings.batch != 1 or settings.calibrate,
         "--execute": settings.execute is not None,
         "--dtype": settings.dtype is not None,
         "--tokens all": settings.tokens == "all",

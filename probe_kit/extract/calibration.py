@@ -1,0 +1,169 @@
+"""How large a batch, and how many simulating processes: measured for some seconds before a run, `--batch auto`.
+
+It decides how fast a run comes and nothing that is stored, but for the float rounding of batches; a family of
+which batching changes more says so on its card and is never given more than the card allows.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from time import perf_counter
+
+import numpy as np
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.play.controllers import PolicyController
+from probe_kit.extract.play.examples import example_observations
+from probe_kit.extract.play.stage import Ending, Stage
+from probe_kit.extract.play.worker import torch_threads
+from probe_kit.extract.settings import RunSettings
+from probe_kit.hooks.observation import Observation
+
+LARGEST = 64
+"""Observations per call that are tried at most."""
+BUDGET_S = 30.0
+"""Seconds after which no larger batch is tried."""
+ENOUGH = 0.95
+"""Share of the best rate with which a smaller batch is preferred: it needs less memory and fewer simulators."""
+GAIN = 1.1
+"""A batch that brings less than this over the half of it ends the search."""
+TURNS = 3
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was measured and chosen.
+
+    inference: seconds of one call of the model, by batch. turn: seconds in which one simulator carries out the
+    actions of one inference and draws the next picture, its share of setting up an episode included.
+    batch, env_workers: chosen. waits: share of the time in which the model is expected to wait for simulators.
+    """
+
+    inference: Mapping[int, float]
+    turn: float
+    batch: int
+    env_workers: int
+    waits: float
+
+    @property
+    def words(self) -> str:
+        """As the plan prints it."""
+        processes = (
+            f"{self.env_workers} simulating processes" if self.env_workers else "simulating in this process"
+        )
+        call, turn = 1e3 * self.inference[self.batch], 1e3 * self.turn
+        return (
+            f"batch {self.batch}, {processes} (measured: the model takes {call:.0f} ms a call, a simulator "
+            f"{turn:.0f} ms a turn; the model would wait {self.waits:.0%} of the time)"
+        )
+
+
+def calibrated[Settings: RunSettings](
+    settings: Settings, controller: PolicyController, plan: Plan
+) -> tuple[Settings, Calibration]:
+    """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
+
+    Takes BUDGET_S or a little more. Raises UsageError for settings that choose either by themselves.
+    """
+    if settings.batch != 1 or settings.env_workers is not None:
+        raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
+    example = example_observations(settings.scene, [plan.episodes[0].episode.item.instruction])[0]
+    most = largest_batch(controller.policy.card.batch, len(plan.episodes))
+    with torch_threads(controller.threads):
+        times = inference_times(lambda batch: _infer(controller, example, batch), most)
+    found = choose(times, _turn(settings, controller, plan), cores_here())
+    return replace(settings, batch=found.batch, env_workers=found.env_workers), found
+
+
+def largest_batch(of_card: int | None, episodes: int) -> int:
+    """What may be tried: the card's bound, LARGEST, and half of the episodes, since two groups take turns."""
+    return max(1, min(LARGEST, of_card or LARGEST, episodes // 2))
+
+
+def inference_times(infer: Callable[[int], object], most: int) -> dict[int, float]:
+    """Seconds per call by batch, 1, 2, 4 … up to `most`, as long as they bring more and the budget lasts.
+
+    A batch for which memory does not suffice ends the search; with one observation it is an error as ever.
+    """
+    began, times = perf_counter(), dict[int, float]()
+    batch = 1
+    while batch <= most:
+        try:
+            infer(batch)  # the first call of a shape chooses kernels and allocates
+            times[batch] = min(_seconds(partial(infer, batch)) for _ in range(2))
+        except MemoryError:
+            if batch == 1:
+                raise
+            break
+        half = times.get(batch // 2)
+        if half is not None and 2 * half < GAIN * times[batch]:
+            break
+        if perf_counter() - began > BUDGET_S:
+            break
+        batch *= 2
+    return times
+
+
+def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibration:
+    """The smallest batch near the best rate, where one group of simulators works while the model infers.
+
+    A core is left to the model. With one core in all, processes bring nothing and everything stays in this one.
+    """
+    hands = max(1, cores - 1)
+
+    def simulating(batch: int) -> float:
+        return turn * -(-batch // hands)
+
+    def rate(batch: int) -> float:
+        own = inference[batch]
+        return batch / (max(own, simulating(batch)) if cores > 1 else own + batch * turn)
+
+    best = max(map(rate, inference))
+    batch = min(size for size in inference if rate(size) >= ENOUGH * best)
+    spent = batch / rate(batch)
+    return Calibration(
+        dict(inference), turn, batch, 2 * batch if cores > 1 else 0, max(0.0, 1 - inference[batch] / spent)
+    )
+
+
+def cores_here() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _infer(controller: PolicyController, example: Observation, batch: int) -> None:
+    from torch.cuda import OutOfMemoryError
+
+    try:
+        controller.rehearse([example] * batch, list(range(batch)))
+    except OutOfMemoryError as error:
+        raise MemoryError(str(error)) from error
+
+
+def _turn(settings: RunSettings, controller: PolicyController, plan: Plan) -> float:
+    """Seconds per inference that a simulator takes, with zero actions; setting up counts once per episode."""
+    stage = Stage(settings.scene, None)
+    try:
+        setting_up = _seconds(lambda: stage.begin(plan.episodes[0], False))
+        if controller.listens:
+            return setting_up
+        steps = min(controller.execute, max(1, settings.scene.max_steps // (TURNS + 1)))
+        actions = np.zeros((steps, 7), np.float32)
+        began, turns = perf_counter(), 0
+        while turns < TURNS:
+            turns += 1
+            if isinstance(stage.advance(actions), Ending):
+                break
+        per_step = (perf_counter() - began) / (turns * steps)
+    finally:
+        stage.close()
+    inferences = -(-settings.scene.max_steps // controller.execute)
+    return per_step * controller.execute + setting_up / inferences
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    began = perf_counter()
+    work()
+    return perf_counter() - began
