@@ -9,6 +9,8 @@ from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.intervene.bench import Bench, Source
+    from probe_kit.intervene.carried_out import CarriedOut
+    from probe_kit.intervene.closed_loop import ClosedLoop, best_cells
     from probe_kit.intervene.effects import Effects, load_effects
     from probe_kit.intervene.follow import Follow
     from probe_kit.intervene.following import Following, stored_following
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Answers",
     "Bench",
+    "CarriedOut",
+    "ClosedLoop",
     "Effects",
     "Follow",
     "Following",
@@ -35,6 +39,7 @@ __all__ = [
     "Steer",
     "Verdict",
     "Words",
+    "best_cells",
     "intervene_on",
     "judge",
     "judgements",
@@ -56,6 +61,9 @@ __getattr__ = lazy_names(
         "Interchange": "interchange",
         "Answers": "stored",
         "Bench": "bench",
+        "CarriedOut": "carried_out",
+        "ClosedLoop": "closed_loop",
+        "best_cells": "closed_loop",
         "Effects": "effects",
         "Follow": "follow",
         "Following": "following",

@@ -85,6 +85,7 @@ class Bench:
         self.run, self.policy, self.scene = run, policy, scene
         self.items, self.twins = items, twins_of(items.values())
         self._stage = Stage(scene, None)
+        self._beside: Stage | None = None
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
 
@@ -93,6 +94,14 @@ class Bench:
 
     def __exit__(self, *_: object) -> None:
         self._stage.close()
+        if self._beside is not None:
+            self._beside.close()
+
+    def stages(self) -> tuple[Stage, Stage]:
+        """Its stage, and one beside it for the same state with exchanged pictures; opened when first asked for."""
+        if self._beside is None:
+            self._beside = Stage(self.scene, None)
+        return self._stage, self._beside
 
     def questions(self, item_id: str) -> list[Question]:
         """The committed episodes of one item, their first frames drawn again.
@@ -184,7 +193,11 @@ class Bench:
     def lateral(self, chunk: Chunk, seen: Observation) -> float:
         """Where the chunk would bring the hand, in metres from the middle between the tiles; left is positive."""
         end = np.asarray(seen.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
-        return float((end - self._middle) @ self._across)
+        return self.across(end)
+
+    def across(self, point: NDArray[np.float64]) -> float:
+        """How far a point (2,) is from the middle between the tiles, in metres; left is positive."""
+        return float((point - self._middle) @ self._across)
 
 
 def open_bench(run: Run, source: Source, load: "Callable[[Run, Source], Policy] | None" = None) -> Bench:

@@ -9,11 +9,12 @@ from probe_kit.console import counter, marked, out, print_json_text, print_text,
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from probe_kit.extract import Run
     from probe_kit.intervene.conditions import Intervention
     from probe_kit.intervene.effects import Effects
 
-KINDS = ("follow", "words", "interchange", "steer")
-INSIDE = "Inside the network (interchange, steer)"
+KINDS = ("follow", "words", "interchange", "steer", "closed-loop")
+INSIDE = "Inside the network (interchange, steer, closed-loop)"
 _FORMATS = ("table", "json", "csv")
 
 
@@ -24,7 +25,8 @@ def intervene(
         typer.Option(
             help="follow: with the two pictures exchanged, does the action change sides? words: before the "
             "same pictures, asked for the other one? interchange: where "
-            "inside does that pass? steer: a direction added, beside matched controls."
+            "inside does that pass? steer: a direction added, beside matched controls. closed-loop: the best "
+            "place of an interchange and its controls, with every episode played again."
         ),
     ] = "follow",
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
@@ -32,7 +34,8 @@ def intervene(
     sites: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4, memory.*; default backbone.*.",
+            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4, memory.*; default backbone.*. "
+            "Closed loop: default the last place, of each category, that the newest interchange located.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
@@ -40,21 +43,25 @@ def intervene(
         str | None,
         typer.Option(
             help="Comma-separated: all, image, language, state, action; default all,image,language. Steer: the "
-            "one whose tokens are moved.",
+            "one whose tokens are moved. Closed loop: with --sites, default all.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
     direction: Annotated[
         str | None,
         typer.Option(
-            help="mean-difference or probe: interchange along it only; steer along it (the first is default).",
+            help="mean-difference or probe: interchange along it only; steer along it (the first is default). "
+            "Closed loop: along it as well (the first is default), or none.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
     controls: Annotated[
         int | None,
         typer.Option(
-            help="Matched random directions beside it; default 5.", min=0, max=100, rich_help_panel=INSIDE
+            help="Matched random directions beside it; default 5, closed loop 1.",
+            min=0,
+            max=100,
+            rich_help_panel=INSIDE,
         ),
     ] = None,
     doses: Annotated[
@@ -88,7 +95,8 @@ def intervene(
 ) -> None:
     """Change what the policy sees, and nothing else: is what can be read also used?
 
-    Replays the first inference of every episode and stores what came of it in the run, where `retention` shows it.
+    Replays the first inference of every episode, or with --kind closed-loop all of it, and stores what came of it
+    in the run, where `retention` shows what is followed.
     The same command continues what was interrupted, and reads back what is there.
     """
     from probe_kit.extract import open_run
@@ -103,6 +111,7 @@ def intervene(
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     asked = _asked(
+        opened,
         kind,
         {"categories": split(categories), "items": items},
         {"sites": split(sites), "roles": split(roles), "direction": direction, "controls": controls,
@@ -125,10 +134,11 @@ _OPTIONS = {
     "words": (),
     "interchange": ("sites", "roles", "direction", "controls", "seed"),
     "steer": ("sites", "roles", "direction", "controls", "doses", "toward", "seed"),
+    "closed-loop": ("sites", "roles", "direction", "controls", "seed"),
 }
 
 
-def _asked(kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
+def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
     """What was asked. Raises UsageError for an option that this kind does not have."""
     from probe_kit.intervene import Follow, Interchange, Steer, Words
 
@@ -139,6 +149,8 @@ def _asked(kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Interv
         )
     if kind in ("follow", "words"):
         return Words(**common) if kind == "words" else Follow(**common)
+    if kind == "closed-loop":
+        return _closed_loop(run, common, given)
     if kind == "interchange":
         controls = given.pop("controls", 5 if "direction" in given else 0)
         return Interchange(**common, **given, controls=controls)
@@ -148,6 +160,21 @@ def _asked(kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Interv
             "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
         )
     return Steer(**common, **given, role=named[0])
+
+
+def _closed_loop(run: "Run", common: dict[str, Any], given: dict[str, Any]) -> "Intervention":
+    from probe_kit.intervene import ClosedLoop, Follow, best_cells
+
+    sites, roles = given.pop("sites", None), given.pop("roles", None)
+    if roles and not sites:
+        raise UsageError("--roles of a closed loop go with --sites; leave both out for the best stored place")
+    if given.get("direction") == "none":
+        given.setdefault("controls", 0)
+    if sites:
+        cells = tuple(f"{site}|{role}" for site in sites for role in roles or ("all",))
+    else:
+        cells = best_cells(run, Follow(**common).chosen(run))
+    return ClosedLoop(**common, **given, cells=cells)
 
 
 def _dose(text: str) -> float:

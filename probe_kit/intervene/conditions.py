@@ -59,6 +59,10 @@ class Intervention(Asked, ABC):
         del bench
         return list(items)
 
+    def play(self, bench: Bench, item: str, conditions: "Sequence[Condition]") -> "Replayed":
+        """What the conditions give for the episodes of one item."""
+        return replay(bench, bench.questions(item), conditions)
+
     @abstractmethod
     def conditions(self, bench: Bench) -> Sequence[Condition]:
         """All of them, in the order in which they are stored; the first is `Plain`."""
@@ -92,7 +96,9 @@ class Replayed:
 
     rows: (E,) in the run's episodes. lateral: (K, E) metres, see `Bench.lateral`. changed: (K, E) the largest
     difference of any action from the plain one's. ledger: (K, E, 5) what was changed, see `patching.LEDGER`.
-    apart: (E,) of the plain one from the stored one; NaN where the run does not say.
+    apart: (E,) of the plain one from the stored one; NaN where the run does not say. outcomes: (K, E) where the
+    cube ended, correct, wrong or oob, for episodes that were played to their end; then `lateral` is the cube's,
+    and `changed` and `apart` are of the trajectory. None where nothing was carried out.
     """
 
     rows: NDArray[np.int64]
@@ -100,16 +106,22 @@ class Replayed:
     changed: NDArray[np.float64]
     ledger: NDArray[np.float64]
     apart: NDArray[np.float64]
+    outcomes: NDArray[np.str_] | None = None
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Those that are there, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
     def joined(cls, parts: Sequence["Replayed"]) -> "Replayed":
         """One after the other."""
-        axes = {"lateral": 1, "changed": 1, "ledger": 1}
+        axes = {"lateral": 1, "changed": 1, "ledger": 1, "outcomes": 1}
         return cls(
-            *(
-                np.concatenate([getattr(p, name) for p in parts], axis=axes.get(name, 0))
-                for name in cls.__annotations__
-            )
+            **{
+                name: np.concatenate([getattr(part, name) for part in parts], axis=axes.get(name, 0))
+                for name in parts[0].arrays
+            }
         )
 
 

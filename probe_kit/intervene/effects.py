@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError
+from probe_kit.intervene.carried_out import CarriedOut, carried_out, carried_out_frame
 from probe_kit.intervene.following import Following, following, following_frame, stored_following
 from probe_kit.intervene.passing import Passing, passing, passing_frame, stored_places
 from probe_kit.intervene.sensitivity import sensitivity
@@ -48,17 +49,30 @@ class Effects:
 
     @property
     def rows(self) -> list[Following]:
-        """What the exchange of the pictures did, one per category; empty if they were not exchanged."""
-        return following(self.answers, self.suite, self.key) if EXCHANGED in self.answers.conditions else []
+        """What the exchange of the pictures did, one per category; empty if no first action was asked for it."""
+        if self.answers.outcomes is not None or EXCHANGED not in self.answers.conditions:
+            return []
+        return following(self.answers, self.suite, self.key)
 
     @property
     def changes(self) -> list[Passing]:
-        """What changes inside the network did, one per category and change; empty for `follow` and `words`."""
+        """What changes inside the network did to first actions, one per category and change; else empty."""
+        if self.answers.outcomes is not None:
+            return []
         return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
 
     @property
+    def carried_out(self) -> list[CarriedOut]:
+        """What changes did to whole episodes, one per category and condition; empty but for a closed loop."""
+        return [] if self.answers.outcomes is None else carried_out(self.answers, self.suite, self.key)
+
+    @property
     def table(self) -> "pd.DataFrame":
-        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`."""
+        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing` or,
+        in a closed loop, `CarriedOut`.
+        """
+        if self.answers.outcomes is not None:
+            return carried_out_frame(self.carried_out)
         if self.kind == WORDS:
             return words_frame(self.answers, self.suite, self.key)
         if self.kind != FOLLOW:
@@ -72,7 +86,13 @@ class Effects:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader must know, a sentence each."""
-        return (*self._replayed(), *self._passed_over(), *self._one_step(), *self._large_doses())
+        return (
+            *self._replayed(),
+            *self._passed_over(),
+            *self._one_step(),
+            *self._large_doses(),
+            *self._broken_hands(),
+        )
 
     def _passed_over(self) -> list[str]:
         counts = self.certificate.get("items", {"asked": 0, "played": 0})
@@ -80,7 +100,8 @@ class Effects:
         return [f"{left_out} of {counts['asked']} items have no twin and were passed over."] if left_out else []
 
     def _one_step(self) -> list[str]:
-        if self.certificate.get("supported", {}).get("readout") != "shadow":
+        is_shadow = self.certificate.get("supported", {}).get("readout") == "shadow"
+        if not is_shadow or self.answers.outcomes is not None:
             return []
         return [
             "This family's inference is one action in greedy bins: what the first one does says little of where "
@@ -94,18 +115,30 @@ class Effects:
             for name, ratio in large.items()
         ]
 
+    def _broken_hands(self) -> list[str]:
+        return [
+            f"{row.category}, {row.name}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
+            "hand is broken, and this enters no verdict."
+            for row in self.carried_out
+            if row.hand_broken
+        ]
+
     def _replayed(self) -> tuple[str, ...]:
         check = self.certificate["replay"]
         if check["compared"] == 0:
             return (
-                "The run does not say what was carried out, so that plain inferences were not compared with it.",
+                f"The run does not say what was carried out, so that {self._plain} were not compared with it.",
             )
         if check["equal"] < check["compared"]:
             return (
-                f"{check['equal']} of {check['compared']} plain inferences are the run's bit for bit; the others "
+                f"{check['equal']} of {check['compared']} {self._plain} are the run's bit for bit; the others "
                 f"differ by at most {check['largest_difference']:.2g}: a larger batch, or another device.",
             )
         return ()
+
+    @property
+    def _plain(self) -> str:
+        return "plain inferences" if self.answers.outcomes is None else "trajectories at dose 0"
 
     def to_json(self) -> str:
         """Key, settings, certificate and the table as JSON."""
@@ -126,6 +159,10 @@ class Effects:
         """The table for a console."""
         from probe_kit.intervene.tables import following_table, passing_table, words_table
 
+        if self.answers.outcomes is not None:
+            from probe_kit.intervene.carried_out_table import carried_out_table
+
+            return carried_out_table(self.carried_out, self.label, self.suite, self.random_weights)
         if self.kind == WORDS:
             return words_table(self.rows, sensitivity(self.answers), self.label, self.suite, self.random_weights)
         if self.kind != FOLLOW:
@@ -166,6 +203,8 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
 
 def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED) -> str:
     """As stored beside the answers, without verdicts, which later probes may change."""
+    if answers.outcomes is not None:
+        return carried_out_frame(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
     changes = passing(answers, suite, toward)
     if {PICTURES, NOISE} <= set(answers.conditions):
         return words_frame(answers, suite).drop(columns="key").to_csv(index=False)

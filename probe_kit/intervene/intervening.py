@@ -11,7 +11,7 @@ from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.registry import known_families
 from probe_kit.intervene.bench import Bench, Source, open_bench
-from probe_kit.intervene.conditions import Condition, Intervention, Replayed, replay
+from probe_kit.intervene.conditions import Condition, Intervention, Replayed
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
 from probe_kit.intervene.passing import Named
@@ -72,7 +72,7 @@ def _carry_out(
     with open_bench(run, source, load) as bench, bench.ready():
         items = asked.playable(bench, wanted)
         conditions = asked.conditions(bench)
-        parts = _replayed(bench, items, conditions, pieces, progress or notebook_progress("items replayed"))
+        parts = _replayed(bench, asked, items, conditions, pieces, progress or notebook_progress("items replayed"))
         certificate = {
             "policy": bench.policy.card.to_json(),
             "provenance": _provenance(bench),
@@ -106,7 +106,12 @@ def items_of(run: Run, asked: Intervention) -> list[str]:
 
 
 def _replayed(
-    bench: Bench, items: Sequence[str], conditions: Sequence[Condition], pieces: Pieces, progress: Progress | None
+    bench: Bench,
+    asked: Intervention,
+    items: Sequence[str],
+    conditions: Sequence[Condition],
+    pieces: Pieces,
+    progress: Progress | None,
 ) -> Replayed:
     """Item by item; what a former attempt finished is read back."""
     parts = []
@@ -114,8 +119,8 @@ def _replayed(
         name = f"{number:06d}"
         stored = pieces.read(name)
         if stored is None:
-            part = replay(bench, bench.questions(item), conditions)
-            pieces.keep(name, vars(part))
+            part = asked.play(bench, item, conditions)
+            pieces.keep(name, part.arrays)
         else:
             part = Replayed(**stored)
         parts.append(part)
@@ -140,6 +145,7 @@ def _answers(run: Run, conditions: Sequence[str], found: Replayed) -> Answers:
         changed=found.changed,
         ledger=found.ledger,
         apart=found.apart,
+        outcomes=found.outcomes,
     )
 
 
@@ -151,6 +157,8 @@ def _replay_check(found: Replayed) -> dict[str, Any]:
         "compared": int(known.size),
         "equal": int((known == 0).sum()),
         "largest_difference": float(known.max(initial=0.0)),
+        # One that differs stops an intervention before anything is stored.
+        **({} if found.outcomes is None else {"outcomes_equal": int(found.apart.size)}),
     }
 
 

@@ -31,6 +31,17 @@ class Ledger:
     moved: float = 0.0
     largest: float = 0.0
 
+    @classmethod
+    def sum(cls, ledgers: Sequence["Ledger"]) -> "Ledger":
+        """Of several inferences, or of several streams of one."""
+        return cls(
+            sum(one.fires for one in ledgers),
+            sum(one.still for one in ledgers),
+            sum(one.norm for one in ledgers),
+            sum(one.moved for one in ledgers),
+            max((one.largest for one in ledgers), default=0.0),
+        )
+
     def row(self) -> NDArray[np.float64]:
         """(5,) as stored; `norm` and `moved` per fire."""
         per = max(self.fires, 1)
@@ -97,6 +108,16 @@ class Moved:
         del site, where
         found: Tensor = own + torch.from_numpy(self.vector).to(own.device)
         return found
+
+
+@dataclass(frozen=True)
+class Kept:
+    """As they are: a dose of zero, which is written back like any other."""
+
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+        """own."""
+        del site, where
+        return own
 
 
 @contextmanager

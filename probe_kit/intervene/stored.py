@@ -41,7 +41,8 @@ class Answers:
     conditions: names of the K, the plain one first. episodes, items, groups, categories, sides: (E,), `sides`
     those of the correct picture. lateral: (K, E) metres from the middle, left positive. changed: (K, E) largest
     difference of any action from the plain one's. ledger: (K, E, 5), see `patching.LEDGER`. apart: (E,) of the
-    plain one from the stored one.
+    plain one from the stored one. outcomes: (K, E) correct, wrong or oob, where episodes were played to their end;
+    else None.
     """
 
     conditions: tuple[str, ...]
@@ -54,6 +55,7 @@ class Answers:
     changed: NDArray[np.float64]
     ledger: NDArray[np.float64]
     apart: NDArray[np.float64]
+    outcomes: NDArray[np.str_] | None = None
 
     def of(self, condition: str) -> NDArray[np.float64]:
         """(E,) lateral of one condition."""
@@ -67,18 +69,19 @@ class Answers:
     def only(self, category: str) -> "Answers":
         """The episodes of one category."""
         chosen = self.categories == category
-        axes = {"lateral": 1, "changed": 1, "ledger": 1}
+        axes = {"lateral": 1, "changed": 1, "ledger": 1, "outcomes": 1}
         cut: dict[str, Any] = {
             name: np.compress(chosen, value, axes.get(name, 0))
             for name, value in vars(self).items()
-            if name != "conditions"
+            if name != "conditions" and value is not None
         }
         return Answers(self.conditions, **cut)
 
     def to_bytes(self) -> bytes:
         """As a `.npz`; the same answers give the same bytes."""
         file = BytesIO()
-        arrays = {**vars(self), "conditions": np.array(self.conditions)}
+        arrays = {name: value for name, value in vars(self).items() if value is not None}
+        arrays["conditions"] = np.array(self.conditions)
         np.savez_compressed(file, allow_pickle=False, **arrays)
         return file.getvalue()
 
@@ -86,7 +89,9 @@ class Answers:
     def from_bytes(cls, content: bytes) -> "Answers":
         """Read back."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
-            found: dict[str, Any] = {name: arrays[name] for name in cls.__annotations__}
+            found: dict[str, Any] = {
+                name: arrays[name] for name in cls.__annotations__ if name in arrays or name != "outcomes"
+            }
         return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
 
 

@@ -104,3 +104,16 @@ def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...],
     code, _, said = ask(run, *options)
     assert code == 2
     assert words in " ".join(said.split())
+
+
+def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
+    for options, words in (
+        ((), "--kind interchange"),
+        (("--roles", "image"), "go with --sites"),
+        (("--doses", "1"), "--doses means nothing to --kind closed-loop"),
+        (("--sites", "backbone.02", "--direction", "none", "--controls", "1"), "--controls 0"),
+        (("--sites", "backbone.02"), "--suite"),
+    ):
+        code, _, said = ask(run, "--kind", "closed-loop", *options)
+        assert code == 2
+        assert words in " ".join(said.split())

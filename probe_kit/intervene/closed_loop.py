@@ -1,0 +1,157 @@
+"""Closed loop: the episode is really played again, with the change made at every inference.
+
+What the first inference would do is a forecast. Here the cube lands somewhere, and the run's own outcomes are what
+it is held against: the same scene, the same seeds, and a dose of zero that must give every one of them again.
+"""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.env.rules import DEFAULT_RULE
+from probe_kit.errors import UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.interventions import InterventionKind
+from probe_kit.hooks.sites import MEMORY_STREAM, Site
+from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
+from probe_kit.intervene.directions import MEAN_DIFFERENCE, axes_of
+from probe_kit.intervene.interchange import NONE, TakenOver
+from probe_kit.intervene.passing import Passing, stored_passing
+from probe_kit.intervene.patching import Kept, Ledger, patched
+from probe_kit.intervene.places import ALL, Place, places, token_mask
+from probe_kit.intervene.stored import PLAIN
+from probe_kit.train.reader import RunReader
+
+CELL = "|"
+KIND = "closed-loop"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop(Intervention):
+    """Interchange at a few cells, carried out: dose zero, exchanged pictures, every cell, and its controls.
+
+    cells: `PLACE|ROLE`, such as `backbone.02|image`; see `best_cells`. direction: along which a cell is taken over
+    as well, beside `controls` random ones of the data's own covariance, where a place is one site; `none` for
+    neither. The tokens of every cell are also taken over whole.
+    """
+
+    cells: tuple[str, ...]
+    direction: str = MEAN_DIFFERENCE
+    controls: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.cells or any(cell.count(CELL) != 1 for cell in self.cells):
+            raise UsageError(f"cells are {self.cells}; expected PLACE|ROLE, such as backbone.02|image")
+        if self.controls and self.direction == NONE:
+            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
+
+    @property
+    def kind(self) -> str:
+        """`closed-loop`."""
+        return KIND
+
+    @property
+    def needs(self) -> tuple[InterventionKind, ...]:
+        """Edits; and a memory, where one of its places is."""
+        memory = any(cell.partition(".")[0] == MEMORY_STREAM for cell in self.cells)
+        return ("edit", "memory") if memory else ("edit",)
+
+    def own_settings(self) -> dict[str, Any]:
+        """Where and along what; it is read where the cube ends."""
+        return {
+            "readout": "episode", "cells": list(self.cells), "direction": self.direction,
+            "controls": self.controls, "seed": self.seed,
+        }  # fmt: skip
+
+    def chosen(self, run: Run) -> tuple[str, ...]:
+        """Its categories. Raises UsageError for outcomes by another rule than they were recorded by."""
+        if run.rule != DEFAULT_RULE:
+            raise UsageError(
+                f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
+                f"recorded: open the run without another rule ({DEFAULT_RULE})"
+            )
+        return super().chosen(run)
+
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """Dose zero, exchanged pictures, and every cell. Raises UnknownSiteError, NoProbesError."""
+        split = [self._split(cell) for cell in self.cells]
+        tried = [(place, role) for pattern, role in split for place in places(pattern, bench.policy)]
+        donors = tuple(dict.fromkeys(site for place, _ in tried for site in place.sites))
+        found: list[Condition] = [DoseZero(donors), Exchanged()]
+        for place, role in tried:
+            found.append(TakenOver(place, role, donors))
+            found += self._along(bench, place, role, donors)
+        return found
+
+    def play(self, bench: Bench, item: str, conditions: Sequence[Condition]) -> Replayed:
+        """The item's episodes, each under every condition, from its first step to its last."""
+        from probe_kit.intervene.playing import play
+
+        return play(bench, bench.questions(item), conditions)
+
+    def _along(self, bench: Bench, place: Place, role: str, donors: tuple[Site, ...]) -> list[Condition]:
+        if self.direction == NONE or len(place.sites) != 1:
+            return []
+        axes = axes_of(bench.run, place.only_site, role, self.direction, self.controls, self.seed)
+        return [TakenOver(place, role, donors, name, axes) for name in (self.direction, *axes.control_names)]
+
+    @staticmethod
+    def _split(cell: str) -> tuple[str, str]:
+        place, _, role = cell.partition(CELL)
+        return place, role
+
+
+@dataclass(frozen=True)
+class DoseZero:
+    """As the run made it, with every site that any condition changes written back as it was."""
+
+    sites: tuple[Site, ...]
+    name: str = PLAIN
+
+    def play(self, turn: Turn) -> Played:
+        """Hooks fire, and nothing moves."""
+        bench, seen = turn.bench, turn.question.seen
+        with ExitStack() as stack:
+            ledgers = [
+                stack.enter_context(
+                    patched(
+                        bench.policy,
+                        [site for site in self.sites if site.stream == stream],
+                        token_mask(bench.policy, seen, stream, ALL),
+                        Kept(),
+                    )
+                )
+                for stream in dict.fromkeys(site.stream for site in self.sites)
+            ]
+            chunk = bench.act(seen, turn.question.seed)
+        return Played(chunk, Ledger.sum(ledgers))
+
+
+def best_cells(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
+    """`PLACE|ROLE`, of each category the last place that the newest interchange located, in its narrowest role.
+
+    The last one is behind everything else through which the answer passes; of its roles the one with the largest
+    effect, and all tokens only where no single role carries half of it. Raises UsageError if none was located.
+    """
+    stored = stored_passing(run)
+    found = [_best(stored.get(category, [])) for category in categories]
+    cells = tuple(dict.fromkeys(cell for cell in found if cell is not None))
+    if not cells:
+        raise UsageError(
+            f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
+            "`probe-kit intervene RUN --kind interchange` first, or name --sites and --roles"
+        )
+    return cells
+
+
+def _best(rows: Sequence[Passing]) -> str | None:
+    located = [row for row in rows if row.is_located and not row.direction]
+    if not located:
+        return None
+    last = [row for row in located if row.place == located[-1].place]
+    best = max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
+    return f"{best.place}{CELL}{best.role}"

@@ -1,0 +1,149 @@
+"""Playing episodes again under conditions, step by step, beside the same state with its pictures exchanged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError, OtherFramesError
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.play.ensemble import ensemble
+from probe_kit.extract.play.stage import Answer, Ending
+from probe_kit.hooks.observation import Observation
+from probe_kit.identity import derive_seed
+from probe_kit.intervene.bench import Bench, Chunk, Question
+from probe_kit.intervene.conditions import Condition, Replayed, Turn
+from probe_kit.intervene.patching import LEDGER, Ledger
+from probe_kit.suite.items import LAYOUTS, Episode
+
+
+@dataclass(frozen=True)
+class Carried:
+    """One episode to its end. outcome: correct, wrong or oob. frames: (T + 1, C) as in `env.trajectory`."""
+
+    outcome: str
+    cube: tuple[float, float]
+    frames: NDArray[np.float32]
+    ledger: Ledger
+
+
+def play(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
+    """Play every episode under every condition; the first one, which changes nothing, is what the run has.
+
+    `changed` is the largest difference of any number of the trajectory from the first condition's, `apart` that of
+    the first condition's from the stored one's. Raises CaptureChangedActionError if an outcome is not the stored
+    one, OtherFramesError if the state beside exchanged pictures goes its own way.
+    """
+    shape = len(conditions), len(questions)
+    found = Replayed(
+        np.array([question.row for question in questions], np.int64),
+        np.empty(shape),
+        np.zeros(shape),
+        np.zeros((*shape, len(LEDGER))),
+        np.empty(len(questions)),
+        np.zeros(shape, "U7"),
+    )
+    assert found.outcomes is not None
+    for column, question in enumerate(questions):
+        plain = carry_out(bench, question, conditions[0], exchanging=False)
+        found.apart[column] = _apart_from_stored(bench, question, plain)
+        for number, condition in enumerate(conditions):
+            carried = carry_out(bench, question, condition) if number else plain
+            found.lateral[number, column] = bench.across(np.array(carried.cube))
+            found.changed[number, column] = _largest(carried.frames, plain.frames)
+            found.ledger[number, column] = carried.ledger.row()
+            found.outcomes[number, column] = carried.outcome
+    return found
+
+
+def carry_out(bench: Bench, question: Question, condition: Condition, exchanging: bool = True) -> Carried:
+    """One episode under a condition that is in force at every inference.
+
+    exchanging: whether the condition looks at exchanged pictures; then a second stage is moved alike.
+    """
+    own, beside = bench.stages()
+    planned, turned = _planned(bench, question)
+    seen: Answer = own.begin(planned, False)
+    other: Answer = beside.begin(turned, False) if exchanging else seen
+    past: list[Chunk] = []
+    ledgers = []
+    for call in count():
+        assert isinstance(seen, Observation)
+        assert isinstance(other, Observation)
+        seed = derive_seed(planned.policy_seed, "inference", call)
+        played = condition.play(Turn(bench, replace(question, seen=seen, exchanged=other, seed=seed)))
+        ledgers += [] if played.ledger is None else [played.ledger]
+        past.append(played.chunk)
+        actions = _executed(bench, past)
+        seen = own.advance(actions)
+        other = beside.advance(actions) if exchanging else seen
+        _check_alike(question, seen, other)
+        if isinstance(seen, Ending):
+            break
+    assert isinstance(seen, Ending)
+    assert seen.trajectory is not None
+    outcome = seen.outcome
+    where = float(outcome["cube_x"]), float(outcome["cube_y"])
+    return Carried(str(outcome["outcome"]), where, seen.trajectory, Ledger.sum(ledgers))
+
+
+def _planned(bench: Bench, question: Question) -> tuple[PlannedEpisode, PlannedEpisode]:
+    """The episode as the run planned it, and the one with its pictures exchanged."""
+    record = bench.run.episodes.iloc[question.row]
+    item = replace(bench.items[question.item_id], instruction=question.seen.instruction)
+    (other,) = (layout for layout in LAYOUTS if layout != question.layout)
+    seeds = int(record["scene_seed"]), int(record["policy_seed"])
+    own, turned = (PlannedEpisode(0, Episode(item, layout), *seeds) for layout in (question.layout, other))
+    return own, turned
+
+
+def _executed(bench: Bench, past: Sequence[Chunk]) -> Chunk:
+    """As in the run: the head of the newest chunk, or one action averaged over all."""
+    exponent = bench.policy.card.ensemble
+    return past[-1][: int(bench.run.settings["execute"])] if exponent is None else ensemble(past, exponent)[None]
+
+
+def _check_alike(question: Question, seen: Answer, other: Answer) -> None:
+    """Pictures have no weight, so that the same actions lead both stages to the same state."""
+    if isinstance(seen, Observation) and isinstance(other, Observation):
+        alike = np.array_equal(seen.state, other.state, equal_nan=True)
+    else:
+        alike = isinstance(seen, Ending) and isinstance(other, Ending)
+    if not alike:
+        raise OtherFramesError(
+            f"{question.episode_id}: the same actions before exchanged pictures led to another state; expected "
+            "the same. The simulator is not deterministic here; use the machine and versions that the run's "
+            "provenance names"
+        )
+
+
+def _apart_from_stored(bench: Bench, question: Question, plain: Carried) -> float:
+    """By how much the episode differs from the stored one; NaN where the run keeps no trajectory.
+
+    Raises CaptureChangedActionError for another outcome.
+    """
+    stored = str(bench.run.episodes.iloc[question.row]["outcome"])
+    if stored != plain.outcome:
+        raise CaptureChangedActionError(
+            f"{question.episode_id}, played again with nothing changed, ended {plain.outcome}; the run has "
+            f"{stored}. A closed loop is held against the run's own outcomes, so that all must repeat: extract "
+            "with --batch 1 on this machine (larger batches and other devices round otherwise), then intervene on "
+            "that run"
+        )
+    try:
+        frames = bench.run.trajectory(question.row).frames
+    except NoTrajectoryError:
+        return nan
+    return _largest(plain.frames, frames)
+
+
+def _largest(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Largest difference over the frames that both have; 0 only if they are the same bit for bit."""
+    if np.array_equal(one, other, equal_nan=True):
+        return 0.0
+    both = min(len(one), len(other))
+    apart = np.abs(one[:both].astype(np.float64) - other[:both])
+    return max(float(np.nanmax(apart)), float(np.finfo(np.float32).tiny))
