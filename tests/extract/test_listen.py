@@ -30,7 +30,7 @@ def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), listen=True
     )
     run = extract_run(settings, tmp_path_factory.mktemp("listened") / "run")
-    train_probes(run, views=["mean"], permutations=19, controls=())
+    train_probes(run, views=["mean"], permutations=5, controls=())
     return open_run(run.path)
 
 
