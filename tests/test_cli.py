@@ -40,7 +40,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     run = tmp_path / "run"
     made = in_process(
         "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
-        "--categories", "color", "--items", 6, "--max-steps", 2, "--out", run,
+        "--categories", "color", "--max-steps", 2, "--out", run,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     assert "RANDOM" in made.stderr
@@ -61,7 +61,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
         assert "random" in in_process("retention", run, "--format", style).stdout.lower()
     again = in_process(
         "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
-        "--categories", "color", "--items", 6, "--max-steps", 3, "--out", run,
+        "--categories", "color", "--max-steps", 3, "--out", run,
     )  # fmt: skip
     assert again.returncode == 3
     assert "scene.max_steps: stored 2, asked 3" in again.stderr
@@ -124,7 +124,7 @@ def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_pat
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]
-    command += ["--suite", str(small_suite.folder), "--items", "3", "--max-steps", "10"]
+    command += ["--suite", str(small_suite.folder), "--items", "6", "--max-steps", "20"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     while len(list(run.glob("commits/*.json"))) < 3 and time.monotonic() < deadline:
@@ -134,10 +134,10 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     assert process.returncode == 130
     assert "the same command continues" in messages
     kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert 3 <= len(kept) < 12
+    assert 3 <= len(kept) < 24
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0
     now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert len(now) == 12
+    assert len(now) == 24
     assert all(now[name] == stamp for name, stamp in kept.items())
 
 

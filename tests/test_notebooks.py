@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import nbformat
 import pytest
 from nbformat import NotebookNode
 
@@ -27,19 +28,47 @@ PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^
 """How a cell ends that is there to show a picture; a semicolon would hide it where no backend is inline."""
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, NotebookNode]]:
+SHORT = {
+    "max_steps=24": "max_steps=4",
+    "suite=suite.folder, env_workers=0)": "suite=suite.folder, env_workers=0, scene=pk.SceneSpec(max_steps=4))",
+}
+"""Episodes that end after one inference: most of what the notebooks cost is rendering."""
+
+
+@pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.slow)])
+def made(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, NotebookNode]]:
     """The folder in which all notebooks ran, and the notebooks with fresh outputs."""
     folder = tmp_path_factory.mktemp("notebooks")
 
+    def source(name: str) -> Path:
+        """The notebook as it is, or with short episodes."""
+        if request.param == "whole":
+            return FOLDER / f"{name}.ipynb"
+        notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+        for cell in notebook.cells:
+            for long, short in SHORT.items():
+                cell.source = cell.source.replace(long, short)
+        path = folder / f"{name}.ipynb"
+        nbformat.write(notebook, path)
+        return path
+
     def run(names: Sequence[str]) -> list[NotebookNode]:
         with kernel(folder) as manager:
-            return [executed(FOLDER / f"{name}.ipynb", folder, manager) for name in names]
+            return [executed(source(name), folder, manager) for name in names]
 
     with ThreadPoolExecutor(2) as pool:
         fresh = [notebook for ran in pool.map(run, BESIDE_EACH_OTHER) for notebook in ran]
     names = [name for group in BESIDE_EACH_OTHER for name in group]
     return folder, dict(zip(names, fresh, strict=True))
+
+
+def test_the_short_notebooks_are_shorter() -> None:
+    sources = [
+        cell.source for name in NAMES for cell in nbformat.read(FOLDER / f"{name}.ipynb", as_version=4).cells
+    ]
+    assert [sum(long in source for source in sources) for long in SHORT] == [4, 1]
 
 
 def printed(notebook: NotebookNode) -> str:
@@ -64,13 +93,12 @@ def test_these_are_all_notebooks() -> None:
 def test_a_notebook_runs_and_its_committed_outputs_are_those_of_its_cells(
     name: str, made: tuple[Path, dict[str, NotebookNode]]
 ) -> None:
-    import nbformat
-
     committed = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     assert any(outputs for outputs in kinds(committed))
     assert kinds(made[1][name]) == kinds(committed)
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     made: tuple[Path, dict[str, NotebookNode]],
 ) -> None:

@@ -100,7 +100,10 @@ util.find_spec = lambda name, *rest: None if name == "rtbdata" else found(name, 
 """
 
 
-@pytest.mark.parametrize("workers", [(), ("--workers", "1"), ("--env-workers", "2")])
+@pytest.mark.parametrize(
+    "workers",
+    [("--workers", "1"), *(pytest.param(other, marks=pytest.mark.slow) for other in [(), ("--env-workers", "2")])],
+)
 def test_the_exit_code_of_a_missing_extra_is_that_of_a_wrong_usage(
     workers: tuple[str, ...], suite: Suite, tmp_path: Path
 ) -> None:

@@ -120,7 +120,7 @@ FAILURES = {
 def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
     planted_run: PlantedRun, options: dict[str, object]
 ) -> None:
-    run = planted_run()
+    run = planted_run(n_items=12)
     before = train_probes(run, permutations=1, views=("mean",))
     files = sorted(run.path.rglob("*"))
     done: list[int] = []
