@@ -97,26 +97,32 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
 
 @pytest.mark.parametrize("model", ["expert", pytest.param("pi0-tiny", marks=pytest.mark.slow)])
 def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: Suite, tmp_path: Path) -> None:
-    run = tmp_path / "run"
     alone = ExtractSettings(model, suite=suite.folder, scene=SHORT, env_workers=0)
     plain = extract_run(alone, tmp_path / "plain").path
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", model, "--suite", str(suite.folder)]
-    command += ["--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out", str(run)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    killed = _kill_a_worker(process.pid, run)
-    _, messages = process.communicate(timeout=120)
-    assert process.returncode == 0, messages
-    assert killed
-    assert commits(run) == commits(plain)
+    command += ["--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out"]
+    for attempt in range(5):  # on a busy machine a run may end before its worker is killed
+        run = tmp_path / f"run-{attempt}"
+        process = subprocess.Popen([*command, str(run)], stderr=subprocess.PIPE, text=True)
+        killed = _kill_a_worker(process.pid, run)
+        _, messages = process.communicate(timeout=120)
+        assert process.returncode == 0, messages
+        assert commits(run) == commits(plain)
+        if killed:
+            return
+    pytest.fail("no worker could be killed in time")
 
 
 def _kill_a_worker(driver: int, run: Path) -> bool:
-    """Kill one child of the driver as soon as something is committed."""
+    """Kill one child of the driver as soon as something is committed; whether there was one to kill."""
     deadline = time.monotonic() + 90
     while time.monotonic() < deadline:
         if list(run.glob("commits/*.json")):
-            children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
-            os.kill(int(children[0]), signal.SIGKILL)
+            try:
+                children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
+                os.kill(int(children[0]), signal.SIGKILL)
+            except (FileNotFoundError, IndexError, ProcessLookupError):
+                return False
             return True
         time.sleep(0.02)
     return False
