@@ -88,7 +88,7 @@ def test_a_worker_process_hands_its_error_on(suite: Suite, tmp_path: Path) -> No
 def test_a_ray_actor_answers_with_its_error_instead_of_dying(suite: Suite, tmp_path: Path) -> None:
     """Raised, it would come back as one of Ray's, or as that of a dead actor, and cost episodes."""
     extraction = spoiled_after_planning(suite, tmp_path)
-    answer = RayActor(extraction.settings, str(tmp_path / "run")).play([0])
+    answer = RayActor(extraction.settings, str(tmp_path / "run")).begin()
     assert isinstance(answer, SuiteError)
     assert "changed" in str(answer)
 

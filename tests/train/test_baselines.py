@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -8,8 +9,9 @@ from PIL import Image
 
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite import Suite, build_suite, load_picture
+from probe_kit.suite.build import default_folder
 from probe_kit.train import ArrayRun
-from probe_kit.train.baselines import baseline_features, suite_of
+from probe_kit.train.baselines import baseline_features, embedded_suite_of, suite_of
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +67,14 @@ def test_a_control_that_does_not_exist_lists_those_that_do(planted_run: Callable
     silent = ArrayRun(Path("R"), "m", "s@1#0", planted_run().episodes.drop(columns="instruction"), {})
     with pytest.raises(UsageError, match="no column 'instruction'"):
         baseline_features(silent, "instruction", None)
+
+
+def test_the_embedded_suite_is_used_only_where_it_was_built(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Drawing 1,650 items would be a surprise in the middle of fitting probes."""
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
+    run = SimpleNamespace(suite="a2a-embedded@1.0.0#0123456789ab")
+    assert embedded_suite_of(run) is None  # type: ignore[arg-type]
+    assert not default_folder().exists()
+    assert embedded_suite_of(SimpleNamespace(suite="mine@1#0")) is None  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.6 million parameters."""
+"""PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.61 million parameters."""
 
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
@@ -6,7 +6,7 @@ from probe_kit.hooks.options import Option
 FAMILIES = (
     Family(
         "vlm-tiny",
-        "PaliGemma at 0.6 million parameters, the embedded reader: knows Color, Shape, State and Traffic",
+        "PaliGemma at 0.61 million parameters, the embedded reader: knows Color, Shape, State and Traffic",
         None,
         "probe_kit.hooks.families.paligemma.adapter:load_vlm_tiny",
         streams="backbone 4 layers, answer 4 layers",

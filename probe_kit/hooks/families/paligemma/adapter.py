@@ -89,7 +89,7 @@ def load_vlm_tiny(
     random_weights: bool = False,
     weights_seed: int = 0,
 ) -> PaliGemma:
-    """The embedded reader: PaliGemma at 0.6 million parameters, trained on the prompts of `probe-kit ask`."""
+    """The embedded reader: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
     place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
     reader = PaliGemma(load_vlm(_RECIPE, place, device, dtype, random_weights, weights_seed))
     reader.card = replace(reader.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
