@@ -7,7 +7,7 @@ import pytest
 
 from tests.faults import Stored, draw_fault
 
-FAST, SLOW, BLOCK = 100, 5000, 100
+FAST, SLOW, BLOCK = 50, 5000, 100
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.extract import verify_run
+from probe_kit.suite import Suite
 from tests.reading import readings
 
 
@@ -45,11 +46,17 @@ def test_a_run_on_a_read_only_disk_is_read_and_verified(disk: Path, little_runs:
 
 @pytest.mark.parametrize(
     "command",
-    ["extract --model expert --items 2 --out {}/new", "run seal {}/bare", "train {}/run --permutations 7"],
+    [
+        "extract --model expert --items 2 --suite {suite} --out {}/new",
+        "run seal {}/bare",
+        "train {}/run --permutations 7",
+    ],
     ids=lambda command: command.split(" -")[0].split(" {")[0],
 )
-def test_whatever_writes_there_says_that_the_disk_is_read_only(disk: Path, command: str) -> None:
-    answer = CliRunner().invoke(app, command.format(disk).split())
+def test_whatever_writes_there_says_that_the_disk_is_read_only(
+    disk: Path, command: str, small_suite: Suite
+) -> None:
+    answer = CliRunner().invoke(app, command.format(disk, suite=small_suite.folder).split())
     assert answer.exit_code == 3, answer.output
     assert "is read-only" in " ".join(answer.output.split())
     assert "Traceback" not in answer.output
