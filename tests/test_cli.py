@@ -45,7 +45,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     assert made.returncode == 0, made.stderr
     assert "RANDOM" in made.stderr
     assert made.stdout.strip() == str(run)
-    trained = in_process("train", run, "--permutations", 20)
+    trained = in_process("train", run, "--permutations", 3)
     assert trained.returncode == 0, trained.stderr
     shown = ("--html", tmp_path / "report.html", "--figures", tmp_path / "figures")
     printed = in_process("retention", run, "--format", "json", *shown)

@@ -9,12 +9,18 @@ import pytest
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
-@pytest.mark.parametrize("steps", [4, pytest.param(20, marks=pytest.mark.slow)])
-def test_the_python_example_runs(steps: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As it stands in the slow suite; in the default one its episodes end after one inference."""
+SHORT = {"max_steps=20": "max_steps=4", "permutations=50": "permutations=3"}
+
+
+@pytest.mark.parametrize("changes", [SHORT, pytest.param({}, marks=pytest.mark.slow)], ids=["short", "as it is"])
+def test_the_python_example_runs(
+    changes: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the default suite with one inference per episode and few relabellings."""
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert "max_steps=20" in example
-    example = example.replace("max_steps=20", f"max_steps={steps}")
+    for long, short in changes.items():
+        assert long in example
+        example = example.replace(long, short)
     with contextlib.chdir(tmp_path):
         exec(compile(example, "README", "exec"), {"__name__": "__main__"})
     assert "(24, 96) float32" in capsys.readouterr().out

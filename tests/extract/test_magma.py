@@ -17,13 +17,15 @@ from tests.magma_checkpoints import write_checkpoint
 STEPS = 2
 
 
-def settings(model: str, suite: Suite, checkpoint: Path | None = None, **more: object) -> ExtractSettings:
+def settings(
+    model: str, suite: Suite, checkpoint: Path | None = None, items: int = 3, **more: object
+) -> ExtractSettings:
     return ExtractSettings(
         model,
         None if checkpoint is None else str(checkpoint),
         suite=suite.folder,
         categories=("color",),
-        items=12,
+        items=items,
         scene=SceneSpec(max_steps=STEPS),
         **more,
     )
@@ -40,10 +42,14 @@ def acting(small_suite: Suite, folder: Path, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture(scope="module")
-def talking(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def wordy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights that put out anything but actions."""
-    folder = write_checkpoint(tmp_path_factory.mktemp("talking"), steered=False)
-    chosen = settings("magma", small_suite, folder, tokens="all")
+    return write_checkpoint(tmp_path_factory.mktemp("talking"), steered=False)
+
+
+@pytest.fixture(scope="module")
+def talking(small_suite: Suite, wordy: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    chosen = settings("magma", small_suite, wordy, tokens="all")
     return extract_run(chosen, tmp_path_factory.mktemp("runs") / "talking")
 
 
@@ -55,15 +61,15 @@ def test_a_run_has_both_streams_and_every_role(acting: Run) -> None:
     for site, wanted in ((Site("backbone", 3), views), (Site("action", 3, iteration=6), ("mean", "mean:action"))):
         for view in wanted:
             column = np.asarray(acting.column(site, view))
-            assert column.shape == (24, 64)
+            assert column.shape == (6, 64)
             assert np.isfinite(column).all()
             assert column.std(axis=0).max() > 0
 
 
 def test_steps_without_an_action_are_counted_per_episode(acting: Run, talking: Run) -> None:
-    assert acting.episodes["inferences"].tolist() == [STEPS] * 24
-    assert acting.episodes["flagged_steps"].tolist() == [0] * 24
-    assert talking.episodes["flagged_steps"].tolist() == [STEPS] * 24
+    assert acting.episodes["inferences"].tolist() == [STEPS] * 6
+    assert acting.episodes["flagged_steps"].tolist() == [0] * 6
+    assert talking.episodes["flagged_steps"].tolist() == [STEPS] * 6
     assert (talking.episodes["outcome"] == "oob").all()
 
 
@@ -72,7 +78,7 @@ def test_tokens_are_stored_by_role(talking: Run) -> None:
     site = Site("backbone", 0)
     for role, count in (("image", 16), ("separator", 4)):
         values, mask = talking.tokens(site, role=role)
-        assert mask.sum(axis=1).tolist() == [count] * 24
+        assert mask.sum(axis=1).tolist() == [count] * 6
         assert np.abs(values[mask]).max() > 0
 
 
@@ -87,10 +93,13 @@ def test_protocol_and_units_are_part_of_a_runs_identity(acting: Run, small_suite
 
 @pytest.mark.slow
 def test_it_stands_in_one_table_beside_another_family_with_its_flagged_steps(
-    acting: Run, talking: Run, small_suite: Suite, tmp_path: Path
+    folder: Path, wordy: Path, small_suite: Suite, tmp_path: Path
 ) -> None:
-    tiny = extract_run(settings("pi0-tiny", small_suite), tmp_path / "tiny")
-    runs = [acting, talking, tiny]
+    chosen = (("magma", folder), ("magma", wordy), ("pi0-tiny", None))
+    runs = [
+        extract_run(settings(model, small_suite, checkpoint, items=12), tmp_path / str(number))
+        for number, (model, checkpoint) in enumerate(chosen)
+    ]
     for run in runs:
         train_probes(run, permutations=0)
     table = retention(runs)

@@ -15,26 +15,32 @@ from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests import internvla_checkpoints, xiaomi_checkpoints
 
-EPISODES = 24
+EPISODES = 6
 
 
-def settings(model: str, suite: Suite, checkpoint: Path | None = None, **more: object) -> ExtractSettings:
+def settings(
+    model: str, suite: Suite, checkpoint: Path | None = None, items: int = EPISODES // 2, **more: object
+) -> ExtractSettings:
     return ExtractSettings(
         model,
         None if checkpoint is None else str(checkpoint),
         suite=suite.folder,
         categories=("color",),
-        items=12,
+        items=items,
         scene=SceneSpec(max_steps=1),
         **more,
     )
 
 
 @pytest.fixture(scope="module")
-def xiaomi(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def xiaomi_settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> ExtractSettings:
     folder = xiaomi_checkpoints.write_checkpoint(tmp_path_factory.mktemp("xiaomi"))
-    asked = settings("xiaomi-r0", small_suite, folder, batch=2, options={"steps": 2})
-    return extract_run(asked, tmp_path_factory.mktemp("runs") / "xiaomi")
+    return settings("xiaomi-r0", small_suite, folder, batch=2, options={"steps": 2})
+
+
+@pytest.fixture(scope="module")
+def xiaomi(xiaomi_settings: ExtractSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return extract_run(xiaomi_settings, tmp_path_factory.mktemp("runs") / "xiaomi")
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +92,11 @@ def test_other_options_are_another_run(internvla_settings: ExtractSettings, inte
 
 @pytest.mark.slow
 def test_they_stand_in_one_table_beside_another_family(
-    xiaomi: Run, internvla: Run, small_suite: Suite, tmp_path: Path
+    xiaomi_settings: ExtractSettings, internvla_settings: ExtractSettings, small_suite: Suite, tmp_path: Path
 ) -> None:
     """The half without a condition is stored, and no probe, peak or retention uses it."""
-    runs = [extract_run(settings("pi0-tiny", small_suite), tmp_path / "tiny"), xiaomi, internvla]
+    chosen = (settings("pi0-tiny", small_suite), xiaomi_settings, internvla_settings)
+    runs = [extract_run(replace(one, items=12), tmp_path / one.model) for one in chosen]
     for run in runs:
         probed = {str(site).partition(".")[0] for site in train_probes(run, permutations=0).scores["site"]}
         assert {"backbone", "expert"} <= probed

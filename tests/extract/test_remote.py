@@ -124,7 +124,7 @@ def test_reading_gives_the_same_numbers_from_a_bucket(recorded_run: Run, copied:
 
 
 def test_probes_of_a_bucket_are_stored_in_it(recorded_run: Run, copied: Run) -> None:
-    chosen = {"categories": ["color"], "permutations": 0}
+    chosen = {"categories": ["color"], "views": ["mean"], "permutations": 0}
     results = train_probes(copied, **chosen)
     expected = train_probes(recorded_run, **chosen)
     again = load_results(open_run(copied.location))
