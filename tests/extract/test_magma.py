@@ -18,7 +18,7 @@ STEPS = 2
 
 
 def settings(
-    model: str, suite: Suite, checkpoint: Path | None = None, items: int = 3, **more: object
+    model: str, suite: Suite, checkpoint: Path | None = None, items: int = 4, **more: object
 ) -> ExtractSettings:
     return ExtractSettings(
         model,
@@ -61,15 +61,15 @@ def test_a_run_has_both_streams_and_every_role(acting: Run) -> None:
     for site, wanted in ((Site("backbone", 3), views), (Site("action", 3, iteration=6), ("mean", "mean:action"))):
         for view in wanted:
             column = np.asarray(acting.column(site, view))
-            assert column.shape == (6, 64)
+            assert column.shape == (8, 64)
             assert np.isfinite(column).all()
             assert column.std(axis=0).max() > 0
 
 
 def test_steps_without_an_action_are_counted_per_episode(acting: Run, talking: Run) -> None:
-    assert acting.episodes["inferences"].tolist() == [STEPS] * 6
-    assert acting.episodes["flagged_steps"].tolist() == [0] * 6
-    assert talking.episodes["flagged_steps"].tolist() == [STEPS] * 6
+    assert acting.episodes["inferences"].tolist() == [STEPS] * 8
+    assert acting.episodes["flagged_steps"].tolist() == [0] * 8
+    assert talking.episodes["flagged_steps"].tolist() == [STEPS] * 8
     assert (talking.episodes["outcome"] == "oob").all()
 
 
@@ -78,7 +78,7 @@ def test_tokens_are_stored_by_role(talking: Run) -> None:
     site = Site("backbone", 0)
     for role, count in (("image", 16), ("separator", 4)):
         values, mask = talking.tokens(site, role=role)
-        assert mask.sum(axis=1).tolist() == [count] * 6
+        assert mask.sum(axis=1).tolist() == [count] * 8
         assert np.abs(values[mask]).max() > 0
 
 

@@ -15,7 +15,7 @@ from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests import internvla_checkpoints, xiaomi_checkpoints
 
-EPISODES = 6
+EPISODES = 8
 
 
 def settings(
