@@ -6,23 +6,19 @@ breaks the hand lowers a success rate as well as one that turns the choice, so t
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.following import WORTH
-from probe_kit.intervene.passing import Named
-from probe_kit.intervene.patching import LEDGER
+from probe_kit.intervene.passing import Named, beyond_controls, ledger_sums
 from probe_kit.intervene.stored import PLAIN, Answers
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.mcnemar import sign_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 BROKEN = 0.5
 """Share of the plain in-zone share below which a hand is called broken."""
@@ -98,11 +94,7 @@ class CarriedOut:
 
 def carried_out(answers: Answers, suite: str, key: str = "") -> list[CarriedOut]:
     """One per category and condition, dose 0 first. suite: its identity, of which intervals are drawn."""
-    return [
-        row
-        for category in dict.fromkeys(answers.categories.tolist())
-        for row in _of_category(answers.only(str(category)), str(category), suite, key)
-    ]
+    return [row for category, own in answers.by_category() for row in _of_category(own, category, suite, key)]
 
 
 def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[CarriedOut]:
@@ -123,8 +115,6 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[
     rows = []
     for at, name in enumerate(names):
         low, high = group_bootstrap(net[at][:, None], answers.groups, drawn, bounds=GAINS)
-        ledger = dict(zip(LEDGER, answers.ledger[at].T, strict=True))
-        norm = float((ledger["norm"] * ledger["fires"]).sum())
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
         t, p, p_fwe = found.get(at, (None, None, None))
         rows.append(
@@ -153,10 +143,8 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[
                 p_fwe=p_fwe,
                 hand_broken=bool(broken[at]),
                 changed=float(answers.changed[at].max()),
-                fires=int(ledger["fires"].sum()),
-                still=int(ledger["still"].sum()),
-                norm_ratio=float((ledger["moved"] * ledger["fires"]).sum()) / norm if norm else 0.0,
                 key=key,
+                **ledger_sums(answers.ledger[at]),
             )
         )
     return rows
@@ -167,15 +155,13 @@ def _tests(
     category: str,
     suite: str,
     net: NDArray[np.float64],
-    controls: Sequence[Sequence[int]],
+    controls: Sequence[list[int]],
     tested: Sequence[int],
 ) -> dict[int, tuple[float, float, float]]:
     """t, p and family-wise p of those conditions that may enter a verdict."""
     if not tested:
         return {}
-    beyond = np.stack(
-        [net[at] - net[list(controls[at])].mean(axis=0) if controls[at] else net[at] for at in tested]
-    )
+    beyond = beyond_controls(net, controls, tested)
     seed = derive_seed("sign flips", suite, category)
     values = zip(*max_t(beyond, answers.items, answers.groups, seed), strict=True)
     return {at: (float(t), float(p), float(p_fwe)) for at, (t, p, p_fwe) in zip(tested, values, strict=True)}
@@ -183,15 +169,3 @@ def _tests(
 
 def _mean(values: NDArray[np.float64]) -> float | None:
     return float(values.mean()) if values.size else None
-
-
-def carried_out_frame(rows: Sequence[CarriedOut]) -> "pd.DataFrame":
-    """One line per category and condition; the interval as two columns."""
-    import pandas as pd
-
-    flat = []
-    for row in rows:
-        plain = row.to_json()
-        low, high = plain.pop("net_ci")
-        flat.append({**plain, "net_ci_low": low, "net_ci_high": high})
-    return pd.DataFrame(flat)

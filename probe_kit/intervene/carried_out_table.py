@@ -18,12 +18,12 @@ _LEGEND = (
 )
 
 
-def carried_out_table(rows: Sequence[CarriedOut], label: str, suite: str, random_weights: bool) -> "FittingTable":
-    """One line per category and condition, dose 0 first."""
+def carried_out_table(rows: Sequence[CarriedOut], of: str) -> "FittingTable":
+    """One line per category and condition, dose 0 first. of: which model, on which suite."""
     from probe_kit.fitting_tables import FittingTable, Part
 
     return FittingTable(
-        title=f"Is it so when carried out? {f'{label} (random weights)' if random_weights else label} on {suite}",
+        title=f"Is it so when carried out? {of}",
         caption=_LEGEND,
         name="category · change",
         names=tuple(f"{row.category} · {'dose 0' if row.place == PLAIN else row.name}" for row in rows),

@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError
-from probe_kit.intervene.carried_out import CarriedOut, carried_out, carried_out_frame
-from probe_kit.intervene.following import Following, following, following_frame, stored_following
-from probe_kit.intervene.passing import Passing, passing, passing_frame, stored_places
+from probe_kit.intervene.carried_out import CarriedOut, carried_out
+from probe_kit.intervene.following import Following, following, stored_following
+from probe_kit.intervene.frames import frame_of
+from probe_kit.intervene.passing import Passing, passing, stored_places
 from probe_kit.intervene.sensitivity import sensitivity
 from probe_kit.intervene.stored import EXCHANGED, NOISE, PICTURES, Answers, Stored, find_stored
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
@@ -47,21 +49,21 @@ class Effects:
         """Of the intervention."""
         return str(self.settings["kind"])
 
-    @property
+    @cached_property
     def rows(self) -> list[Following]:
         """What the exchange of the pictures did, one per category; empty if no first action was asked for it."""
         if self.answers.outcomes is not None or EXCHANGED not in self.answers.conditions:
             return []
         return following(self.answers, self.suite, self.key)
 
-    @property
+    @cached_property
     def changes(self) -> list[Passing]:
         """What changes inside the network did to first actions, one per category and change; else empty."""
         if self.answers.outcomes is not None:
             return []
         return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
 
-    @property
+    @cached_property
     def carried_out(self) -> list[CarriedOut]:
         """What changes did to whole episodes, one per category and condition; empty but for a closed loop."""
         return [] if self.answers.outcomes is None else carried_out(self.answers, self.suite, self.key)
@@ -72,12 +74,12 @@ class Effects:
         in a closed loop, `CarriedOut`.
         """
         if self.answers.outcomes is not None:
-            return carried_out_frame(self.carried_out)
+            return frame_of(self.carried_out)
         if self.kind == WORDS:
             return words_frame(self.answers, self.suite, self.key)
         if self.kind != FOLLOW:
-            return passing_frame(self.changes)
-        frame = following_frame(self.rows)
+            return frame_of(self.changes)
+        frame = frame_of(self.rows)
         found = [self.verdicts.get(str(category), None) for category in frame["category"]]
         frame["verdict"] = [None if one is None else one.verdict for one in found]
         frame["reason"] = ["" if one is None else one.reason for one in found]
@@ -157,17 +159,18 @@ class Effects:
 
     def to_rich(self) -> "FittingTable":
         """The table for a console."""
+        of = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
         from probe_kit.intervene.tables import following_table, passing_table, words_table
 
         if self.answers.outcomes is not None:
             from probe_kit.intervene.carried_out_table import carried_out_table
 
-            return carried_out_table(self.carried_out, self.label, self.suite, self.random_weights)
+            return carried_out_table(self.carried_out, of)
         if self.kind == WORDS:
-            return words_table(self.rows, sensitivity(self.answers), self.label, self.suite, self.random_weights)
+            return words_table(self.rows, sensitivity(self.answers), of)
         if self.kind != FOLLOW:
-            return passing_table(self.changes, self.kind, self.label, self.suite, self.random_weights)
-        return following_table(self.rows, self.verdicts, self.label, self.suite, self.random_weights)
+            return passing_table(self.changes, self.kind, of)
+        return following_table(self.rows, self.verdicts, of)
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> Effects:
@@ -204,17 +207,18 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
 def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED) -> str:
     """As stored beside the answers, without verdicts, which later probes may change."""
     if answers.outcomes is not None:
-        return carried_out_frame(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
-    changes = passing(answers, suite, toward)
+        return frame_of(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
     if {PICTURES, NOISE} <= set(answers.conditions):
         return words_frame(answers, suite).drop(columns="key").to_csv(index=False)
-    frame = passing_frame(changes) if changes else following_frame(following(answers, suite))
+    changes = passing(answers, suite, toward)
+    frame = frame_of(changes) if changes else frame_of(following(answers, suite))
     return frame.drop(columns="key").to_csv(index=False)
 
 
 def words_frame(answers: Answers, suite: str, key: str = "") -> "pd.DataFrame":
     """One line per category: the fields of `Following`, of exchanged words, and of `Sensitivity`."""
-    frame = following_frame(following(answers, suite, key))
+    frame = frame_of(following(answers, suite, key))
+    steps = sensitivity(answers)
     for name in ("words", "pictures", "noise", "words_changed", "pictures_changed"):
-        frame[name] = [getattr(row, name) for row in sensitivity(answers)]
+        frame[name] = [getattr(row, name) for row in steps]
     return frame

@@ -1,7 +1,7 @@
 """What the exchange of the two pictures did, per category. Reads stored answers; needs no model."""
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +10,6 @@ from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 WORTH = 0.25
 """Share of episodes by which following must outweigh going against, to be called following."""
@@ -64,10 +61,7 @@ class Following:
 
 def following(answers: Answers, suite: str, key: str = "") -> list[Following]:
     """One per category, in the order of the episodes. suite: its identity, of which intervals are drawn."""
-    return [
-        _of_category(answers.only(str(category)), str(category), suite, key)
-        for category in dict.fromkeys(answers.categories.tolist())
-    ]
+    return [_of_category(own, category, suite, key) for category, own in answers.by_category()]
 
 
 def _of_category(answers: Answers, category: str, suite: str, key: str) -> Following:
@@ -101,15 +95,3 @@ def stored_following(run: RunReader) -> dict[str, Following]:
     for one in stored_interventions(run, "follow"):
         found |= {own.category: own for own in following(one.answers(), run.suite, one.key)}
     return found
-
-
-def following_frame(rows: "list[Following]") -> "pd.DataFrame":
-    """One line per category; the interval as two columns."""
-    import pandas as pd
-
-    flat = []
-    for row in rows:
-        plain = row.to_json()
-        low, high = plain.pop("net_ci")
-        flat.append({**plain, "net_ci_low": low, "net_ci_high": high})
-    return pd.DataFrame(flat)

@@ -7,7 +7,7 @@ away from it as well.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
@@ -112,9 +109,7 @@ class Passing:
 def passing(answers: Answers, suite: str, toward: str = "exchanged", key: str = "") -> list[Passing]:
     """One per category and change. toward: `exchanged`, or the side that was steered to, see `Steer`."""
     return [
-        row
-        for category in dict.fromkeys(answers.categories.tolist())
-        for row in _of_category(answers.only(str(category)), str(category), suite, toward, key)
+        row for category, own in answers.by_category() for row in _of_category(own, category, suite, toward, key)
     ]
 
 
@@ -134,11 +129,9 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
     names = [Named.of(answers.conditions[row]) for row in rows]
     shifts = push * (answers.lateral[rows] - plain)
     controls = [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
-    beyond = np.stack([own - shifts[own_controls].mean(axis=0) if own_controls else own
-                       for own, own_controls in zip(shifts, controls, strict=True)])  # fmt: skip
     tested = [at for at, name in enumerate(names) if not name.is_control]
     seed = derive_seed("sign flips", suite, category)
-    t, p, p_fwe = max_t(beyond[tested], answers.items, answers.groups, seed)
+    t, p, p_fwe = max_t(beyond_controls(shifts, controls, tested), answers.items, answers.groups, seed)
     place_of = {at: place for place, at in enumerate(tested)}
     share = _shares(answers, rows, suite)
     found = []
@@ -146,9 +139,6 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
         turned = _turned(push, plain, answers.lateral[rows[at]])
         drawn = units_seed(answers.groups, suite)
         low, high = group_bootstrap(turned[:, None], answers.groups, drawn, bounds=GAINS)
-        ledger = dict(zip(LEDGER, answers.ledger[rows[at]].T, strict=True))
-        fires = float(ledger["fires"].sum())
-        norm = float((ledger["norm"] * ledger["fires"]).sum())
         tested_at = place_of.get(at)
         found.append(
             Passing(
@@ -171,13 +161,28 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
                 p=None if tested_at is None else float(p[tested_at]),
                 p_fwe=None if tested_at is None else float(p_fwe[tested_at]),
                 changed=float(answers.changed[rows[at]].max()),
-                fires=int(fires),
-                still=int(ledger["still"].sum()),
-                norm_ratio=float((ledger["moved"] * ledger["fires"]).sum()) / norm if norm else 0.0,
                 key=key,
+                **ledger_sums(answers.ledger[rows[at]]),
             )
         )
     return found
+
+
+def beyond_controls(values: Values, controls: Sequence[list[int]], tested: Sequence[int]) -> Values:
+    """(tested, E) what each does beyond the mean of its controls. values: (K, E). controls: rows, of every row."""
+    beyond = [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
+    return np.array(beyond).reshape(len(tested), values.shape[1])
+
+
+def ledger_sums(ledger: Values) -> dict[str, Any]:
+    """`fires`, `still` and `norm_ratio` of one condition. ledger: (E, 5), see `patching.LEDGER`."""
+    of = dict(zip(LEDGER, ledger.T, strict=True))
+    norm = float((of["norm"] * of["fires"]).sum())
+    return {
+        "fires": int(of["fires"].sum()),
+        "still": int(of["still"].sum()),
+        "norm_ratio": float((of["moved"] * of["fires"]).sum()) / norm if norm else 0.0,
+    }
 
 
 def _turned(push: Values, plain: Values, changed: Values) -> Values:
@@ -220,15 +225,3 @@ def located_in(rows: Sequence[Passing]) -> tuple[str, ...]:
 def stored_places(run: RunReader) -> dict[str, tuple[str, ...]]:
     """By category, `located_in` of what is stored."""
     return {category: located_in(rows) for category, rows in stored_passing(run).items()}
-
-
-def passing_frame(rows: Sequence[Passing]) -> "pd.DataFrame":
-    """One line per category and change; the interval as two columns."""
-    import pandas as pd
-
-    flat = []
-    for row in rows:
-        plain = row.to_json()
-        low, high = plain.pop("net_ci")
-        flat.append({**plain, "net_ci_low": low, "net_ci_high": high})
-    return pd.DataFrame(flat)

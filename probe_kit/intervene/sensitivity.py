@@ -36,10 +36,7 @@ def sensitivity(answers: Answers) -> list[Sensitivity]:
     """One per category, in the order of the episodes; empty where words were not exchanged."""
     if not {PICTURES, NOISE} <= set(answers.conditions):
         return []
-    return [
-        _of_category(answers.only(str(category)), str(category))
-        for category in dict.fromkeys(answers.categories.tolist())
-    ]
+    return [_of_category(own, category) for category, own in answers.by_category()]
 
 
 def _of_category(answers: Answers, category: str) -> Sensitivity:

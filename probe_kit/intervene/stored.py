@@ -77,6 +77,10 @@ class Answers:
         }
         return Answers(self.conditions, **cut)
 
+    def by_category(self) -> "list[tuple[str, Answers]]":
+        """Every category with its episodes, in the order of the episodes."""
+        return [(name, self.only(name)) for name in dict.fromkeys(map(str, self.categories))]
+
     def to_bytes(self) -> bytes:
         """As a `.npz`; the same answers give the same bytes."""
         file = BytesIO()

@@ -9,7 +9,7 @@ from probe_kit.intervene.sensitivity import Sensitivity
 from probe_kit.intervene.verdict import Judgement
 
 if TYPE_CHECKING:
-    from probe_kit.fitting_tables import Cell, FittingTable
+    from probe_kit.fitting_tables import Cell, FittingTable, Part
 
 _LEGEND = (
     "follows: goes to the correct picture, and to the other side once the two are exchanged; against: the "
@@ -17,26 +17,19 @@ _LEGEND = (
 )
 
 
-def following_table(
-    rows: Sequence[Following], verdicts: Mapping[str, Judgement], label: str, suite: str, random_weights: bool
-) -> "FittingTable":
-    """One line per category."""
+def following_table(rows: Sequence[Following], verdicts: Mapping[str, Judgement], of: str) -> "FittingTable":
+    """One line per category. of: which model, on which suite."""
     from probe_kit.fitting_tables import Cell, FittingTable, Part
 
-    marked = f"{label} (random weights)" if random_weights else label
     reasons = dict.fromkeys(f"{name}: {one.reason}" for name, one in verdicts.items() if one.reason)
     return FittingTable(
-        title=f"Is it used? {marked} on {suite}, pictures exchanged",
+        title=f"Is it used? {of}, pictures exchanged",
         caption="; ".join([_LEGEND, *reasons]),
         name="category",
         names=tuple(row.category for row in rows),
         styles=("",) * len(rows),
         parts=(
-            Part(
-                "Does the action follow the pictures?",
-                ("follows %", "against %", "net [95 %]", "p", "median shift cm", "n (items)"),
-                tuple(_cells(row) for row in rows),
-            ),
+            _following_part("Does the action follow the pictures?", rows),
             Part(
                 "Verdict",
                 ("verdict",),
@@ -55,24 +48,18 @@ _WORDS_LEGEND = (
 )
 
 
-def words_table(
-    rows: Sequence[Following], steps: Sequence[Sensitivity], label: str, suite: str, random_weights: bool
-) -> "FittingTable":
-    """One line per category."""
+def words_table(rows: Sequence[Following], steps: Sequence[Sensitivity], of: str) -> "FittingTable":
+    """One line per category. of: which model, on which suite."""
     from probe_kit.fitting_tables import Cell, FittingTable, Part
 
     return FittingTable(
-        title=f"Is the question read? {f'{label} (random weights)' if random_weights else label} on {suite}",
+        title=f"Is the question read? {of}",
         caption=_WORDS_LEGEND,
         name="category",
         names=tuple(row.category for row in rows),
         styles=("",) * len(rows),
         parts=(
-            Part(
-                "Does the action follow the words?",
-                ("follows %", "against %", "net [95 %]", "p", "median shift cm", "n (items)"),
-                tuple(_cells(row) for row in rows),
-            ),
+            _following_part("Does the action follow the words?", rows),
             Part(
                 "What one step owes to",
                 ("words cm", "pictures cm", "noise cm", "words change it %", "pictures change it %"),
@@ -89,6 +76,13 @@ def words_table(
             ),
         ),
     )  # fmt: skip
+
+
+def _following_part(title: str, rows: Sequence[Following]) -> "Part":
+    from probe_kit.fitting_tables import Part
+
+    columns = ("follows %", "against %", "net [95 %]", "p", "median shift cm", "n (items)")
+    return Part(title, columns, tuple(_cells(row) for row in rows))
 
 
 def _cells(row: Following) -> "tuple[Cell, ...]":
@@ -109,16 +103,13 @@ _CHANGE_LEGEND = (
 )
 
 
-def passing_table(
-    rows: Sequence[Passing], kind: str, label: str, suite: str, random_weights: bool
-) -> "FittingTable":
-    """One line per category and change; controls stand beside what they are held against."""
+def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "FittingTable":
+    """One line per category and change; controls stand beside what they are held against. of: model, suite."""
     from probe_kit.fitting_tables import FittingTable, Part
 
-    marked = f"{label} (random weights)" if random_weights else label
     shown = [row for row in rows if not row.is_control]
     return FittingTable(
-        title=f"Where is it used? {marked} on {suite}, {kind}",
+        title=f"Where is it used? {of}, {kind}",
         caption=_CHANGE_LEGEND,
         name="category · change",
         names=tuple(f"{row.category} · {row.name}" for row in shown),

@@ -4,6 +4,7 @@ Shading, the renderer's nearest texel, crop and resize are all linear in the tex
 per side takes a texture to the low-resolution pixels of its tile.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from pi0_tiny_training.window import WINDOW_OF_POLICY, seen_by_policy
 from probe_kit.env import SceneSpec
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.tiles import TEXTURE_PIXELS, as_texture
+from probe_kit.models.pi0_tiny import IMAGE_SIDE
 
 
 @dataclass(frozen=True)
@@ -37,27 +39,43 @@ class Brush:
         return np.asarray(self.warp @ texels, np.float32).reshape(*self.cover.shape, 3)
 
 
+def ramp() -> Image.Image:
+    """A texture that says in red and green which texel is seen, and in blue how it is lit."""
+    column = np.tile(np.arange(TEXTURE_PIXELS, dtype=np.uint8), (TEXTURE_PIXELS, 1))
+    return Image.fromarray(np.stack([column, column.T, np.full_like(column, 255)], axis=-1))
+
+
 def calibrate(spec: SceneSpec) -> tuple[Brush, Brush]:
     """The brushes for the left and the right tile, read off one rendering of a coordinate texture."""
-    column = np.tile(np.arange(TEXTURE_PIXELS, dtype=np.uint8), (TEXTURE_PIXELS, 1))
-    ramp = Image.fromarray(np.stack([column, column.T, np.full_like(column, 255)], axis=-1))
     scene = Scene(spec)
-    scene.reset(dict.fromkeys(SIDES, ramp), (*spec.cube_xy, spec.cube_side / 2), spec.cube_yaw)
+    scene.reset(dict.fromkeys(SIDES, ramp()), (*spec.cube_xy, spec.cube_side / 2), spec.cube_yaw)
     frame = scene.frame()
     picture = scene.picture(frame).astype(np.float64)
-    brushes = [_brush(picture, frame.bodies == scene.quads[side]) for side in SIDES]
+    brushes = [
+        brush_of(picture, frame.bodies == scene.quads[side], WINDOW_OF_POLICY.crop, seen_by_policy)
+        for side in SIDES
+    ]
     scene.close()
     return brushes[0], brushes[1]
 
 
-def _brush(picture: NDArray[np.float64], mask: NDArray[np.bool_]) -> Brush:
+def brush_of(
+    picture: NDArray[np.float64],
+    mask: NDArray[np.bool_],
+    crop: tuple[int, int, int, int],
+    seen: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
+) -> Brush:
+    """The brush of the tile that `mask` shows in a picture of it with `ramp` on it.
+
+    crop: top, left, height, width of what the model looks at. seen: that crop, resized as the model does.
+    """
     shade = np.median(picture[mask][:, 2]) / 255
     place = np.clip(np.rint(picture[mask][:, :2] / shade), 0, TEXTURE_PIXELS - 1).astype(int)
     texel = place[:, 1] * TEXTURE_PIXELS + place[:, 0]
     y, x = np.nonzero(mask)
-    down, across = _resize_weights()
-    top, left = WINDOW_OF_POLICY.crop[:2]
-    low = seen_by_policy(255 * np.uint8(mask)).astype(np.float32) / 255
+    down, across = _resize_weights(*crop[2:])
+    top, left = crop[:2]
+    low = seen(255 * np.uint8(mask)).astype(np.float32) / 255
     rows, columns = (_extent(low.any(axis=axis)) for axis in (1, 0))
     weights = np.einsum("ip,jp->ijp", down[rows][:, y - top], across[columns][:, x - left])
     pixels = sparse.csr_matrix(weights.reshape(-1, len(texel)) * shade)
@@ -67,14 +85,12 @@ def _brush(picture: NDArray[np.float64], mask: NDArray[np.bool_]) -> Brush:
     return Brush(rows, columns, low[rows, columns], (pixels @ lookup).astype(np.float32))
 
 
-def _resize_weights() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _resize_weights(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The resize as matrices (96, rows of the crop) and (96, columns of the crop)."""
-    _, _, height, width = WINDOW_OF_POLICY.crop
-    size = WINDOW_OF_POLICY.size
-    resize = torch.nn.functional.interpolate
+    resize, small = torch.nn.functional.interpolate, IMAGE_SIDE
     options = {"mode": "bilinear", "antialias": True, "align_corners": False}
-    down = resize(torch.eye(height)[:, None, :, None].expand(-1, 1, -1, 8), (size[0], 8), **options)[:, 0, :, 0].T
-    across = resize(torch.eye(width)[:, None, None, :].expand(-1, 1, 8, -1), (8, size[1]), **options)[:, 0, 0, :].T
+    down = resize(torch.eye(height)[:, None, :, None].expand(-1, 1, -1, 8), (small, 8), **options)[:, 0, :, 0].T
+    across = resize(torch.eye(width)[:, None, None, :].expand(-1, 1, 8, -1), (8, small), **options)[:, 0, 0, :].T
     return down.double().numpy(), across.double().numpy()
 
 
