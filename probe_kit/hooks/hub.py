@@ -1,6 +1,5 @@
 """Whether the hub can be reached, found out within seconds: its own client retries for long. Imports no torch."""
 
-import time
 from threading import Thread
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -19,12 +18,10 @@ def unreachable() -> str:
     if constants.HF_HUB_OFFLINE:
         return "offline mode (HF_HUB_OFFLINE)"
     found: list[str] = []
-    started = time.monotonic()
     asking = Thread(target=lambda: found.append(_ask(constants.ENDPOINT)), daemon=True)
     asking.start()
     asking.join(PATIENCE)  # looking a name up knows no time limit of its own
-    waited = time.monotonic() - started
-    return found[0] if found else f"{constants.ENDPOINT} says nothing for {waited:.0f} s"
+    return found[0] if found else _silence(constants.ENDPOINT)
 
 
 def _ask(address: str) -> str:
@@ -33,5 +30,10 @@ def _ask(address: str) -> str:
     except HTTPError:
         return ""  # it answered
     except (OSError, ValueError) as error:
-        return f"{address} does not answer: {getattr(error, 'reason', error)}"
+        reason = getattr(error, "reason", error)
+        return _silence(address) if isinstance(reason, TimeoutError) else f"{address} does not answer: {reason}"
     return ""
+
+
+def _silence(address: str) -> str:
+    return f"{address} says nothing for {PATIENCE:g} s"
