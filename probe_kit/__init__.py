@@ -18,7 +18,16 @@ if TYPE_CHECKING:
     from probe_kit.errors import ProbeKitError
     from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
-    from probe_kit.intervene import ClosedLoop, Follow, Interchange, Source, Steer, intervene_on, load_effects
+    from probe_kit.intervene import (
+        ClosedLoop,
+        Erase,
+        Follow,
+        Interchange,
+        Source,
+        Steer,
+        intervene_on,
+        load_effects,
+    )
     from probe_kit.retention import retention as retention_table
     from probe_kit.retention.displays import (
         FinalPositionsDisplay,
@@ -35,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Act2AnswerEnv",
     "ClosedLoop",
+    "Erase",
     "ExtractSettings",
     "FinalPositionsDisplay",
     "Follow",
@@ -71,6 +81,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "Steer": "intervene",
+        "Erase": "intervene",
         "Interchange": "intervene",
         "ClosedLoop": "intervene",
         "Act2AnswerEnv": "env",

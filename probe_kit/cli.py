@@ -24,11 +24,12 @@ from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import intervene
+from probe_kit.intervene.show_command import show
 from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
 from probe_kit.retention.join_commands import join
 from probe_kit.suite.commands import app as suite_app
-from probe_kit.train.commands import show, train
+from probe_kit.train.commands import train
 from probe_kit.train.power_commands import power
 
 ORDER = (

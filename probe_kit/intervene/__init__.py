@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from probe_kit.intervene.carried_out import CarriedOut
     from probe_kit.intervene.closed_loop import ClosedLoop, best_cells
     from probe_kit.intervene.effects import Effects, load_effects
+    from probe_kit.intervene.erase import Erase
+    from probe_kit.intervene.erased import Erasing
     from probe_kit.intervene.follow import Follow
     from probe_kit.intervene.following import Following, stored_following
     from probe_kit.intervene.interchange import Interchange
@@ -29,6 +31,8 @@ __all__ = [
     "CarriedOut",
     "ClosedLoop",
     "Effects",
+    "Erase",
+    "Erasing",
     "Follow",
     "Following",
     "Interchange",
@@ -65,6 +69,8 @@ __getattr__ = lazy_names(
         "ClosedLoop": "closed_loop",
         "best_cells": "closed_loop",
         "Effects": "effects",
+        "Erase": "erase",
+        "Erasing": "erased",
         "Follow": "follow",
         "Following": "following",
         "Judgement": "verdict",

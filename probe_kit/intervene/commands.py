@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from probe_kit.intervene.conditions import Intervention
     from probe_kit.intervene.effects import Effects
 
-KINDS = ("follow", "words", "interchange", "steer", "closed-loop")
-INSIDE = "Inside the network (interchange, steer, closed-loop)"
+KINDS = ("follow", "words", "interchange", "steer", "closed-loop", "erase")
+INSIDE = "Inside the network (interchange, steer, closed-loop, erase)"
 _FORMATS = ("table", "json", "csv")
 
 
@@ -26,7 +26,8 @@ def intervene(
             help="follow: with the two pictures exchanged, does the action change sides? words: before the "
             "same pictures, asked for the other one? interchange: where "
             "inside does that pass? steer: a direction added, beside matched controls. closed-loop: the best "
-            "place of an interchange and its controls, with every episode played again."
+            "place of an interchange and its controls, with every episode played again. erase: what can be read "
+            "linearly taken away per token, beside random subspaces; says less than an exchange."
         ),
     ] = "follow",
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
@@ -43,7 +44,7 @@ def intervene(
         str | None,
         typer.Option(
             help="Comma-separated: all, image, language, state, action; default all,image,language. Steer: the "
-            "one whose tokens are moved. Closed loop: with --sites, default all.",
+            "one whose tokens are moved. Closed loop: with --sites, default all. Erase: default image.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
@@ -51,7 +52,8 @@ def intervene(
         str | None,
         typer.Option(
             help="mean-difference or probe: interchange along it only; steer along it (the first is default). "
-            "Closed loop: along it as well (the first is default), or none.",
+            "Closed loop: along it as well (the first is default), or none. Erase: leace (default), "
+            "mean-difference:K or inlp:K, K directions per token.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
@@ -135,6 +137,7 @@ _OPTIONS = {
     "interchange": ("sites", "roles", "direction", "controls", "seed"),
     "steer": ("sites", "roles", "direction", "controls", "doses", "toward", "seed"),
     "closed-loop": ("sites", "roles", "direction", "controls", "seed"),
+    "erase": ("sites", "roles", "direction", "controls", "seed"),
 }
 
 
@@ -154,12 +157,22 @@ def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]
     if kind == "interchange":
         controls = given.pop("controls", 5 if "direction" in given else 0)
         return Interchange(**common, **given, controls=controls)
+    if kind == "erase":
+        return _erase(common, given)
     named = given.pop("roles", ())
     if "sites" not in given or len(named) != 1:
         raise UsageError(
             "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
         )
     return Steer(**common, **given, role=named[0])
+
+
+def _erase(common: dict[str, Any], given: dict[str, Any]) -> "Intervention":
+    from probe_kit.intervene import Erase
+
+    if "sites" not in given:
+        raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
+    return Erase(**common, **given | ({"method": given.pop("direction")} if "direction" in given else {}))
 
 
 def _closed_loop(run: "Run", common: dict[str, Any], given: dict[str, Any]) -> "Intervention":

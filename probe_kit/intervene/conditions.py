@@ -63,6 +63,11 @@ class Intervention(Asked, ABC):
         """What the conditions give for the episodes of one item."""
         return replay(bench, bench.questions(item), conditions)
 
+    def told(self, conditions: "Sequence[Condition]") -> dict[str, Any]:
+        """What else its certificate says of its conditions, as plain JSON."""
+        del conditions
+        return {}
+
     @abstractmethod
     def conditions(self, bench: Bench) -> Sequence[Condition]:
         """All of them, in the order in which they are stored; the first is `Plain`."""

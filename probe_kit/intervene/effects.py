@@ -7,11 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.carried_out import CarriedOut, carried_out
+from probe_kit.intervene.erased import Erasing, erased
 from probe_kit.intervene.following import Following, following, stored_following
 from probe_kit.intervene.frames import frame_of
 from probe_kit.intervene.passing import Passing, passing, stored_places
 from probe_kit.intervene.sensitivity import sensitivity
-from probe_kit.intervene.stored import EXCHANGED, NOISE, PICTURES, Answers, Stored, find_stored
+from probe_kit.intervene.stored import (
+    ERASE,
+    EXCHANGED,
+    NOISE,
+    PICTURES,
+    READABLE,
+    Answers,
+    Stored,
+    find_stored,
+)
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
@@ -23,6 +33,8 @@ if TYPE_CHECKING:
 
 
 FOLLOW, WORDS = "follow", "words"
+BLIND = 0.6
+"""Accuracy below which a probe is said to be blind to one of two sides."""
 LARGE = 2.0
 """Token norms beyond which a dose is said to be large."""
 
@@ -59,7 +71,7 @@ class Effects:
     @cached_property
     def changes(self) -> list[Passing]:
         """What changes inside the network did to first actions, one per category and change; else empty."""
-        if self.answers.outcomes is not None:
+        if self.answers.outcomes is not None or self.kind == ERASE:
             return []
         return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
 
@@ -68,13 +80,22 @@ class Effects:
         """What changes did to whole episodes, one per category and condition; empty but for a closed loop."""
         return [] if self.answers.outcomes is None else carried_out(self.answers, self.suite, self.key)
 
+    @cached_property
+    def erased(self) -> list[Erasing]:
+        """What is left of an answer in first actions, one per category and condition; empty but for `erase`."""
+        if self.kind != ERASE:
+            return []
+        return erased(self.answers, self.suite, self.key, self.certificate.get(READABLE, {}))
+
     @property
     def table(self) -> "pd.DataFrame":
-        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing` or,
-        in a closed loop, `CarriedOut`.
+        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`, of
+        `Erasing` or, in a closed loop, of `CarriedOut`.
         """
         if self.answers.outcomes is not None:
             return frame_of(self.carried_out)
+        if self.kind == ERASE:
+            return frame_of(self.erased)
         if self.kind == WORDS:
             return words_frame(self.answers, self.suite, self.key)
         if self.kind != FOLLOW:
@@ -94,6 +115,7 @@ class Effects:
             *self._one_step(),
             *self._large_doses(),
             *self._broken_hands(),
+            *self._less_than_exchanging(),
         )
 
     def _passed_over(self) -> list[str]:
@@ -123,6 +145,21 @@ class Effects:
             "hand is broken, and this enters no verdict."
             for row in self.carried_out
             if row.hand_broken
+        ]
+
+    def _less_than_exchanging(self) -> list[str]:
+        if not self.erased:
+            return []
+        blind = [row for row in self.erased if row.finding == "kept" and (row.readable or 1.0) < BLIND]
+        broken = [row for row in self.erased if row.finding == "controls break too"]
+        return [
+            "Erasing says less than exchanging: what is read need not be linear, and may pass elsewhere. A loss "
+            "beyond the controls is evidence of use; none is no evidence of the contrary.",
+            *(f"{row.category}, {row.name}: a probe is blind, and the action goes on as before." for row in blind),
+            *(
+                f"{row.category}, {row.name}: random subspaces of the same rank break the action as well."
+                for row in broken
+            ),
         ]
 
     def _replayed(self) -> tuple[str, ...]:
@@ -166,6 +203,10 @@ class Effects:
             from probe_kit.intervene.carried_out_table import carried_out_table
 
             return carried_out_table(self.carried_out, of)
+        if self.kind == ERASE:
+            from probe_kit.intervene.erased_table import erased_table
+
+            return erased_table(self.erased, of)
         if self.kind == WORDS:
             return words_table(self.rows, sensitivity(self.answers), of)
         if self.kind != FOLLOW:
@@ -204,8 +245,12 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
     return judgements(stored_following(run), encoded_in(results), stored_places(run))
 
 
-def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED) -> str:
+def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED, kind: str = "") -> str:
     """As stored beside the answers, without verdicts, which later probes may change."""
+    if kind == ERASE:
+        # What probes read stands in the certificate.
+        frame = frame_of(erased(answers, suite))
+        return frame.drop(columns=["key", "readable_before", "readable"]).to_csv(index=False)
     if answers.outcomes is not None:
         return frame_of(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
     if {PICTURES, NOISE} <= set(answers.conditions):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from probe_kit.errors import CaptureChangedActionError, UsageError
+from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
@@ -16,7 +16,7 @@ from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
 from probe_kit.intervene.passing import Named
 from probe_kit.intervene.patching import LEDGER
-from probe_kit.intervene.settings import key_of, refuse_unfit, settings_of
+from probe_kit.intervene.settings import items_of, key_of, refuse_unfit, settings_of
 from probe_kit.intervene.stored import EXCHANGED, Answers, is_stored, save
 from probe_kit.notebook import notebook_progress
 
@@ -80,9 +80,10 @@ def _carry_out(
             "items": {"asked": len(wanted), "played": len(items)},
             "supported": bench.policy.interventions.to_json(),
             "edits": _ledgers(conditions, parts),
+            **asked.told(conditions),
         }
     answers = _answers(run, [condition.name for condition in conditions], parts)
-    effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)))
+    effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)), asked.kind)
     save(run.location, settings, key, answers, effects, certificate)
     pieces.discard()
 
@@ -92,17 +93,6 @@ def refuse_unsupported(run: Run, asked: Intervention) -> None:
     if (family := known_families().get(run.model)) is not None:
         for kind in asked.needs:
             family.check_intervention(kind)
-
-
-def items_of(run: Run, asked: Intervention) -> list[str]:
-    """The items that are replayed, category by category. Raises UsageError if there is none."""
-    episodes, chosen = run.episodes, []
-    for category in asked.chosen(run):
-        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
-        chosen += list(dict.fromkeys(names))[: asked.items]
-    if not chosen:
-        raise UsageError(f"{run.location} has no episode yet; extract some first")
-    return chosen
 
 
 def _replayed(

@@ -1,6 +1,6 @@
 """What every intervention is asked, and the key under which its results are stored. Needs no model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -54,6 +54,17 @@ class Asked:
         return self.categories or tuple(known)
 
 
+def items_of(run: Run, asked: Asked) -> list[str]:
+    """The items that are replayed, category by category. Raises UsageError if there is none."""
+    episodes, chosen = run.episodes, []
+    for category in asked.chosen(run):
+        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
+        chosen += list(dict.fromkeys(names))[: asked.items]
+    if not chosen:
+        raise UsageError(f"{run.location} has no episode yet; extract some first")
+    return chosen
+
+
 def settings_of(asked: Asked, run: Run) -> dict[str, Any]:
     """Everything that decides the numbers, as plain JSON; its hash is the key."""
     return {
@@ -96,8 +107,3 @@ def readout_of(text: str) -> Readout:
     if text not in READOUTS:
         raise UsageError(f"unknown readout {text!r}; expected one of {', '.join(READOUTS)}")
     return cast("Readout", text)
-
-
-def first_items(names: Sequence[str], count: int | None) -> tuple[str, ...]:
-    """The first `count` different names, all of them for None."""
-    return tuple(dict.fromkeys(names))[:count]

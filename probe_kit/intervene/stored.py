@@ -29,6 +29,8 @@ PLAIN, EXCHANGED = "plain", "exchanged"
 """Conditions: as the run made it, and before the same two pictures in each other's place."""
 PICTURES, NOISE = "pictures", "noise"
 """Of `words`, where the words are what is exchanged: the pictures instead, and only the noise drawn anew."""
+ERASE, READABLE = "erase", "readable"
+"""A kind, and what its certificate calls what probes read behind its conditions."""
 UNCHANGED = frozenset({PLAIN, EXCHANGED, PICTURES, NOISE})
 """Conditions in which nothing inside the network is changed."""
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"

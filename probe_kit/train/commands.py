@@ -1,14 +1,13 @@
-"""`probe-kit train`, and `probe-kit run show`, which lists what it stored."""
+"""`probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.text import Text
 
-from probe_kit.console import counter, marked, out, print_json, progress, say, split
+from probe_kit.console import counter, marked, out, progress, say, split
 from probe_kit.errors import UsageError
 from probe_kit.fitting_tables import Cell, FittingTable, Part
 
@@ -116,25 +115,8 @@ def train(
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
-def show(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> None:
-    """List what a run holds: episodes, streams, and every set of probes by its key."""
-    from probe_kit.extract import open_run
-    from probe_kit.train.inventory import inventory
-
-    found = inventory(open_run(run, allow_partial=True))
-    if as_json:
-        print_json(asdict(found))
-        return
-    out.print(_facts(found))
-    if not found.probes:
-        step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
-        out.print(f"no probes: {step}", soft_wrap=True)
-
-
-def _facts(found: "Inventory") -> "Table":
+def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
+    """A run and what is stored with it. further: lines below, by name."""
     from rich.table import Table
 
     from probe_kit.extract.store.summary import NOT_PROTECTED
@@ -159,6 +141,7 @@ def _facts(found: "Inventory") -> "Table":
             f"unfinished {key}": f"a sweep of {sites} sites so far; the same `probe-kit train` continues it"
             for key, sites in found.unfinished.items()
         },
+        **further,
     }
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="dim", no_wrap=True)

@@ -98,6 +98,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         (("--kind", "steer", "--sites", "backbone.02", "--roles", "image,language"), "one of --roles"),
         (("--kind", "steer", "--sites", "backbone.02", "--roles", "image", "--doses", "much"), "is no dose"),
         (("--kind", "interchange", "--controls", "2"), "choose --direction"),
+        (("--kind", "erase"), "needs --sites"),
+        (("--kind", "erase", "--sites", "backbone.02", "--direction", "zap"), "expected leace"),
+        (("--kind", "erase", "--sites", "backbone.02", "--doses", "1"), "--doses means nothing to --kind erase"),
     ],
 )
 def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...], words: str) -> None:

@@ -1,0 +1,187 @@
+"""Erasing: what is linearly readable of the answer taken away, token by token, beside random controls.
+
+A supplement, and the weakest of them. What a policy reads need not be linear, an answer that is erased at one
+place may pass at another, and what is taken away along with it breaks the hand: a place where an exchange passes
+tells more than a place where an eraser breaks something. Erasers that know only the mean over tokens blind a probe
+and leave the behaviour, so that there is one per position.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.sites import Site
+from probe_kit.identity import derive_seed
+from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Turn
+from probe_kit.intervene.directions import FOLDS
+from probe_kit.intervene.gathered import Gathered, gather
+from probe_kit.intervene.patching import Kept, patched
+from probe_kit.intervene.places import Place, places, roles_of, token_mask
+from probe_kit.intervene.settings import items_of
+from probe_kit.intervene.stored import ERASE, READABLE
+from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+LEACE, UNTOUCHED = "leace", "none|0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Erase(Intervention):
+    """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
+
+    sites: patterns of places of one site each. roles: whose tokens. method: see `train.erasure.Method`. controls:
+    so many of the same rank. What erases an episode was fitted on the tokens of the other folds' episodes, of the
+    items that are played. Raises UsageError for a method that does not exist.
+    """
+
+    sites: tuple[str, ...]
+    roles: tuple[str, ...] = ("image",)
+    method: str = LEACE
+    controls: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.sites or not self.roles:
+            raise UsageError("erasing needs at least one site and one role")
+        object.__setattr__(self, "method", str(Method.of(self.method)))
+
+    @property
+    def kind(self) -> str:
+        """`erase`."""
+        return ERASE
+
+    def own_settings(self) -> dict[str, Any]:
+        """Where, how and beside how many controls."""
+        return {
+            "sites": list(self.sites), "roles": list(self.roles), "method": self.method,
+            "controls": self.controls, "seed": self.seed,
+        }  # fmt: skip
+
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """Plain, then every place and role at dose 0, erased, and with its controls. Raises UnknownSiteError."""
+        found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
+        items = items_of(bench.run, self)
+        conditions: list[Condition] = [Plain()]
+        for place in found.values():
+            roles = roles_of(bench.policy, place.stream, self.roles)
+            every = gather(bench, items, place.only_site, roles)
+            for role in roles:
+                own = {category: rows for (name, category), rows in every.items() if name == role}
+                conditions += self._of(place, role, own)
+        if len(conditions) == 1:
+            raise UsageError(f"no token of {', '.join(found)} plays {', '.join(self.roles)}")
+        return conditions
+
+    def told(self, conditions: Sequence[Condition]) -> dict[str, Any]:
+        """How well a fresh probe reads the answer behind each condition, by category."""
+        return {READABLE: {one.name: dict(one.readable) for one in conditions if isinstance(one, Erased)}}
+
+    def _of(self, place: Place, role: str, gathered: Mapping[str, Gathered]) -> list[Condition]:
+        method = Method.of(self.method)
+        names = (self.method, *(f"control-{number + 1}" for number in range(self.controls)))
+        erasers: dict[str, dict[str, Eraser]] = {name: {} for name in names}
+        readable: dict[str, dict[str, float]] = {name: {} for name in ("", *names)}
+        for category, own in gathered.items():
+            seed = derive_seed("erase", self.seed, category)
+            folds = grouped_folds(own.left.astype(int), own.groups, min(FOLDS, np.unique(own.groups).size), seed)
+            draw = np.random.default_rng(derive_seed("control", self.seed, category, str(place.only_site), role))
+            fitted = [_fitted(own, fold, method, names, draw) for fold in folds]
+            readable[""][category] = _readable(own, folds, None)
+            for name in names:
+                readable[name][category] = _readable(own, folds, [one[name] for one in fitted])
+                erasers[name] |= {
+                    own.episodes[row]: one[name]
+                    for fold, one in zip(folds, fitted, strict=True)
+                    for row in fold.test
+                }
+        return [
+            Erased(place, role, UNTOUCHED, {}, readable[""]),
+            *(Erased(place, role, name, erasers[name], readable[name]) for name in names),
+        ]
+
+
+@dataclass(frozen=True)
+class Erased:
+    """The tokens of one role at one place, without what an eraser takes away.
+
+    erasers: by episode, fitted without it; empty to write back what is there. readable: by category, the held-out
+    accuracy of a probe fitted on what is left, of the mean over tokens.
+    """
+
+    place: Place
+    role: str
+    what: str
+    erasers: Mapping[str, Eraser] = field(repr=False)
+    readable: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """Place, role and what is taken away, apart by `|`."""
+        return f"{self.place.name}|{self.role}|{self.what}"
+
+    def play(self, turn: Turn) -> Played:
+        """The plain inference without it."""
+        question, bench = turn.question, turn.bench
+        mask = token_mask(bench.policy, question.seen, self.place.stream, self.role)
+        change = Without(self.erasers[question.episode_id]) if self.erasers else Kept()
+        with patched(bench.policy, self.place.sites, mask, change) as ledger:
+            chunk = bench.act(question.seen, question.seed)
+        return Played(chunk, ledger)
+
+
+@dataclass(frozen=True)
+class Without:
+    """What an eraser leaves; tokens beyond those it was fitted on stay as they are."""
+
+    eraser: Eraser
+
+    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+        """Computed in float64, as it was fitted."""
+        import torch
+
+        del site, where
+        known = min(own.shape[0], self.eraser.fitted.size)
+        after = own.clone()
+        erased = self.eraser(own[:known].double().cpu().numpy())
+        after[:known] = torch.from_numpy(erased).to(own)
+        return after
+
+
+def _fitted(
+    own: Gathered, fold: Fold, method: Method, names: Sequence[str], draw: np.random.Generator
+) -> dict[str, Eraser]:
+    """The eraser and its controls, by name, of one fold's training episodes."""
+    training, left = own.tokens.only(fold.train), own.left[fold.train]
+    eraser = fit_eraser(training, left, method)
+    return {names[0]: eraser, **{name: fit_control(training, left, method, eraser, draw) for name in names[1:]}}
+
+
+def _readable(own: Gathered, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
+    """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    right = 0
+    for number, fold in enumerate(folds):
+        pooled = _pooled(own.tokens, None if erasers is None else erasers[number])
+        probe = make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
+        probe.fit(pooled[fold.train], own.left[fold.train])
+        right += int((probe.predict(pooled[fold.test]) == own.left[fold.test]).sum())
+    return right / own.left.size
+
+
+def _pooled(tokens: Tokens, eraser: Eraser | None) -> NDArray[np.float64]:
+    """(N, D) mean over the tokens that are there."""
+    values = tokens.values if eraser is None else eraser(tokens.values)
+    here = tokens.present[..., None]
+    return np.asarray(np.where(here, values, 0).sum(axis=1) / here.sum(axis=1))

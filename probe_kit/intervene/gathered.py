@@ -1,0 +1,60 @@
+"""The tokens of one place before the action, of whole categories: what erasers are fitted on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.sites import Site
+from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.places import token_mask
+from probe_kit.train.erasure import Tokens
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The tokens of one category at one site and role, of N episodes.
+
+    episodes, groups: (N,). left: (N,) whether the correct picture lies left. tokens: at position t the role's
+    t-th token, see `train.erasure.Tokens`.
+    """
+
+    episodes: tuple[str, ...]
+    groups: NDArray[np.str_]
+    left: NDArray[np.bool_]
+    tokens: Tokens
+
+
+def gather(
+    bench: Bench, items: Sequence[str], site: Site, roles: Sequence[str]
+) -> dict[tuple[str, str], Gathered]:
+    """By role and category, from one plain inference per episode. items: by id, all of their episodes.
+
+    Takes 8 bytes per number: episodes × tokens × width.
+    """
+    from probe_kit.hooks import capture
+
+    found: dict[tuple[str, str], list[tuple[str, str, bool, NDArray[np.float64]]]] = {}
+    for item in items:
+        for question in bench.questions(item):
+            with capture(bench.policy, [site]) as tape:
+                bench.act(question.seen, question.seed)
+            passing = tape[site][0].double().cpu().numpy()
+            for role in roles:
+                mask = token_mask(bench.policy, question.seen, site.stream, role)
+                found.setdefault((role, question.category), []).append(
+                    (question.episode_id, question.group_id, question.side_correct == "left", passing[mask])
+                )
+    return {name: _together(rows) for name, rows in found.items()}
+
+
+def _together(rows: Sequence[tuple[str, str, bool, NDArray[np.float64]]]) -> Gathered:
+    """Sequences of different lengths side by side, their first tokens together."""
+    episodes, groups, left, values = zip(*rows, strict=True)
+    longest = max(len(own) for own in values)
+    tokens = np.zeros((len(rows), longest, values[0].shape[1]))
+    present = np.zeros((len(rows), longest), bool)
+    for row, own in enumerate(values):
+        tokens[row, : len(own)], present[row, : len(own)] = own, True
+    return Gathered(tuple(episodes), np.array(groups), np.array(left), Tokens(tokens, present))

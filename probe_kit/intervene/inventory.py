@@ -1,0 +1,103 @@
+"""What interventions a run holds, for `probe-kit run show`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.extract.store.bundles import PARTIAL, Bundle, read_bundles
+from probe_kit.extract.store.layout import INTERVENTIONS
+from probe_kit.extract.store.location import Location
+from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.stored import stored_interventions
+from probe_kit.train.reader import RunReader
+
+COMMON = frozenset(
+    {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout"}
+)
+"""What every intervention is asked; the rest of its settings is its kind's own."""
+
+
+@dataclass(frozen=True)
+class StoredIntervention:
+    """One stored intervention, or what is known of one written by another version.
+
+    state: `used` for the newest of its kind and categories, which tables and figures read; `other`; `other
+    episodes` if the run has others by now; `other version` if this version cannot read it. asked: what its kind
+    was asked besides, as stored.
+    """
+
+    key: str
+    state: str
+    created: str
+    kind: str = ""
+    categories: tuple[str, ...] = ()
+    items: int | None = None
+    wording: str = ""
+    asked: Mapping[str, Any] | None = None
+
+    @property
+    def words(self) -> str:
+        """In a line."""
+        if not self.kind:
+            return f"written by another version of probe_kit, which this one cannot read; {self._when}"
+        own = [f"{name} {_plain(value)}" for name, value in (self.asked or {}).items() if value not in (None, [])]
+        parts = [self.kind, f"of {', '.join(self.categories)}"]
+        parts += [f"{self.items} items each"] * (self.items is not None)
+        parts += [f"wording {self.wording}"] * bool(self.wording)
+        if self.state == "other":
+            own.append("superseded by a later one in tables")
+        if self.state == "other episodes":
+            own.append("of other episodes than the run has now")
+        return "; ".join([" ".join(parts[:2]), *parts[2:], *own, self._when])
+
+    @property
+    def _when(self) -> str:
+        return f"made {self.created[:16].replace('T', ' ')} UTC"
+
+
+def listed_interventions(run: Any) -> list[StoredIntervention]:
+    """All of a run, oldest first. Raises RunDamagedError if one was changed."""
+    wordings = getattr(run, "wordings", ())
+    readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
+    current = {one.key for reader in readers for one in stored_interventions(reader)}
+    used = {key for reader in readers for key in _newest(reader)}
+    found = [_listed(bundle, current, used) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    return sorted(found, key=lambda one: (one.created, one.key))
+
+
+def unfinished_interventions(location: Location) -> dict[str, int]:
+    """Number of finished items of every intervention that was interrupted, by the key it will have."""
+    parts = (key.split("/") for key in location.keys(INTERVENTIONS))
+    names = [own[1] for own in parts if len(own) > 2 and own[1].startswith(".") and own[1].endswith(PARTIAL)]
+    return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
+
+
+def _newest(run: RunReader) -> set[str]:
+    """Keys of the newest of every kind and category."""
+    newest = {
+        (str(one.settings["kind"]), str(category)): one.key
+        for one in stored_interventions(run)
+        for category in one.settings["categories"]
+    }
+    return set(newest.values())
+
+
+def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredIntervention:
+    settings, created = bundle.head.get("settings"), str(bundle.head.get("created", ""))
+    if not isinstance(settings, Mapping) or settings.get("format") != FORMAT:
+        return StoredIntervention(bundle.key, "other version", created)
+    state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
+    return StoredIntervention(
+        key=bundle.key,
+        state=state,
+        created=created,
+        kind=str(settings["kind"]),
+        categories=tuple(map(str, settings["categories"])),
+        items=settings["items"],
+        wording=str(settings["wording"] or ""),
+        asked={name: value for name, value in settings.items() if name not in COMMON},
+    )
+
+
+def _plain(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

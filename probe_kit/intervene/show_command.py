@@ -1,0 +1,36 @@
+"""`probe-kit run show`: what a run holds, and what probes and interventions are stored with it."""
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from probe_kit.console import out, print_json
+
+
+def show(
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """List what a run holds: episodes, streams, and every set of probes and intervention by its key."""
+    from probe_kit.extract import open_run
+    from probe_kit.intervene.inventory import listed_interventions, unfinished_interventions
+    from probe_kit.train.commands import facts_table
+    from probe_kit.train.inventory import inventory
+
+    opened = open_run(run, allow_partial=True)
+    found, interventions = inventory(opened), listed_interventions(opened)
+    unfinished = unfinished_interventions(opened.location)
+    if as_json:
+        listed = [asdict(one) for one in interventions]
+        print_json({**asdict(found), "interventions": listed, "unfinished_interventions": unfinished})
+        return
+    further = {f"intervention {one.key}": one.words for one in interventions}
+    further |= {
+        f"unfinished {key}": f"an intervention, {items} items so far; the same `probe-kit intervene` continues it"
+        for key, items in unfinished.items()
+    }
+    out.print(facts_table(found, further))
+    if not found.probes:
+        step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
+        out.print(f"no probes: {step}", soft_wrap=True)

@@ -1,0 +1,257 @@
+"""Erasing what is linearly readable of an answer, token by token: LEACE, INLP and differences of class means.
+
+LEACE: Belrose, Schneider-Joseph, Ravfogel, Cotterell, Raff, Biderman: LEACE: Perfect linear concept erasure in
+closed form, NeurIPS 2023. INLP: Ravfogel, Elazar, Gonen, Twiton, Goldberg: Null it out, ACL 2020. Written anew
+from the papers' formulas, for one binary answer, fewer episodes than dimensions, and one eraser per position.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+
+Array = NDArray[np.float64]
+Way = Literal["leace", "mean-difference", "inlp"]
+WAYS: tuple[Way, ...] = get_args(Way)
+RANK = 5
+"""Directions that are taken away where several can be and none says how many; beyond, controls break as well."""
+FEWEST = 4
+"""Episodes of either answer that a position must have in training; with fewer it is left as it is."""
+_TINY = 1e-10
+
+
+@dataclass(frozen=True)
+class Method:
+    """How an answer is erased. rank: directions per token, always 1 for `leace`, which needs no more."""
+
+    way: Way = "leace"
+    rank: int = 1
+
+    @classmethod
+    def of(cls, text: str) -> "Method":
+        """From its name: `leace`, `mean-difference:K` or `inlp:K`. Raises UsageError for any other."""
+        way, _, rank = text.partition(":")
+        if way not in WAYS:
+            raise UsageError(
+                f"unknown way to erase {text!r}; expected leace, mean-difference:K or inlp:K, K directions each"
+            )
+        if way == "leace":
+            if rank:
+                raise UsageError("leace takes one direction per token, and no number; leave it out")
+            return cls()
+        if rank and not (rank.isdecimal() and int(rank) > 0):
+            raise UsageError(f"{text!r}: expected a number of directions behind the colon, such as {way}:{RANK}")
+        return cls(way, int(rank or RANK))
+
+    def __str__(self) -> str:
+        return self.way if self.way == "leace" else f"{self.way}:{self.rank}"
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """Tokens of N episodes at T positions. values: (N, T, D), anything where not present. present: (N, T)."""
+
+    values: Array
+    present: NDArray[np.bool_]
+
+    def only(self, rows: NDArray[np.int64]) -> "Tokens":
+        """Some of the episodes."""
+        return Tokens(self.values[rows], self.present[rows])
+
+    def usable(self, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(T,) positions at which either answer has `FEWEST` episodes."""
+        counts = [self.present[left == side].sum(axis=0) for side in (True, False)]
+        return np.asarray(np.minimum(*counts) >= FEWEST)
+
+    def centred(self) -> "tuple[Array, Array]":
+        """(N, T, D) minus the means (T, D) over who is present; zero where nobody is."""
+        here = self.present[..., None]
+        counts = np.maximum(here.sum(axis=0), 1)
+        means = np.where(here, self.values, 0).sum(axis=0) / counts
+        return np.where(here, self.values - means, 0), means
+
+
+@dataclass(frozen=True)
+class Eraser:
+    """x becomes x − Σ_k removed_k (read_k · (x − mean)), at every position of its own.
+
+    means: (T, D). removed, read: (T, K, D) or, the same for all positions, (1, K, D). fitted: (T,) positions at
+    which there was enough to learn from; the others are left as they are.
+    In float64: rounding to fewer digits leaves traces of the answer in a plane that is otherwise empty, where
+    ordinary least squares find it.
+    """
+
+    means: Array
+    removed: Array
+    read: Array
+    fitted: NDArray[np.bool_]
+
+    def __call__(self, values: Array) -> Array:
+        """(…, T, D) erased; T may be less than it was fitted for."""
+        count = values.shape[-2]
+        apart = np.where(self.fitted[:count, None], values - self.means[:count], 0.0)
+        removed, read = (
+            np.broadcast_to(own, (self.fitted.size, *own.shape[1:]))[:count] for own in (self.removed, self.read)
+        )
+        found: Array = np.einsum("...tk,tkd->...td", np.einsum("...td,tkd->...tk", apart, read), removed)
+        return np.asarray(values - found)
+
+
+def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Eraser:
+    """What erases the answer from such tokens. left: (N,) the answer.
+
+    Raises UsageError if no position has episodes enough of either answer.
+    """
+    _check(tokens, left)
+    centred, means = tokens.centred()
+    usable = tokens.usable(left)
+    if method.way == "leace":
+        removed, read = _leace(centred, tokens.present, _answer(tokens, left), usable)
+    elif method.way == "inlp":
+        removed = read = _inlp(centred, tokens.present, left, usable, method.rank)
+    else:
+        removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank)
+    return Eraser(means, removed, read, usable)
+
+
+def fit_control(
+    tokens: Tokens, left: NDArray[np.bool_], method: Method, own: Eraser, draw: np.random.Generator
+) -> Eraser:
+    """The same taken away for no answer: as many random directions of the data's own covariance, beside `own`.
+
+    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way.
+    """
+    _check(tokens, left)
+    centred, means = tokens.centred()
+    usable = tokens.usable(left)
+    if method.way == "leace":
+        answer = _answer(tokens, left)
+        label = np.where(tokens.present, draw.normal(size=len(left))[:, None], 0.0)
+        share = (label * answer).sum(axis=0) / np.maximum((answer**2).sum(axis=0), _TINY)
+        label = np.where(tokens.present, label - share * answer, 0.0)
+        counts = np.maximum(tokens.present.sum(axis=0), 1)
+        label = np.where(tokens.present, label - label.sum(axis=0) / counts, 0.0)
+        return Eraser(means, *_leace(centred, tokens.present, label, usable), usable)
+    if method.way == "inlp":
+        weights = draw.normal(size=(method.rank, len(left)))
+        drawn = np.einsum("kn,ntd->tkd", weights, centred)
+    else:
+        weights = draw.normal(size=(method.rank, *centred.shape[:2]))
+        drawn = np.einsum("knt,ntd->kd", weights, centred)[None]
+    beside = np.stack([_basis(one, past=taken) for one, taken in zip(drawn, own.removed, strict=True)])
+    return Eraser(means, beside, beside, usable)
+
+
+def ledoit_wolf(centred: Array) -> float:
+    """How far Ledoit and Wolf (2004) shrink the covariance of centred data (N, D) toward a sphere, in [0, 1].
+
+    By the (N, N) products of episodes: dimensions are many and episodes few.
+    """
+    count, width = centred.shape
+    gram = centred @ centred.T
+    squares = float((gram**2).sum()) / count**2
+    mean = float(np.trace(gram)) / (count * width)
+    spread = squares / width - mean**2
+    noise = (float((np.diag(gram) ** 2).sum()) / count - squares) / (count * width)
+    return 0.0 if spread <= 0 else float(np.clip(noise / spread, 0.0, 1.0))
+
+
+def leace_direction(centred: Array, label: Array, shrinkage: float | None = None) -> tuple[Array, Array]:
+    """What LEACE takes away of one label, and what it reads it by, both (D,): P = removed · readᵀ.
+
+    centred: (N, D). label: (N,), its mean 0. P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances: whatever
+    the shrinkage, nothing correlated with the label is left in the data it was fitted on; without any, no other
+    affine map that achieves this changes the data less. shrinkage: None for `ledoit_wolf`.
+    """
+    amount = ledoit_wolf(centred) if shrinkage is None else shrinkage
+    count, width = centred.shape
+    along = centred.T @ label / count
+    _, values, axes = np.linalg.svd(centred, full_matrices=False)
+    variances = values**2 / count
+    shrunk = (1 - amount) * variances + amount * variances.sum() / width
+    kept = variances > _TINY * max(variances.max(initial=0.0), _TINY)
+    read = axes[kept].T @ ((axes[kept] @ along) / shrunk[kept])
+    strength = float(along @ read)
+    return (along, read / strength) if strength > 0 else (np.zeros(width), np.zeros(width))
+
+
+def _check(tokens: Tokens, left: NDArray[np.bool_]) -> None:
+    if not tokens.usable(left).any():
+        raise UsageError(
+            f"no position has {FEWEST} episodes of either answer among {len(left)} to learn from; expected more "
+            "items (leave --items out, or extract more)"
+        )
+
+
+def _answer(tokens: Tokens, left: NDArray[np.bool_]) -> Array:
+    """(N, T) the answer as ±½, centred at every position over who is present there."""
+    values = np.where(tokens.present, left[:, None] - 0.5, 0.0)
+    means = values.sum(axis=0) / np.maximum(tokens.present.sum(axis=0), 1)
+    return np.where(tokens.present, values - means, 0.0)
+
+
+def _rows(present: NDArray[np.bool_], usable: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    for position in np.flatnonzero(usable):
+        yield int(position), np.flatnonzero(present[:, position])
+
+
+def _leace(
+    centred: Array, present: NDArray[np.bool_], label: Array, usable: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """(T, 1, D) each. label: (N, T)."""
+    removed, read = (np.zeros((usable.size, 1, centred.shape[2])) for _ in range(2))
+    for position, rows in _rows(present, usable):
+        removed[position, 0], read[position, 0] = leace_direction(centred[rows, position], label[rows, position])
+    return removed, read
+
+
+def _inlp(
+    centred: Array, present: NDArray[np.bool_], left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
+) -> Array:
+    """(T, K, D): at every position, what a probe finds, then what one finds without it, and so on."""
+    from sklearn.linear_model import LogisticRegression
+
+    found = np.zeros((usable.size, rank, centred.shape[2]))
+    for position, rows in _rows(present, usable):
+        values = centred[rows, position]
+        scale = float(values.std()) or 1.0
+        for number in range(rank):
+            past = found[position, :number]
+            rest = (values - (values @ past.T) @ past) / scale
+            weights = LogisticRegression(C=1.0, max_iter=200).fit(rest, left[rows]).coef_
+            found[position, number] = _basis(weights, past=past)[0]
+    return found
+
+
+def _differences(centred: Array, present: NDArray[np.bool_], left: NDArray[np.bool_]) -> Array:
+    """(T, D) between the means of either answer."""
+    sums = [
+        centred[left == side].sum(axis=0) / np.maximum(present[left == side].sum(axis=0), 1)[:, None]
+        for side in (True, False)
+    ]
+    return np.asarray(sums[0] - sums[1])
+
+
+def _shared(differences: Array, rank: int) -> Array:
+    """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token."""
+    _, values, axes = np.linalg.svd(differences, full_matrices=False)
+    chosen = axes[: min(rank, int((values > _TINY * max(values[0], _TINY)).sum()))]
+    return np.asarray(chosen[None])
+
+
+def _basis(directions: Array, past: Array) -> Array:
+    """(K, D) orthonormal: directions (K, D) without what `past` (J, D) spans; zero where nothing is left."""
+    taken = [own / np.linalg.norm(own) for own in past if np.linalg.norm(own) > 0]
+    found: list[Array] = []
+    for own in directions:
+        length = float(np.linalg.norm(own))
+        for _ in range(2):  # once more for rounding
+            for other in [*taken, *found]:
+                own = own - other * (other @ own)
+        left = float(np.linalg.norm(own))
+        found.append(own / left if left > 1e-6 * length else np.zeros_like(own))
+    return np.array(found)
