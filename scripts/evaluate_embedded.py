@@ -1,7 +1,7 @@
 """What the embedded models know and do, with intervals: `python scripts/evaluate_embedded.py OUT`.
 
-Asks `vlm-tiny` the prompts of `probe-kit ask` about the first frames of a scene, and with `--policy` has
-`pi0-tiny` act in it; both on the embedded suite, whose pictures no training has seen. Finished runs are reused.
+Has `pi0-tiny` act and asks `vlm-tiny` the prompts of `probe-kit ask`, on the embedded suite, whose pictures no
+training has seen. Episodes are judged by two rules. Finished runs are reused.
 """
 
 from collections.abc import Callable
@@ -16,63 +16,90 @@ from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extrac
 from probe_kit.extract.asking.templates import TEMPLATES
 from probe_kit.organisms import READER, TRAINED, verdict
 from probe_kit.retention import RetentionRow, retention
+from probe_kit.retention.asked import ask_of
 from probe_kit.retention.rows import MEAN
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "traffic", "counting")
-HEADING = ("run", "category", "N", "SR % [95 %]", "Δ by items", "oob or unreadable %", "expected", "measured")
+RULES = ("disc", "released-on-tile")
+HEADING = (
+    "run", "rule", "category", "N", "SR % [95 %]", "original / swapped", "wrong", "oob or unreadable",
+    "Δ by items", "truth", "measured",
+)  # fmt: skip
 
 
 def main(
     out: Annotated[Path, typer.Argument(help="Folder for suite and runs.")],
     items: Annotated[int, typer.Option(help="Per category; each is played in two layouts.")] = 150,
     prompts: Annotated[str, typer.Option(help="Comma-separated; empty to ask nothing.")] = "p1,p2,seen",
-    scene: Annotated[str, typer.Option(help="Preset.")] = "bridge",
-    suite_version: Annotated[int, typer.Option(help="Of the embedded suite: 1 or 2.")] = 1,
-    policy: Annotated[bool, typer.Option("--policy", help="Have the policy act too.")] = False,
+    categories: Annotated[str, typer.Option(help="Comma-separated.")] = ",".join(CATEGORIES),
+    scene: Annotated[str, typer.Option(help="Preset.")] = "act2answer",
+    early_stop: Annotated[bool, typer.Option(help="End an episode when the cube was released and lies.")] = True,
+    suite_version: Annotated[int, typer.Option(help="Of the embedded suite: 1 or 2.")] = 2,
+    suite_seed: Annotated[int, typer.Option(help="Of the embedded suite.")] = 0,
+    checkpoint: Annotated[str | None, typer.Option(help="A policy instead of the embedded one.")] = None,
+    policy: Annotated[bool, typer.Option(help="Have the policy act.")] = True,
 ) -> None:
-    """Ask, act, print."""
+    """Act, ask, print."""
+    place = SceneSpec.preset(scene, early_stop=early_stop)
     with progress() as bar:
         suite = build_suite(
-            out / f"suite-{suite_version}",
-            CATEGORIES,
+            out / f"suite-{suite_version}-{suite_seed}",
+            categories.split(","),
             items,
+            seed=suite_seed,
             version=suite_version,
             progress=counter(bar, "suite"),
         )
-        runs = [_asked(out, suite, scene, prompt, counter(bar, prompt)) for prompt in prompts.split(",") if prompt]
+        runs = [_asked(out, suite, place, prompt, counter(bar, prompt)) for prompt in prompts.split(",") if prompt]
         if policy:
-            settings = ExtractSettings(TRAINED.model, suite=suite.folder, scene=SceneSpec.preset(scene))
-            runs.append(extract_run(settings, _folder(out, suite, scene, "acted"), counter(bar, "episodes")))
-    rows = [row for run in runs for row in retention([run]).rows if row.category != MEAN]
-    for cells in (HEADING, ["---"] * len(HEADING), *map(_cells, rows)):
+            settings = ExtractSettings(TRAINED.model, checkpoint, suite=suite.folder, scene=place, frames="none")
+            name = "acted" if checkpoint is None else Path(checkpoint).name
+            runs.append(extract_run(settings, _folder(out, suite, place, name), counter(bar, "episodes")))
+    for cells in (HEADING, ["---"] * len(HEADING), *map(_cells, _rows(runs))):
         typer.echo(f"| {' | '.join(cells)} |")
 
 
-def _asked(out: Path, suite: Suite, scene: str, prompt: str, count: Callable[..., None]) -> Run:
-    settings = AskSettings(
-        READER.model, suite=suite.folder, scene=SceneSpec.preset(scene), prompt=TEMPLATES[prompt], frames="none"
-    )
+def _rows(runs: list[Run]) -> list[RetentionRow]:
+    """Of every run by itself; those that act by every rule."""
+    judged = [(run, rule) for run in runs for rule in (RULES[:1] if ask_of(run) else RULES)]
+    return [row for run, rule in judged for row in retention([run], rule=rule).rows if row.category != MEAN]
+
+
+def _asked(out: Path, suite: Suite, scene: SceneSpec, prompt: str, count: Callable[..., None]) -> Run:
+    settings = AskSettings(READER.model, suite=suite.folder, scene=scene, prompt=TEMPLATES[prompt], frames="none")
     return ask_run(settings, _folder(out, suite, scene, prompt), count)
 
 
-def _folder(out: Path, suite: Suite, scene: str, name: str) -> Path:
-    return out / f"{name}-{scene}-{suite.version}-{suite.content_sha256[:8]}"
+def _folder(out: Path, suite: Suite, scene: SceneSpec, name: str) -> Path:
+    return out / f"{name}-{scene.name}-{suite.version}-{suite.content_sha256[:8]}"
 
 
 def _cells(row: RetentionRow) -> tuple[str, ...]:
-    whose = TRAINED if row.kind == "acts" else READER
+    acts = row.kind == "acts"
     low, high = row.sr_ci
+    layouts = (
+        "–"
+        if None in (row.sr_original, row.sr_swapped)
+        else f"{_percent(row.sr_original)} / {_percent(row.sr_swapped)}"
+    )
     return (
         row.label or row.model,
+        row.rule if acts else "–",
         row.category,
         str(row.n_episodes),
-        f"{100 * row.sr:.1f} [{100 * low:.1f}, {100 * high:.1f}]",
-        f"{100 * row.delta_regime:.1f}",
-        f"{100 * row.p_oob:.1f}",
-        whose.expected(row.category),
-        verdict(row) if row.kind == "asks" else str(row.regime),
+        f"{_percent(row.sr)} [{_percent(low)}, {_percent(high)}]",
+        layouts,
+        _percent(row.p_wrong),
+        _percent(row.p_oob),
+        _percent(row.delta_regime),
+        (TRAINED if acts else READER).expected(row.category),
+        str(row.regime) if acts else verdict(row),
     )
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f}"
 
 
 if __name__ == "__main__":

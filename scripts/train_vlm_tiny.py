@@ -5,12 +5,8 @@ says how much processor time each part took. Nothing of the evaluation split is 
 another seed.
 """
 
-import json
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 from typing import Annotated
 
 import torch
@@ -19,6 +15,7 @@ from vlm_tiny_training.batches import Pairs
 from vlm_tiny_training.painting import Surface, calibrate, sheet
 from vlm_tiny_training.pictures import PictureBank, read_banks
 from vlm_tiny_training.reading import READING, Learner
+from vlm_tiny_training.spent import timed
 from vlm_tiny_training.training import Trainer, draw_losses, follow, rank, together
 
 from probe_kit.env import SceneSpec
@@ -41,11 +38,11 @@ def main(
     """Draw, train, write."""
     torch.set_num_threads(1)
     out.mkdir(parents=True, exist_ok=True)
-    with _timed(out, "pictures"):
+    with timed(out, "pictures"):
         surfaces = {name: calibrate(SceneSpec.preset(name)) for name in PRESETS}
         surfaces |= {name: sheet(*size) for name, size in SHEETS.items()}
         banks = read_banks(out, tuple(SHARES), PICTURE_SEED, COUPLES, surfaces, processes, print)
-    with _timed(out, "training"):
+    with timed(out, "training"):
         together(processes, lambda: _train(out, seed, banks, surfaces))
     draw_losses(out / "losses.csv", out / "losses.png")
 
@@ -60,25 +57,6 @@ def _train(out: Path, seed: int, banks: list[PictureBank], surfaces: Mapping[str
     follow(trainer, out / "losses.csv", print)
     if rank() == 0:
         write_vlm_tiny(out / "vlm-tiny", network, f"trained, {trainer.step} steps, seed {seed}")
-
-
-@contextmanager
-def _timed(out: Path, part: str) -> Iterator[None]:
-    """Adds to what `time.json` says about a part, in minutes of all processes; of a stopped part it is lost."""
-    file = out / "time.json"
-    processor, wall = _processor_seconds(), time.monotonic()
-    yield
-    spent = json.loads(file.read_text()) if file.is_file() else {}
-    before = spent.get(part, {"processor": 0.0, "wall": 0.0})
-    now = {"processor": (_processor_seconds() - processor) / 60, "wall": (time.monotonic() - wall) / 60}
-    spent[part] = {name: round(before[name] + now[name], 2) for name in now}
-    file.write_text(json.dumps(spent, indent=1))
-
-
-def _processor_seconds() -> float:
-    """Of this process and of those it waited for."""
-    used = [getrusage(whose) for whose in (RUSAGE_SELF, RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 if __name__ == "__main__":

@@ -16,30 +16,23 @@ from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 from numpy.typing import ArrayLike
 from safetensors.numpy import save_file as save_numpy
 from safetensors.torch import save_file
-from tokenizers import Regex, Tokenizer
-from tokenizers.models import WordLevel
-from tokenizers.normalizers import Lowercase
-from tokenizers.pre_tokenizers import Sequence, Split
-from tokenizers.processors import TemplateProcessing
 
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
-from probe_kit.suite.generators import vocabulary
+from probe_kit.models.tiny_words import VOCABULARY, write_tokenizer
 
-_SPECIAL = ("<pad>", "<eos>", "<bos>", "<unk>", "\n")
-WORDS = (*_SPECIAL, *vocabulary())
 SIZE = Pi0Size(
     vlm=GemmaSize(width=96, depth=3, mlp_dim=192, num_heads=8, num_kv_heads=1, head_dim=16),
     expert=GemmaSize(width=64, depth=3, mlp_dim=128, num_heads=8, num_kv_heads=1, head_dim=16),
     vision=SiglipSize(hidden=96, layers=3, heads=4, inter=192, patch=16),
-    vocab_size=-(-len(WORDS) // 64) * 64,
+    vocab_size=VOCABULARY,
 )
 IMAGE_SIDE = 96
 CHUNK = 16
 TEXT_TOKENS = 16
 CAMERA = "observation.images.base"
-WINDOW = {"crop": (70, 100, 280, 540), "size": (IMAGE_SIDE, IMAGE_SIDE)}
-"""Of the 480 x 640 camera picture, the part that holds both tiles: top, left, height, width."""
+LOOKED_AT = (70, 20, 310, 620)
+"""Of the 480 x 640 camera picture, the part that holds both tiles of every preset: top, left, height, width."""
 ACTION_DIMS = (0, 1, 2, 6)
 """What the policy decides: x, y, z and the gripper. It never turns the hand."""
 IDLE_DIMS = (3, 4, 5)
@@ -80,7 +73,7 @@ def write_checkpoint(
     folder.mkdir(parents=True, exist_ok=True)
     policy.config.save_pretrained(folder)
     (folder / "dims.json").write_text(json.dumps(SIZE.to_json(), indent=1))
-    _write_tokenizer(folder)
+    write_tokenizer(folder, TEXT_TOKENS)
     _write_statistics(folder, statistics)
     save_file(
         {name: tensor.to(dtype).contiguous() for name, tensor in policy.state_dict().items()},
@@ -112,19 +105,6 @@ def _config() -> PI0Config:
     )
 
 
-def _write_tokenizer(folder: Path) -> None:
-    """A word-level tokenizer of the embedded suite's grammar."""
-    tokenizer = Tokenizer(WordLevel({word: index for index, word in enumerate(WORDS)}, unk_token="<unk>"))
-    tokenizer.normalizer = Lowercase()
-    tokenizer.pre_tokenizer = Sequence([Split(Regex("\n"), "isolated"), Split(" ", "removed")])
-    tokenizer.post_processor = TemplateProcessing(single="<bos> $A", special_tokens=[("<bos>", 2)])
-    tokenizer.add_special_tokens(["<pad>", "<eos>", "<bos>", "<unk>"])
-    tokenizer.save(str(folder / "tokenizer.json"))
-    card = {"tokenizer_class": "PreTrainedTokenizerFast", "model_max_length": TEXT_TOKENS}
-    tokens = {f"{name}_token": f"<{name}>" for name in ("pad", "eos", "bos", "unk")}
-    (folder / "tokenizer_config.json").write_text(json.dumps(card | tokens, indent=1))
-
-
 def _write_statistics(folder: Path, statistics: Statistics) -> None:
     arrays = {
         f"{feature}.{name}": np.asarray(values, np.float32)
@@ -145,5 +125,5 @@ def _write_statistics(folder: Path, statistics: Statistics) -> None:
 
 
 def _window() -> dict[str, Any]:
-    config = {"crop_params_dict": {CAMERA: WINDOW["crop"]}, "resize_size": WINDOW["size"]}
+    config = {"crop_params_dict": {CAMERA: LOOKED_AT}, "resize_size": (IMAGE_SIDE, IMAGE_SIDE)}
     return {"registry_name": "image_crop_resize_processor", "config": config}

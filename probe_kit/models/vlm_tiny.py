@@ -14,14 +14,12 @@ from transformers import PaliGemmaConfig
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.paligemma.network import build_paligemma
 from probe_kit.models.paligemma.pictures import CROP
-from probe_kit.models.pi0_tiny import IMAGE_SIDE, SIZE
+from probe_kit.models.pi0_tiny import IMAGE_SIDE, LOOKED_AT, SIZE
 from probe_kit.models.tiny_words import END, IMAGE_TOKEN, SPECIAL, VOCABULARY, write_tokenizer
 
 MOST_TOKENS = 128
 """Of a whole prompt, the picture's 36 included."""
 CAMERA_PICTURE = (480, 640)
-LOOKED_AT = (70, 20, 310, 620)
-"""Of such a picture, the part that holds both tiles of every preset: top, left, height, width."""
 
 
 def new_vlm_tiny(seed: int) -> Any:

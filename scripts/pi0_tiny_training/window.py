@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.hooks.families.lerobot_window import PictureWindow
-from probe_kit.models.pi0_tiny import WINDOW
+from probe_kit.models.pi0_tiny import IMAGE_SIDE, LOOKED_AT
 
 
 def seen_by_policy(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -15,4 +15,4 @@ def seen_by_policy(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return (seen * 255).round().to(torch.uint8).numpy().reshape(*seen.shape[:2], *picture.shape[2:])
 
 
-WINDOW_OF_POLICY = PictureWindow(**WINDOW)
+WINDOW_OF_POLICY = PictureWindow(LOOKED_AT, (IMAGE_SIDE, IMAGE_SIDE))

@@ -5,7 +5,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pi0_tiny_training.painting import brush_of, ramp
 from PIL import Image
 
 from probe_kit.env import Act2AnswerEnv, SceneSpec
@@ -13,6 +12,7 @@ from probe_kit.env.scene import SIDES, Scene
 from probe_kit.extract.asking.pictures import GREY, MARGIN
 from probe_kit.models.pi0_tiny import IMAGE_SIDE
 from probe_kit.models.vlm_tiny import CAMERA_PICTURE, LOOKED_AT
+from vlm_tiny_training.brush import brush_of, ramp
 from vlm_tiny_training.window import seen
 
 

@@ -50,9 +50,14 @@ class Trainer[Setting]:
     """Learner and optimiser of one training, which continues from `path`."""
 
     def __init__(
-        self, learner: Learning[Setting], stages: Sequence[Stage[Setting]], seed: int, path: Path
+        self,
+        learner: Learning[Setting],
+        stages: Sequence[Stage[Setting]],
+        seed: int,
+        path: Path,
+        batch: int = BATCH,
     ) -> None:
-        self.learner, self.stages, self.seed, self.path = learner, stages, seed, path
+        self.learner, self.stages, self.seed, self.path, self._batch = learner, stages, seed, path, batch
         self.step = 0
         self._parameters = [p for p in learner.network.parameters() if p.requires_grad]
         decayed = [p for p in self._parameters if p.ndim > 1]
@@ -81,7 +86,7 @@ class Trainer[Setting]:
             group["lr"] = stage.rate_at(step)
         torch.manual_seed((self.seed * 1_000_003 + self.step) * 101 + rank())
         rng = np.random.default_rng([self.seed, self.step, rank()])
-        losses = self.learner.losses(rng, stage.setting, BATCH // workers())
+        losses = self.learner.losses(rng, stage.setting, self._batch // workers())
         self.optimiser.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
         self._share_gradients()
@@ -180,12 +185,12 @@ def _append(log: Path, step: int, means: Mapping[str, float]) -> None:
         writer.writerows((step, name, mean) for name, mean in means.items())
 
 
-def draw_losses(log: Path, picture: Path) -> None:
+def draw_losses(log: Path, picture: Path, batch: int = BATCH) -> None:
     """The loss curves of a training as a PNG file."""
     figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
     for name, rows in pd.read_csv(log).groupby("loss", sort=False):
         axis.plot(rows["step"], rows["mean"].rolling(4, min_periods=1).mean(), label=name)
-    axis.set(xlabel=f"step of {BATCH} samples", ylabel="loss, mean of 200 steps", yscale="log")
+    axis.set(xlabel=f"step of {batch} samples", ylabel="loss, mean of 200 steps", yscale="log")
     axis.legend()
     figure.savefig(picture, dpi=120)
     plt.close(figure)

@@ -1,0 +1,1 @@
+"""How policies are made of the embedded reader: demonstrations → frames → training → checkpoint."""
