@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
-from probe_kit.hooks.foreign_code import loading
+from probe_kit.hooks.foreign_code import loading, of_checkpoint
 from probe_kit.hooks.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.options import Option, check_options
 from probe_kit.hooks.protocol import ProtocolRow
@@ -146,7 +146,8 @@ class Family:
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if place is not None and self.config_types:
-            check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
+            with of_checkpoint(self.name, place):
+                check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
         return chosen
 
     def check_intervention(self, kind: InterventionKind) -> None:

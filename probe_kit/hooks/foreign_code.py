@@ -1,24 +1,58 @@
-"""Calling code of others: whatever it raises, even the end of the process, becomes a named error of ours."""
+"""Calling code of others: whatever it raises, even the end of the process, becomes a named error of ours.
 
+What is wrong with a checkpoint says whose it is and where it lies, wherever in the loading or acting it was found.
+"""
+
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
-from probe_kit.errors import CheckpointError, PolicyFailedError, ProbeKitError
+from probe_kit.errors import CheckpointError, PolicyFailedError, ProbeKitError, WeightsError
 
 _LONGEST = 300
 
 
 @contextmanager
-def acting(model: str) -> Iterator[None]:
-    """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours."""
+def of_checkpoint(model: str, place: str) -> Iterator[None]:
+    """Put the model and the checkpoint's folder or hub id into every CheckpointError and WeightsError of the body.
+
+    What a message already names is not said twice.
+    """
     try:
         yield
+    except (CheckpointError, WeightsError) as error:
+        error.args = (whose(str(error), model, place),)
+        raise
+
+
+def whose(reason: str, model: str, place: str) -> str:
+    """A reason why a checkpoint cannot be used, with the names of its model and place unless it holds them."""
+    places = {place, str(Path(place))}
+    rest = reason
+    for one in places:
+        rest = rest.replace(one, " ")  # a folder may be called as its model is
+    lacking = [] if re.search(rf"(?<![\w-]){re.escape(model)}(?![\w-])", rest) else [model]
+    if rest == reason:
+        lacking.append(place)
+    return f"{' from '.join(lacking)}: {reason}" if lacking else reason
+
+
+@contextmanager
+def acting(model: str, place: str) -> Iterator[None]:
+    """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
+
+    place: where its checkpoint lies, for what is found out about it this late.
+    """
+    try:
+        with of_checkpoint(model, place):
+            yield
     except ProbeKitError:
         raise
     except (Exception, SystemExit) as error:
         raise PolicyFailedError(
             f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error of "
-            "probe_kit; mend it, then the same command continues"
+            f"probe_kit; mend it, or what it read from {place}. Then the same command continues"
         ) from error
 
 
@@ -29,7 +63,8 @@ def loading(model: str, place: str) -> Iterator[None]:
     A loader that ends the process raises PolicyFailedError.
     """
     try:
-        yield
+        with of_checkpoint(model, place):
+            yield
     except ProbeKitError:
         raise
     except SystemExit as error:

@@ -170,7 +170,7 @@ class Bench:
 
     def act(self, seen: Observation, seed: int) -> Chunk:
         """(chunk, 7): one inference, alone in its batch. Raises PolicyFailedError for what the policy raises."""
-        with acting(self.run.model):
+        with acting(self.run.model, self.policy.card.checkpoint):
             return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
 
     def apart(self, question: Question, chunk: Chunk) -> float:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from probe_kit.errors import CaptureChangedActionError
+from probe_kit.extract.store.bundles import tidy_bundle
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
@@ -53,7 +54,9 @@ def intervene_on(
     refuse_unsupported(run, asked)
     settings = settings_of(asked, run)
     key = key_of(settings)
-    if not is_stored(run.location, key):
+    if is_stored(run.location, key):
+        tidy_bundle(run.location, INTERVENTIONS, key)
+    else:
         _carry_out(run, asked, settings, key, source or Source(), load, progress)
     return load_effects(run, key)
 

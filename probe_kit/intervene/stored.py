@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError, UsageError
-from probe_kit.extract.store.bundles import HEAD, Bundle, read_bundles, write_bundle
+from probe_kit.extract.store.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
 from probe_kit.extract.store.hashes import as_json
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.location import Location
@@ -143,6 +143,7 @@ def save(
 ) -> None:
     """Write `interventions/<key>/`, all or nothing; what is there is kept."""
     if is_stored(run, key):
+        tidy_bundle(run, INTERVENTIONS, key)
         return
     files = {EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate)}
     now = datetime.now(UTC).isoformat(timespec="microseconds")

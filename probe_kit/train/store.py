@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
-from probe_kit.extract.store.bundles import HEAD, Bundle, read_bundles, write_bundle
+from probe_kit.extract.store.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
 from probe_kit.extract.store.layout import PROBES
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.location import Location
@@ -50,6 +50,8 @@ def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = T
         header = {**header, "asked": _now()}
     if found or header != stored[results.key]:
         _write(location, results.key, header, {**found, **({SCORES: _scores(results)} if found else {})})
+    else:
+        tidy_bundle(location, PROBES, results.key)
 
 
 def _write(run: Location, key: str, header: Mapping[str, Any], files: Mapping[str, bytes]) -> None:

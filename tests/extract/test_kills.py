@@ -66,14 +66,14 @@ def nursery(suite: Suite) -> Iterator[Nursery]:
 def objects(run: Path | str) -> dict[str, bytes]:
     """Every object by key, columns by their name in a folder.
 
-    Of probes, what neither tells the time nor was written aside by a process that was killed.
+    Of probes, what does not tell the time.
     """
     location = locate(run)
     stamped = f"{location.derived(COLUMNS, open_run(run, allow_partial=True).stamp)}/"
     return {
         key.replace(stamped, f"{COLUMNS}/"): location.read(key)
         for key in location.keys("")
-        if not (key.startswith("probes/") and key.endswith(("settings.json", ".tmp")))
+        if not (key.startswith("probes/") and key.endswith("settings.json"))
     }
 
 

@@ -1,5 +1,6 @@
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -33,6 +34,29 @@ def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun)
     scores = pd.read_csv(folder / "scores.csv")
     np.testing.assert_allclose(scores["accuracy"], results.scores["accuracy"])
     assert (scores["settings"] == results.key).all()
+
+
+def leave_behind(folder: Path, key: str) -> None:
+    """What processes killed in the middle of writing leave of a bundle."""
+    for torn in (folder / key / "abc.tmp", folder / f".{key}.partial" / "mean+backbone.00.residual.npz"):
+        torn.parent.mkdir(parents=True, exist_ok=True)
+        torn.write_text("torn")
+
+
+@pytest.mark.parametrize("finished", [True, False], ids=["killed at the end", "killed before the settings"])
+def test_what_a_killed_training_left_is_cleared_by_the_next_one(planted_run: PlantedRun, finished: bool) -> None:
+    run = planted_run()
+    results = train_probes(run, permutations=1)
+    probes = run.path / "probes"
+    whole = {path.name for path in probes.rglob("*")}
+    if not finished:
+        (probes / results.key / "settings.json").unlink()
+        (probes / f".{results.key}.partial").mkdir()  # else it is damage
+        (probes / results.key / "abc.tmp").write_text("torn")
+    else:
+        leave_behind(probes, results.key)
+    train_probes(run, permutations=1)
+    assert {path.name for path in probes.rglob("*")} == whole
 
 
 def test_the_newest_results_for_the_target_are_loaded(planted_run: PlantedRun) -> None:

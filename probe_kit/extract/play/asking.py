@@ -69,7 +69,7 @@ class Asking:
         if not due:
             return
         try:
-            with acting(self._controller.identity["model"]):
+            with acting(self._controller.identity["model"], self._controller.reader.card.checkpoint):
                 outcomes = self._controller.ask([turn for _, turn, _ in due])
         except EPISODE_ERRORS as error:
             for chair, turn, _ in due:

@@ -126,7 +126,7 @@ class PolicyController:
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
-        with acting(name):
+        with acting(name, policy.card.checkpoint):
             self.streams = stored_streams(policy, policy.roles(examples))
         self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
         card = policy.card
@@ -153,7 +153,7 @@ class PolicyController:
 
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
-        with acting(self.identity["model"]):
+        with acting(self.identity["model"], self.policy.card.checkpoint):
             return self._act(turns)
 
     def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -178,7 +178,7 @@ class PolicyController:
 
     def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
-        with acting(self.identity["model"]):
+        with acting(self.identity["model"], self.policy.card.checkpoint):
             self._infer(observations, list(seeds))
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:

@@ -6,6 +6,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.play.controllers import SCRIPTED
 from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.card import Card
+from probe_kit.hooks.foreign_code import whose
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -58,8 +59,9 @@ def _refuse_acting(settings: ExtractSettings) -> None:
 def refuse_misfit(settings: ExtractSettings, policy: "Policy") -> None:
     """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only listened to."""
     if not settings.listen and (reason := policy.misfit()) is not None:
+        told = whose(reason, settings.model, policy.card.checkpoint)
         raise CheckpointError(
-            f"{reason}. To capture what it thinks without acting, add --listen: the first inference of every "
+            f"{told}. To capture what it thinks without acting, add --listen: the first inference of every "
             "episode is stored and probed as ever, and there is no success rate"
         )
 

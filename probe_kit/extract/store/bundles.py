@@ -113,8 +113,22 @@ def write_bundle(
 ) -> None:
     """Store a bundle, or change one: files that are not given stay as they are.
 
-    head: replaces the former one, without the parts that are kept here (`key`, `run`, `files`).
+    head: replaces the former one, without the parts that are kept here (`key`, `run`, `files`). What killed
+    processes left in its folder is removed.
     """
+    with location.tended(f"{home}/{key}"):
+        _write_bundle(location, home, key, head, files)
+
+
+def tidy_bundle(location: Location, home: str, key: str) -> None:
+    """Remove what killed processes left of a bundle that is complete: files and folders that never counted."""
+    with location.tended(f"{home}/{key}"):
+        location.remove(f"{home}/.{key}{PARTIAL}")
+
+
+def _write_bundle(
+    location: Location, home: str, key: str, head: Mapping[str, Any], files: Mapping[str, bytes]
+) -> None:
     before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
     kept = _files_of(before) if before else {}
     named, written = dict(kept), dict[str, int]()

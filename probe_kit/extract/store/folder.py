@@ -192,6 +192,20 @@ class Folder(Location):
                 shutil.rmtree(leftover, ignore_errors=True)
             yield
 
+    @contextmanager
+    def tended(self, folder: str) -> Iterator[None]:
+        """By a lock on the folder itself, so whatever lies aside there is nobody's any more."""
+        path = self._path / folder
+        path.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            for leftover in path.glob("*.tmp"):
+                leftover.unlink()
+            yield
+        finally:
+            os.close(handle)
+
     def derived(self, folder: str, stamp: str) -> str:  # noqa: ARG002 - there is only one, see `rebuilding`
         """Always `folder`."""
         return folder

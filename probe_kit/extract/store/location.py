@@ -118,6 +118,10 @@ class Location(ABC):
         """Processes that want to do the same derived work take turns."""
 
     @abstractmethod
+    def tended(self, folder: str) -> AbstractContextManager[None]:
+        """Processes that write right into `folder` take turns; what killed ones left aside there is removed."""
+
+    @abstractmethod
     def derived(self, folder: str, stamp: str) -> str:
         """Where the group derived from `stamp` lies that belongs to `folder`."""
 

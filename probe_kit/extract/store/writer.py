@@ -126,6 +126,15 @@ class RunWriter:
         with self.location.held(lambda: self.location.remove(FAILED)):
             yield
 
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Work along while the body runs, in a process that the owner started, and may outlive it.
+
+        Nobody then takes what it is writing for a leftover. What the owner noted of failures stays.
+        """
+        with self.location.held(lambda: None):
+            yield
+
     def begin(self, allow_mixed: bool = False) -> None:
         """Say in the run who is going to play in it.
 

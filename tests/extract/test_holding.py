@@ -1,0 +1,115 @@
+"""Whoever writes into a run holds it, the owner and every worker, so that nobody clears what it is writing."""
+
+import fcntl
+from multiprocessing import Pipe
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.extract import ExtractSettings, extract_run, prepare
+from probe_kit.extract.crews.processes import MORE, serve
+from probe_kit.extract.crews.ray import RayActor
+from probe_kit.extract.store.folder import Folder
+from probe_kit.extract.store.layout import RUN_FILE
+from probe_kit.suite import Suite
+
+EPISODES = [0, 1]
+
+
+@pytest.fixture
+def settings(small_suite: Suite) -> ExtractSettings:
+    scene = SceneSpec(max_steps=1)
+    return ExtractSettings(
+        "expert", suite=small_suite.folder, categories=("color",), items=1, scene=scene, env_workers=0
+    )
+
+
+@pytest.fixture
+def unheld(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Keys that were written while nobody held their run; that the run begins is no such writing."""
+    found: list[str] = []
+    for name in ("create", "write"):
+        _watch(monkeypatch, name, found)
+    return found
+
+
+def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None:
+    original = getattr(Folder, name)
+
+    def watched(self: Folder, key: str, content: bytes) -> Any:
+        with (self.path / RUN_FILE).open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                pass
+            else:
+                found.append(key)
+        return original(self, key, content)
+
+    monkeypatch.setattr(Folder, name, watched)
+
+
+def begun(settings: ExtractSettings, run: Path) -> str:
+    """A run of nobody: its owner was killed."""
+    return prepare(settings).writer(Folder(run)).location.address
+
+
+def test_an_extraction_in_one_process_holds_its_run(
+    settings: ExtractSettings, tmp_path: Path, unheld: list[str]
+) -> None:
+    extract_run(settings, tmp_path / "run")
+    assert unheld == []
+
+
+def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path, unheld: list[str]) -> None:
+    address = begun(settings, tmp_path / "run")
+    ours, theirs = Pipe()
+    worker = Thread(target=_serve, args=(theirs,), daemon=True)
+    worker.start()
+    ours.send((settings, address))
+    numbers = iter(EPISODES)
+    done: list[int] = []
+    while len(done) < len(EPISODES):
+        message = ours.recv()
+        if message == MORE:
+            ours.send(next(numbers, None))
+        else:
+            done.append(message.number)
+    ours.close()
+    worker.join()
+    assert done == EPISODES
+    assert (tmp_path / "run" / "certificate.json").is_file()
+    assert unheld == []
+
+
+def _serve(connection: Any) -> None:
+    try:
+        serve(connection)
+    except (EOFError, OSError):
+        return  # the driver hung up, which ends the process
+
+
+def test_an_actor_on_a_cluster_holds_the_run_itself(
+    settings: ExtractSettings, tmp_path: Path, unheld: list[str]
+) -> None:
+    actor = RayActor(settings, begun(settings, tmp_path / "run"))
+    assert actor.begin() is None
+    assert isinstance(played := actor.play(EPISODES), list)
+    assert [event.number for event in played] == EPISODES
+    actor._opened.close()
+    assert unheld == []
+
+
+def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_path: Path) -> None:
+    writer = prepare(settings).writer(Folder(tmp_path / "run"))
+    with writer.owned():
+        writer.give_up(3, "it fell over")
+        with writer.joined():
+            pass
+    with writer.joined():
+        assert list(writer.location.read_all("failed", ".json"))
+    with writer.owned():
+        assert not list(writer.location.read_all("failed", ".json"))
