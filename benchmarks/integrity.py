@@ -1,12 +1,13 @@
 """What integrity costs: hashes while writing, opening a large run, and reading every byte to verify it.
 
-    python benchmarks/integrity.py [--width 512] [--episodes 3440] [--repeats 5]
+    python benchmarks/integrity.py [--width 512] [--episodes 3440] [--gigabytes 1.2] [--repeats 5]
 
 Rivals: the same writing without any checksum and with the crc32c of former versions; opening the same run as a
-former version stored it; reading the same files and doing nothing with them.
+former version stored it; reading the same files and doing nothing with them, and hashing them in one thread.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import statistics
@@ -14,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from probe_kit.extract import open_run, verify_run
+from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
 from probe_kit.extract.play.rollout import Rollout
 from probe_kit.extract.play.staging import EpisodeBuffers
@@ -103,9 +105,19 @@ def write(writer: RunWriter, records: list[EpisodeRecord]) -> None:
 
 
 def read_all(files: list[Path]) -> None:
-    """And do nothing with them."""
+    """A megabyte at a time into the same memory, which is the cheapest way, and do nothing with it."""
+    buffer = bytearray(1 << 20)
     for path in files:
-        path.read_bytes()
+        with path.open("rb", buffering=0) as file:
+            while file.readinto(buffer):
+                pass
+
+
+def hash_all(files: list[Path]) -> None:
+    """One file after another in one thread: what the hash alone takes."""
+    for path in files:
+        with path.open("rb") as file:
+            hashlib.file_digest(file, "blake2b")
 
 
 def forget(files: list[Path]) -> None:
@@ -116,25 +128,39 @@ def forget(files: list[Path]) -> None:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def bench_verifying(folder: Path, repeats: int) -> None:
-    """Every byte of the runs that were just written, against reading the same files, from disk and from memory."""
-    runs = [folder / f"none-blake2b-{repeat}" for repeat in range(repeats)]
-    files = {run: [path for path in run.rglob("*") if path.is_file()] for run in runs}
-    size = sum(path.stat().st_size for path in files[runs[0]]) / 1e6
+def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> None:
+    """Every byte of a run with tokens of full width, against reading and hashing the same files.
+
+    From the disk, its pages forgotten before every turn, and from memory, where the run was read just before.
+    """
+    stream = replace(BACKBONE, width=2048)
+    episodes = max(1, round(gigabytes * 1e9 / stream.raw_bytes(True)))
+    plan = make_plan(suite, [stream], 0, 1, True)
+    many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
+    writer = RunWriter(locate(run), replace(plan, episodes=many), settings("none"))
+    record = episode(plan, 0).record
+    with writer.owned():
+        for planned in many:
+            writer.write(replace(record, planned=planned))
+        seal(run)
+    files = [path for path in run.rglob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in files) / 1e6
+    ways: dict[str, Callable[[], object]] = {
+        "reading alone": partial(read_all, files),
+        "hashing alone": partial(hash_all, files),
+        "verify --deep": partial(verify_run, run, deep=True),
+    }
     for where in ("disk", "memory"):
-        found: dict[str, list[Seconds]] = {"reading": [], "verify --deep": []}
-        for run in runs:
-            ways = {"reading": partial(read_all, files[run]), "verify --deep": partial(verify_run, run, deep=True)}
+        found: dict[str, list[Seconds]] = {name: [] for name in ways}
+        for _ in range(repeats):
             for name, work in ways.items():
-                (forget if where == "disk" else read_all)(files[run])
+                (forget if where == "disk" else read_all)(files)
                 found[name].append(seconds(work))
-        (read_wall, read_cpu), (wall, cpu) = (medians(turns) for turns in found.values())
-        ways = ((read_wall, read_cpu, "reading alone"), (wall, cpu, "verify --deep"))
-        for wall_of, cpu_of, name in ways:
-            print(
-                f"{size:.0f} MB from {where}, {name:13} {size / wall_of:6.0f} MB/s ({size / cpu_of:.0f} per CPU-s)"
-            )
-        print(f"verify --deep from {where}: {read_wall / wall:.2f} of the speed of reading alone")
+        for name, turns in found.items():
+            wall, cpu = medians(turns)
+            ratio = medians(found["reading alone"])[0] / wall
+            print(f"{size:.0f} MB in {len(files)} files from {where}, {name} {size / wall:6.0f} MB/s "
+                  f"({size / cpu:.0f} per CPU-s), {ratio:.2f} of the speed of reading")  # fmt: skip
 
 
 def large_run(suite: Suite, run: Path, episodes: int) -> None:
@@ -199,14 +225,20 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=512)
     parser.add_argument("--episodes", type=int, default=3440)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--gigabytes", type=float, default=1.2, help="of the run that is verified")
+    parser.add_argument("--only", choices=["opening", "writing", "verifying"], help="one part instead of all")
     options = parser.parse_args()
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    load = os.getloadavg()[0]
+    print(f"load {load:.1f} on {os.cpu_count()} cores, {datetime.now(UTC):%d %B %Y}")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         suite = build_suite(folder / "suite", ["color"], 6)
-        bench_opening(suite, folder, options.episodes, options.repeats)
-        bench_writing(suite, folder, options.width, options.repeats)
-        bench_verifying(folder, options.repeats)
+        if options.only in (None, "opening"):
+            bench_opening(suite, folder, options.episodes, options.repeats)
+        if options.only in (None, "writing"):
+            bench_writing(suite, folder, options.width, options.repeats)
+        if options.only in (None, "verifying"):
+            bench_verifying(suite, folder / "verified", options.gigabytes, options.repeats)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first. Imports no torch."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.foreign_json import parse_json, read_json
 from probe_kit.hooks.hub import unreachable
 from probe_kit.models.bounds import check_sizes
@@ -72,6 +72,23 @@ def _content(file: Path) -> Any:
         return yaml.safe_load(file.read_bytes())
     except yaml.YAMLError as error:
         raise ValueError(error) from error
+
+
+def chosen_dtype(asked: str | None, stored: object, offered: Collection[str]) -> str:
+    """The dtype that was asked for, or else what a checkpoint's configuration says; float32 where neither does.
+
+    Raises UsageError for another one that was asked for, CheckpointError for one that is stored.
+    """
+    if asked is not None:
+        if asked not in offered:
+            raise UsageError(f"dtype {asked!r} is not one of {', '.join(offered)}")
+        return asked
+    name = str(stored or "float32").removeprefix("torch.")
+    if name not in offered:
+        raise CheckpointError(
+            f"its configuration says dtype {name!r}; expected one of {', '.join(offered)}. Pass one as --dtype"
+        )
+    return name
 
 
 def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:

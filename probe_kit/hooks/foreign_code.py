@@ -8,20 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from probe_kit.errors import CheckpointError, PolicyFailedError, ProbeKitError, WeightsError
+from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
 
 _LONGEST = 300
 
 
 @contextmanager
 def of_checkpoint(model: str, place: str) -> Iterator[None]:
-    """Put the model and the checkpoint's folder or hub id into every CheckpointError and WeightsError of the body.
+    """Put the model and the checkpoint's folder or hub id into the body's errors about weights, files and words.
 
     What a message already names is not said twice.
     """
     try:
         yield
-    except (CheckpointError, WeightsError) as error:
+    except (CheckpointError, WeightsError, InstructionError) as error:  # the last of a tokenizer that lacks words
         error.args = (whose(str(error), model, place),)
         raise
 

@@ -5,12 +5,19 @@ from contextlib import AbstractContextManager
 
 import pytest
 
-from probe_kit.errors import CheckpointError, PolicyFailedError, ProbeKitError, UsageError, WeightsError
+from probe_kit.errors import (
+    CheckpointError,
+    InstructionError,
+    PolicyFailedError,
+    ProbeKitError,
+    UsageError,
+    WeightsError,
+)
 from probe_kit.hooks.foreign_code import acting, loading, whose
 
 
 @pytest.mark.parametrize("context", [loading, acting], ids=["loading", "acting"])
-@pytest.mark.parametrize("kind", [CheckpointError, WeightsError])
+@pytest.mark.parametrize("kind", [CheckpointError, WeightsError, InstructionError])
 def test_an_error_about_a_checkpoint_names_its_family_and_its_folder(
     context: Callable[[str, str], AbstractContextManager[None]], kind: type[ProbeKitError]
 ) -> None:

@@ -1,7 +1,7 @@
 """Commits: the small record that makes an episode count, written last and exactly once."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import google_crc32c
@@ -32,6 +32,14 @@ _NUMBERED = re.compile(r"(\d{8})\.json")
 def crc32c(content: bytes) -> str:
     """The checksum that commits of former versions carry, as eight hex digits."""
     return f"{google_crc32c.value(content):08x}"
+
+
+def crc32c_of(pieces: Iterable[bytes | memoryview]) -> tuple[int, str]:
+    """Length and the same checksum of what these pieces are together."""
+    value = length = 0
+    for piece in pieces:
+        value, length = google_crc32c.extend(value, bytes(piece)), length + len(piece)
+    return length, f"{value:08x}"
 
 
 def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:

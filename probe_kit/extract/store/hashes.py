@@ -10,9 +10,9 @@ Hashes find accidents, whatever they look like. They stop nobody who computes th
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import blake2b
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.foreign_json import parse_json
@@ -20,7 +20,6 @@ from probe_kit.foreign_json import parse_json
 HASH = "blake2b"
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
 _HEX = 2 * DIGEST_BYTES
-_PIECE = 1 << 20
 _BEFORE, _AFTER = f'{{\n "{HASH}": "'.encode(), b'",'
 
 
@@ -61,12 +60,13 @@ def digest(content: bytes) -> str:
     return blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
 
 
-def digest_of(file: BinaryIO) -> str:
-    """That of all that is left in an open file, read a piece at a time."""
-    running = blake2b(digest_size=DIGEST_BYTES)
-    while piece := file.read(_PIECE):
+def digest_of(pieces: Iterable[bytes | memoryview]) -> tuple[int, str]:
+    """Length and blake2b of what these pieces are together."""
+    running, length = blake2b(digest_size=DIGEST_BYTES), 0
+    for piece in pieces:
         running.update(piece)
-    return running.hexdigest()
+        length += len(piece)
+    return length, running.hexdigest()
 
 
 def block_digest(content: bytes) -> str:

@@ -6,7 +6,7 @@ in `folder` and `bucket`, and nowhere else.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import BinaryIO
@@ -56,6 +56,13 @@ class Location(ABC):
     @abstractmethod
     def read(self, key: str) -> bytes:
         """All of one object. Raises FileNotFoundError."""
+
+    def pieces(self, key: str) -> Iterator[bytes | memoryview]:
+        """One object from its beginning to its end; a piece is good until the next one is asked for.
+
+        Raises FileNotFoundError.
+        """
+        yield self.read(key)
 
     @abstractmethod
     def open(self, key: str) -> BinaryIO:

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype
 from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
@@ -59,9 +59,7 @@ def load_checkpoint(
     """
     folder = checkpoint_folder(checkpoint)
     config = MagmaConfig.from_folder(folder)
-    name = dtype or str(config.dtype or "float32").removeprefix("torch.")
-    if name not in _DTYPES:
-        raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
+    name = chosen_dtype(dtype, config.dtype, _DTYPES)
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
         notes: tuple[str, ...] = ()

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype
 from probe_kit.hooks.families.prismatic.lora import ADAPTER_CONFIG, Adapter, merge_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
@@ -64,9 +64,7 @@ def load_checkpoint(
     base = folder if adapter is None else adapter.base_folder()
     _refuse_other_heads((folder, base))
     config = PrismaticConfig.from_folder(base)
-    name = dtype or _stored_dtype(config)
-    if name not in _DTYPES:
-        raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
+    name = chosen_dtype(dtype, config.dtype, _DTYPES)
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
     else:
@@ -100,10 +98,6 @@ def _refuse_other_heads(folders: tuple[Path, ...]) -> None:
                     f"{found[0]} belongs to OpenVLA-OFT, which does not decode its actions as tokens: "
                     "running it as OpenVLA would give other actions than its authors'"
                 )
-
-
-def _stored_dtype(config: PrismaticConfig) -> str:
-    return str(config.dtype or "float32").removeprefix("torch.")
 
 
 def _random(

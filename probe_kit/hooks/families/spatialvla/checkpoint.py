@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype
 from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
@@ -69,9 +69,7 @@ def load_checkpoint(
             f"{folder} holds a LoRA adapter, not a SpatialVLA; merge it into its base with peft first"
         )
     config = SpatialVLAConfig.from_folder(folder)
-    name = str(dtype or config.dtype or "float32").removeprefix("torch.")
-    if name not in _DTYPES:
-        raise UsageError(f"dtype {name!r} is not one of {', '.join(_DTYPES)}")
+    name = chosen_dtype(dtype, config.dtype, _DTYPES)
     processor = _processor(folder)
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)

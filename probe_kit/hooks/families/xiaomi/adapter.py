@@ -20,9 +20,9 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.card import Card
-from probe_kit.hooks.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.families.memory import memory_tap
-from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
+from probe_kit.hooks.families.qwen_loading import DTYPES, Filled, fill, twin
 from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
 from probe_kit.hooks.families.weighing import Note, weighed
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
@@ -282,11 +282,11 @@ def load_xiaomi(
     def build(kind: torch.dtype, place: str) -> XiaomiNetwork:
         return build_xiaomi(config, kind, place)
 
-    stored = str(config.dtype).removeprefix("torch.") if config.dtype else None
+    kind = chosen_dtype(dtype, config.dtype, DTYPES) if dtype or config.dtype else None
     if random_weights:
-        filled = twin(build, name, dtype or stored, weights_seed)
+        filled = twin(build, name, kind, weights_seed)
     else:
         tied = _TIED if config.vlm.tie_word_embeddings else ()
-        filled = fill(build, lambda: read_weights(folder), dtype or stored, lambda _: tied)
+        filled = fill(build, lambda: read_weights(folder), kind, lambda _: tied)
     filled.network.to(device)
     return Xiaomi(filled, config, folder, name, device, robot, steps, tokenizer, openness)
