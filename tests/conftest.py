@@ -1,12 +1,14 @@
 """What several test folders share: golden references where present, the embedded policy, one recorded run."""
 
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -128,26 +130,44 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
     return build_suite(tmp_path_factory.mktemp("suite") / "small", ["color", "shape"], 12)
 
 
+def _made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """The folder that `make` fills: one process of the suite does so, and every other gets a copy of its own."""
+    own = tmp_path_factory.mktemp(name) / name
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        make(own)
+        return own
+    everybodys = tmp_path_factory.getbasetemp().parent / name
+    with FileLock(f"{everybodys}.lock"):
+        if not everybodys.exists():
+            make(own)
+            shutil.copytree(own, f"{everybodys}.part")
+            Path(f"{everybodys}.part").rename(everybodys)
+            return own
+    shutil.copytree(everybodys, own)
+    return own
+
+
 @pytest.fixture(scope="session")
 def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of two runs without a model, `run` and `other`, of other seeds, with everything a run can hold."""
     from tests.little_run import intervene_on_little_run, probe_little_run, write_little_run
 
-    folder = tmp_path_factory.mktemp("little")
-    for seed, name in enumerate(("run", "other")):
-        made = write_little_run(folder / name, small_suite.select(["color"]), seed)
-        probe_little_run(made)
-        intervene_on_little_run(made)
-    return folder
+    def make(folder: Path) -> None:
+        for seed, name in enumerate(("run", "other")):
+            made = write_little_run(folder / name, small_suite.select(["color"]), seed)
+            probe_little_run(made)
+            intervene_on_little_run(made)
+
+    return _made_once(tmp_path_factory, "little", make)
 
 
 @pytest.fixture(scope="session")
 def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
     """A real run of pi0-tiny's random twin with all tokens: 48 episodes of four actions."""
     from probe_kit.env import SceneSpec
-    from probe_kit.extract import ExtractSettings, extract_run
+    from probe_kit.extract import ExtractSettings, extract_run, open_run
 
     settings = ExtractSettings(
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
     )
-    return extract_run(settings, tmp_path_factory.mktemp("runs") / "recorded")
+    return open_run(_made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))

@@ -26,7 +26,7 @@ class Design(Protocol):
         """Zᵀ · values, (R, K) for (N, K)."""
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
+        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class DenseDesign:
         return self.samples.T @ values
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
-        return (self.samples.T * weights) @ self.samples
+        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        return (self.samples.T * weights.T[:, None, :]) @ self.samples
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,10 @@ class StreamedDesign:
         return self._joined([self.axes.T @ total, values.sum(axis=0)[None]])
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(weights) · Z, (R, R) for (N,)."""
+        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        return namespace(self.axes).stack([self._moments(column) for column in weights.T])
+
+    def _moments(self, weights: Array) -> Array:
         xp, start = namespace(self.axes), 0
         inner, border = 0.0, 0.0
         for block in self.features.blocks():

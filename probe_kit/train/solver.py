@@ -19,6 +19,9 @@ from probe_kit.train.design import Design
 
 MAX_NEWTON_STEPS = 100
 MAX_CG_STEPS = 100
+FEW_COLUMNS, SMALL_HESSIAN = 32, 2**20
+"""Up to so many label columns, each of so many multiplications (N · R²), whole Hessians cost less than the many
+small products of conjugate gradients."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,9 @@ class LogisticSolver:
         Columns that conjugate gradients do not settle in time are solved exactly.
         """
         xp = self.xp
+        samples, columns = curvature.shape
+        if columns <= FEW_COLUMNS and samples * len(gradient) ** 2 <= SMALL_HESSIAN:
+            return self._exact_newton_steps(gradient, curvature)
         step = xp.zeros_like(gradient)
         todo = xp.arange(gradient.shape[1], device=gradient.device)
         target = precision * xp.linalg.norm(gradient, axis=0)
@@ -126,13 +132,14 @@ class LogisticSolver:
             scaled = rest / diagonal
             previous, slope = slope, (rest * scaled).sum(axis=0)
             direction = scaled + (slope / previous) * direction
-        for column, weight in zip(todo, curvature.T, strict=True):
-            step[:, column] = self._exact_newton_step(gradient[:, column], weight)
+        for place, column in enumerate(todo):  # one after another: all Hessians may be more than the memory holds
+            one = slice(place, place + 1)
+            step[:, column] = self._exact_newton_steps(gradient[:, column, None], curvature[:, one])[:, 0]
         return step
 
-    def _exact_newton_step(self, gradient: Array, curvature: Array) -> Array:
-        hessian = self.samples.moments(curvature) + self.xp.diag(self.penalty[:, 0])
-        return self.xp.linalg.solve(hessian, -gradient)
+    def _exact_newton_steps(self, gradient: Array, curvature: Array) -> Array:
+        hessians = self.samples.moments(curvature) + self.xp.diag(self.penalty[:, 0])
+        return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
     def _moved(self, todo: _Problems, strength: float, gradient: Array, step: Array) -> _Problems:
         """`todo` moved along `step`, which is halved per column until the objective falls enough."""

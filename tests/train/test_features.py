@@ -38,7 +38,7 @@ def test_axes_are_orthonormal_and_lose_nothing_of_the_training_samples(shape: tu
 
 
 def test_coordinates_of_training_samples_are_uncorrelated() -> None:
-    moments = Coordinates.fit(noise(30, 80)).train.moments(np.ones(30))
+    (moments,) = Coordinates.fit(noise(30, 80)).train.moments(np.ones((30, 1)))
     np.testing.assert_allclose(moments, np.diag(np.diag(moments)), atol=1e-10)
 
 

@@ -19,6 +19,12 @@ LABELS = GENERATOR.random(90) < 0.5
 SIGNS = np.where(LABELS, 1.0, -1.0)[:, None]
 
 
+@pytest.fixture(params=["whole Hessians", "conjugate gradients"], autouse=True)
+def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small problems are solved in one way, large ones in the other; every test holds for both."""
+    monkeypatch.setattr(solver, "FEW_COLUMNS", 32 if request.param == "whole Hessians" else 0)
+
+
 def near_duplicates() -> np.ndarray:
     return np.repeat(NOISE[:45], 2, axis=0) + 1e-7 * NOISE
 
