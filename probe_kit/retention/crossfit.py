@@ -1,6 +1,7 @@
 """Scores of the best site, without the luck of having been chosen."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,15 +99,13 @@ def crossfit(
 
     peak_share: weight of the best site on all groups, scored on them too; it has no part in the covariance.
     """
-    generator = np.random.default_rng(seed)
     sizes = backbone.sizes
-    everyone = np.arange(sizes.size)
-    splits = random_halves(generator, everyone, sizes.size, REPEATS)
+    splits, splits_of_halves = _splits(sizes.size, seed)
     chosen = np.array([held_out_scores(stream, splits).mean(axis=0) for stream in (expert, backbone)])
     peaks = np.array([stream.sums[stream.sums.sum(axis=1).argmax()] for stream in (expert, backbone)])
     held_out = (1 - peak_share) * chosen + peak_share * peaks
     above = held_out.sum(axis=1) / sizes.sum() - chance
-    covariance = _covariance_by_halving((expert, backbone), generator)
+    covariance = _covariance_by_halving((expert, backbone), splits_of_halves)
     covariance = with_unseen(covariance, above + chance, sizes.size, seed)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
@@ -130,16 +129,23 @@ def held_out_scores(scores: GroupScores, sides: Sides) -> Matrix:
     return held_out
 
 
-def _covariance_by_halving(streams: tuple[GroupScores, GroupScores], generator: np.random.Generator) -> Matrix:
+@lru_cache(maxsize=4)  # the same for all numbers of a table that are made of the same groups
+def _splits(n_groups: int, seed: int) -> tuple[Sides, Sides]:
+    """Splits of all groups, (REPEATS, n_groups), and of both halves of each halving, one after another."""
+    generator = np.random.default_rng(seed)
+    everyone = np.arange(n_groups)
+    whole = random_halves(generator, everyone, n_groups, REPEATS)
+    halves = random_halves(generator, everyone, n_groups, HALVINGS)
+    of_halves = [
+        random_halves(generator, np.flatnonzero(halving == side), n_groups, REPEATS_OF_HALF)
+        for halving in halves
+        for side in (1, -1)
+    ]
+    return whole, np.concatenate(of_halves)
+
+
+def _covariance_by_halving(streams: tuple[GroupScores, GroupScores], sides: Sides) -> Matrix:
     sizes = streams[0].sizes
-    halves = random_halves(generator, np.arange(sizes.size), sizes.size, HALVINGS)
-    sides = np.concatenate(
-        [
-            random_halves(generator, np.flatnonzero(halving == side), sizes.size, REPEATS_OF_HALF)
-            for halving in halves
-            for side in (1, -1)
-        ]
-    )
     shares = np.array([held_out_scores(stream, sides).sum(axis=1) for stream in streams]) / ((sides != 0) @ sizes)
     first, second = np.moveaxis(shares.reshape(2, HALVINGS, 2, REPEATS_OF_HALF).mean(axis=3), 2, 0)
     differences = first - second

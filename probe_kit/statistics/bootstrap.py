@@ -1,5 +1,7 @@
 """Intervals by resampling whole groups, also where every group agrees."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -108,6 +110,9 @@ def units_seed(names: ArrayLike, suite: str) -> int:
     return derive_seed("units", 0, suite, *np.unique(np.asarray(names)).tolist())
 
 
+@lru_cache(maxsize=4)  # of one table: its groups and items, drawn for every number alike
 def draw_groups(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
-    """How often each of `count` groups is drawn, (draws, count)."""
-    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
+    """How often each of `count` groups is drawn, (draws, count), read-only."""
+    times = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
+    times.setflags(write=False)
+    return times
