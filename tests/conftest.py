@@ -1,5 +1,6 @@
 """What several test folders share: golden references where present, the embedded policy, one recorded run."""
 
+import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -58,6 +59,11 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What tests the tool as a whole comes first: it is long, and no core shall end up alone with it."""
     items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
+def pytest_collection_finish() -> None:
+    """What the imported libraries hold stays: looking through it for garbage again and again takes a minute."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
