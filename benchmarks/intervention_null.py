@@ -1,27 +1,39 @@
 """False alarms: how often is something found in policies that know nothing, or with shuffled labels?
 
-    python benchmarks/intervention_null.py FOLDER [--twins 5] [--items 12] [--categories …] [--shuffles 100]
+    python benchmarks/intervention_null.py FOLDER [--twins 50] [--inside 10] [--items 12] [--categories …]
+                                           [--shuffles 100] [--model pi0-tiny]
 
-Random twins of the embedded policy, each with weights of its own, act for a few steps on a drawn suite; `follow`
-and an interchange at every backbone layer and role are stored with each run. A *cell* is one test: a category for
-`follow`, a category, place and role for the interchange (family-wise, so that a category counts once for its
-smallest). Labels are shuffled by item on what is stored. Prints found / cells and the one-sided binomial p of more
-than 5 %.
+Random twins of a policy, each with weights of its own, infer on the first frames of a drawn suite, drawn once:
+`follow` for all of them, an interchange at every backbone layer and role for the first `--inside`. Labels are
+shuffled by item on what the trained policy itself does, once per shuffle. A *cell* is one test: a category for
+`follow`; a category, place and role for the interchange. Cells of one interchange share its episodes, so that the
+family-wise count, one cell a category and policy, is the independent one. Every policy's answers are kept in
+FOLDER: the same command continues. Prints found / cells and the one-sided binomial p of more than 5 %.
 """
 
 import argparse
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.intervene import Answers, Follow, Interchange, Source, intervene_on
+from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.hooks import Policy, load_policy
+from probe_kit.intervene import Answers, Bench, Follow, Interchange, Source
+from probe_kit.intervene.bench import Question, open_bench
+from probe_kit.intervene.conditions import Replayed, replay
 from probe_kit.intervene.following import following
+from probe_kit.intervene.intervening import answers_of
 from probe_kit.intervene.passing import passing
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.suite import build_suite
+from probe_kit.suite import Suite, build_suite
+
+NAMES = (
+    "follow: p < 0.05", "follow: called following", "interchange: single p < 0.05", "interchange: located",
+    "interchange: any p_fwe < 0.05 in a category",
+)  # fmt: skip
 
 
 @dataclass
@@ -70,38 +82,85 @@ def count_inside(answers: Answers, suite: str, counts: dict[str, Count]) -> None
         counts["interchange: any p_fwe < 0.05 in a category"].note(smallest < SIGNIFICANCE)
 
 
-def main() -> None:
+@dataclass
+class Frames:
+    """First frames of a suite, drawn once, and what a policy does on them. run: whose episodes they are."""
+
+    run: Run
+    bench: Bench
+    questions: Sequence[Question]
+
+    def answers(self, policy: Policy, asked: Follow | Interchange, file: Path) -> Answers:
+        """Of one policy; read back from `file` where that is there."""
+        if not file.is_file():
+            self.bench.policy = policy
+            conditions = asked.conditions(self.bench)
+            parts = [replay(self.bench, [question], conditions) for question in self.questions]
+            found = answers_of(self.run, [one.name for one in conditions], Replayed.joined(parts))
+            partial = file.with_suffix(".partial")
+            partial.write_bytes(found.to_bytes())
+            partial.replace(file)
+        return Answers.from_bytes(file.read_bytes())
+
+
+def run_of(folder: Path, suite: Suite, model: str) -> Run:
+    """Episodes of one step, whose places and seeds every policy is asked on."""
+    settings = ExtractSettings(
+        model, random_weights=True, suite=suite.folder, scene=SceneSpec(max_steps=1), frames="none", env_workers=0
+    )
+    return extract_run(settings, folder / "run")
+
+
+def report(title: str, counts: dict[str, Count]) -> None:
+    """Print one table."""
+    print(title)
+    for name, found in counts.items():
+        if found.cells:
+            print(f"  {name:45} {found}")
+
+
+def measure(frames: Frames, model: str, folder: Path, twins: Iterable[int], inside: int, shuffles: int) -> None:
     """Make what is missing, and count."""
+    of_twins, of_shuffles = ({name: Count() for name in NAMES} for _ in range(2))
+    suite = frames.run.suite
+    for seed in twins:
+        policy = load_policy(model, random_weights=True, weights_seed=seed)
+        count_outside(frames.answers(policy, Follow(), folder / f"follow-{seed}.npz"), suite, of_twins)
+        if seed < inside:
+            found = frames.answers(policy, Interchange(), folder / f"interchange-{seed}.npz")
+            count_inside(found, suite, of_twins)
+        print(f"twin {seed}: {of_twins[NAMES[0]]}; {of_twins[NAMES[2]]}", flush=True)
+    trained = load_policy(model)
+    outside = frames.answers(trained, Follow(), folder / "follow-trained.npz")
+    within = frames.answers(trained, Interchange(), folder / "interchange-trained.npz")
+    for number in range(shuffles):
+        draw = np.random.default_rng(number)
+        count_outside(shuffled(outside, draw), suite, of_shuffles)
+        count_inside(shuffled(within, draw), suite, of_shuffles)
+    report("random twins", of_twins)
+    report("the trained policy, labels shuffled by item", of_shuffles)
+
+
+def main() -> None:
+    """Draw the frames and measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--twins", type=int, default=5)
+    parser.add_argument("--twins", type=int, default=50)
+    parser.add_argument("--inside", type=int, default=10)
     parser.add_argument("--items", type=int, default=12)
-    parser.add_argument("--categories", default="color,shape")
+    parser.add_argument("--categories", default="color,shape,state,counting")
     parser.add_argument("--shuffles", type=int, default=100)
+    parser.add_argument("--model", default="pi0-tiny")
     arguments = parser.parse_args()
     suite = build_suite(arguments.folder / "suite", arguments.categories.split(","), arguments.items)
-    names = (
-        "follow: p < 0.05", "follow: called following", "interchange: single p < 0.05", "interchange: located",
-        "interchange: any p_fwe < 0.05 in a category",
-    )  # fmt: skip
-    of_twins, of_shuffles = ({name: Count() for name in names} for _ in range(2))
-    for seed in range(arguments.twins):
-        settings = ExtractSettings(
-            "pi0-tiny", random_weights=True, weights_seed=seed, suite=suite.folder, scene=SceneSpec(max_steps=1),
-            frames="none", env_workers=0,
-        )  # fmt: skip
-        run = extract_run(settings, arguments.folder / f"twin-{seed}")
-        source = Source(suite.folder, weights_seed=seed)
-        for asked in (Follow(), Interchange()):
-            answers = intervene_on(run, asked, source).answers
-            count = count_inside if asked.kind == "interchange" else count_outside
-            count(answers, run.suite, of_twins)
-            for number in range(arguments.shuffles):
-                count(shuffled(answers, np.random.default_rng([seed, number])), run.suite, of_shuffles)
-    for title, counts in (("random twins", of_twins), ("shuffled labels", of_shuffles)):
-        print(title)
-        for name, found in counts.items():
-            print(f"  {name:45} {found}")
+    run = run_of(arguments.folder, suite, arguments.model)
+    with open_bench(run, Source(suite.folder)) as bench, bench.ready():
+        items = dict.fromkeys(run.episodes["item_id"].astype(str))
+        questions = [replace(one, stored=None) for item in items for one in bench.questions(item)]
+        frames = Frames(run, bench, questions)
+        measure(
+            frames, arguments.model, arguments.folder, range(arguments.twins), arguments.inside, arguments.shuffles
+        )
 
 
 if __name__ == "__main__":

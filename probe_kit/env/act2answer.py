@@ -16,7 +16,7 @@ from probe_kit.env.scene import Scene
 from probe_kit.env.spec import SceneSpec
 from probe_kit.env.trial import Trial
 from probe_kit.errors import EpisodeOverError, SceneError
-from probe_kit.suite.items import Item, other_side
+from probe_kit.suite.items import Item, Side, other_side
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
@@ -136,6 +136,14 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     def scene(self) -> Scene:
         """The simulated scene. Raises EpisodeOverError before the first `reset`."""
         return self.trial.scene
+
+    def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
+        """(H, W) where in `observe`'s picture each tile's own is seen; where it was shrunk, where any of it is."""
+        masks, size = self.scene.tile_masks(self._current_frame()), self.scene_spec.picture_size
+        if size is None:
+            return masks
+        shrunk = {side: Image.fromarray(mask.astype(np.float32)) for side, mask in masks.items()}
+        return {side: np.asarray(mask.resize(size, Image.Resampling.BOX)) > 0 for side, mask in shrunk.items()}
 
     @property
     def trial(self) -> Trial:

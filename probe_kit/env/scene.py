@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit.env.arm import Arm
@@ -168,6 +169,10 @@ class Scene:
     def tile_visibility(self, frame: Frame) -> dict[Side, float]:
         """Share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
         return {side: float((frame.bodies == self.quads[side]).sum() / self._tile_pixels[side]) for side in SIDES}
+
+    def tile_masks(self, frame: Frame) -> dict[Side, NDArray[np.bool_]]:
+        """(H, W) where in the picture each tile's own picture is seen."""
+        return {side: np.asarray(frame.bodies == self.quads[side]) for side in SIDES}
 
     def _build(self) -> None:
         """Load the table, whose picture is kept; the tiles, whose pixels are counted; the cube and the arm."""

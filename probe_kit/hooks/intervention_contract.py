@@ -5,7 +5,7 @@ Properties that hold by construction, whatever the weights are. Needs pytest.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from probe_kit.hooks.attention import attention
 from probe_kit.hooks.capture_context import capture, edit
 from probe_kit.hooks.editing import applied
 from probe_kit.hooks.edits import Edit, Vectors, vector_hash
+from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.hooks.model import Policy
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.registry import find_family
@@ -81,7 +82,7 @@ class InterventionContract:
                     np.testing.assert_array_equal(plain, policy.act(seen, [0]), err_msg=str(site))
 
     def test_what_is_not_supported_is_refused_by_name(self, policy: Policy) -> None:
-        for kind in ("follow", "edit", "memory", "attention"):
+        for kind in get_args(InterventionKind):
             if policy.interventions.supports(kind):
                 policy.interventions.check(kind, policy.card.family)
                 continue
@@ -143,6 +144,36 @@ class InterventionContract:
         image = torch.from_numpy(policy.token_roles([one])[memory.name][0].mask("image"))
         torch.testing.assert_close(edited, torch.where(image[:, None], donor, plain), rtol=0, atol=0)
         assert [entry.tokens for entry in ledger.entries] == [int(image.sum())]
+
+    # -- tiles ---------------------------------------------------------------------------------------------
+
+    def test_every_token_of_the_picture_comes_of_the_patches_that_are_named(
+        self, policy: Policy, observations: list[Observation]
+    ) -> None:
+        """What leaves the vision tower at the patches of one token reaches that token's embedding and no other."""
+        if not policy.interventions.tiles:
+            with pytest.raises(UnknownSiteError, match=policy.card.family):
+                policy.patch_order()
+            return
+        seen, order = observations[:1], policy.patch_order()
+        stream = policy.every_stream()["vision"]
+        last = next(site for site in stream.sites() if site.layer == stream.layers - 1)
+        embedded = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
+        picture = np.flatnonzero(policy.roles(seen)["backbone"][0].mask(f"image.{policy.card.cameras[0]}"))
+        assert set(order) - {-1} == set(range(picture.size))
+        plain = _heard(policy, seen, [last, embedded])
+        assert plain[last].shape[-2] == order.size
+        for token in (0, 1, picture.size // 2, picture.size - 1):
+            own = torch.from_numpy(np.flatnonzero(order == token))
+
+            def turned(passing: torch.Tensor, own: torch.Tensor = own) -> torch.Tensor:
+                passing[:, own] = -passing[:, own]
+                return passing
+
+            with edit(policy, {last: turned}):
+                changed = _heard(policy, seen, [embedded])
+            moved = (changed[embedded] != plain[embedded])[0].any(dim=-1).cpu().numpy()
+            assert np.flatnonzero(moved).tolist() == [picture[token]]
 
     # -- attention -----------------------------------------------------------------------------------------
 

@@ -7,12 +7,14 @@ from typing import Any, Literal, get_args
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 
-InterventionKind = Literal["follow", "edit", "memory", "attention"]
+InterventionKind = Literal["follow", "edit", "memory", "attention", "tiles"]
 Readout = Literal["chunk", "shadow"]
 _UNDECLARED = {
     "memory": "its adapter declares no memory. Interchange residual sites instead, or declare `Model.memory`",
     "attention": "its adapter gives no attention. Exchange the memory or single roles instead: what an exchange "
     "moves is read, whatever attention weighs",
+    "tiles": "its adapter does not say which picture token comes of which patch. Exchange all of `image`, or "
+    "declare `Model.patch_order`",
 }
 
 
@@ -30,6 +32,7 @@ class Interventions:
     heard_from: the first output that an edit of backbone or memory reaches through the memory: 0, or 1 where the
     prompt's own pass already chooses the first token.
     attention: whether it tells how much attention what acts pays to every token of the prompt.
+    tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
     readout: `chunk` where the first chunk says where the hand will go; `shadow` where an inference gives one
     action in greedy bins, so that conditions are evaluated at every call of an unedited episode, never executed.
     instead: for what is not supported, why and what to do.
@@ -41,6 +44,7 @@ class Interventions:
     memory: bool = False
     heard_from: int = 0
     attention: bool = False
+    tiles: bool = False
     readout: Readout = "chunk"
     instead: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -50,7 +54,8 @@ class Interventions:
 
     def supports(self, kind: InterventionKind) -> bool:
         """Whether `kind` can be asked for."""
-        return {"memory": self.memory, "attention": self.attention}.get(kind, True)
+        own = {"memory": self.memory, "attention": self.attention, "tiles": self.tiles}
+        return own.get(kind, True)
 
     def check(self, kind: InterventionKind, family: str) -> None:
         """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""

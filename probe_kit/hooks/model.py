@@ -152,6 +152,16 @@ class Model(ABC):
             roles[self.memory.name] = roles[self.tokens_of(self.memory.name)]
         return roles
 
+    def patch_order(self) -> NDArray[np.int64]:
+        """(V,) which of the picture's tokens, counted from 0, every token of the `vision` stream ends in.
+
+        −1 for those that end in none, such as class tokens. Of the first camera's picture. Raises
+        UnknownSiteError for a model that does not say.
+        """
+        raise UnknownSiteError(
+            f"{self.card.family} does not say which picture token comes of which patch; ask for all of `image`"
+        )
+
     def tokens_of(self, stream: str) -> str:
         """The stored stream whose tokens a stream has: the backbone for the memory, else itself."""
         if self.memory is None or stream != self.memory.name:

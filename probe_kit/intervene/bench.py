@@ -58,8 +58,8 @@ class Source:
 class Question:
     """The first inference of one episode, and what is seen when the two pictures are exchanged.
 
-    row: in the run's episodes. seed: of the inference. stored: (n, 7) actions that the run carried out of it, None
-    where it does not say.
+    row: in the run's episodes. seed: of the inference. tiles: (H, W) where in its picture each tile's own is seen.
+    stored: (n, 7) actions that the run carried out of it, None where it does not say.
     """
 
     row: int
@@ -72,6 +72,7 @@ class Question:
     seen: Observation
     exchanged: Observation
     seed: int
+    tiles: Mapping[Side, NDArray[np.bool_]] = field(repr=False)
     stored: Chunk | None = None
 
 
@@ -111,6 +112,7 @@ class Bench:
         episodes = self.run.episodes
         rows = np.flatnonzero((episodes["item_id"] == item_id).to_numpy())
         frames: dict[Layout, Seen] = {}
+        tiles: dict[Layout, dict[Side, NDArray[np.bool_]]] = {}
         found = []
         for row in rows:
             record = episodes.iloc[int(row)]
@@ -118,6 +120,7 @@ class Bench:
             for layout in LAYOUTS:
                 if layout not in frames:
                     frames[layout] = self._look(item, layout, int(record["scene_seed"]))
+                    tiles[layout] = self._stage.tile_masks()
             own: Layout = "original" if record["layout"] == "original" else "swapped"
             other: Layout = "swapped" if own == "original" else "original"
             self._check_frame(record, frames[own])
@@ -133,6 +136,7 @@ class Bench:
                     seen=frames[own].observation,
                     exchanged=frames[other].observation,
                     seed=derive_seed(int(record["policy_seed"]), "inference", 0),
+                    tiles=tiles[own],
                     stored=self._stored(int(row)),
                 )
             )

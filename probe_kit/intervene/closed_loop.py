@@ -13,11 +13,11 @@ from probe_kit.env.rules import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.interventions import InterventionKind
-from probe_kit.hooks.sites import MEMORY_STREAM, Site
+from probe_kit.hooks.sites import Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
 from probe_kit.intervene.directions import MEAN_DIFFERENCE, axes_of
-from probe_kit.intervene.interchange import NONE, TakenOver
+from probe_kit.intervene.interchange import NONE, TakenOver, needed
 from probe_kit.intervene.passing import Passing, stored_passing
 from probe_kit.intervene.patching import Kept, Ledger, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
@@ -57,8 +57,8 @@ class ClosedLoop(Intervention):
     @property
     def needs(self) -> tuple[InterventionKind, ...]:
         """Edits; and a memory, where one of its places is."""
-        memory = any(cell.partition(".")[0] == MEMORY_STREAM for cell in self.cells)
-        return ("edit", "memory") if memory else ("edit",)
+        sites, roles = zip(*map(self._split, self.cells), strict=True)
+        return needed(sites, roles)
 
     def own_settings(self) -> dict[str, Any]:
         """Where and along what; it is read where the cube ends."""

@@ -43,7 +43,8 @@ def intervene(
     roles: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated: all, image, language, state, action; default all,image,language. Steer: the "
+            help="Comma-separated: all, image, image.left, image.right, language, state, action; default "
+            "all,image,language. Steer: the "
             "one whose tokens are moved. Closed loop: with --sites, default all. Erase: default image.",
             rich_help_panel=INSIDE,
         ),

@@ -24,6 +24,7 @@ from probe_kit.intervene.patching import Kept, patched
 from probe_kit.intervene.places import Place, places, roles_of, token_mask
 from probe_kit.intervene.settings import items_of
 from probe_kit.intervene.stored import ERASE, READABLE
+from probe_kit.intervene.tiles import TILES
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
 
@@ -52,6 +53,11 @@ class Erase(Intervention):
         super().__post_init__()
         if not self.sites or not self.roles:
             raise UsageError("erasing needs at least one site and one role")
+        if tiles := set(self.roles) & set(TILES):
+            raise UsageError(
+                f"{', '.join(sorted(tiles))} is of other patches in every episode, and an eraser is of positions; "
+                "erase `image`, or exchange the tile (--kind interchange)"
+            )
         object.__setattr__(self, "method", str(Method.of(self.method)))
 
     @property

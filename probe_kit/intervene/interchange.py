@@ -15,7 +15,8 @@ from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
 from probe_kit.intervene.directions import Axes, axes_of
 from probe_kit.intervene.patching import Change, Replaced, ReplacedAlong, patched
-from probe_kit.intervene.places import ALL, Place, places, roles_of, token_mask
+from probe_kit.intervene.places import ALL, Place, places, roles_of
+from probe_kit.intervene.tiles import TILES, role_mask
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Tape
@@ -23,6 +24,13 @@ if TYPE_CHECKING:
 SITES = ("backbone.*",)
 ROLES = (ALL, "image", "language")
 NONE = "none"
+
+
+def needed(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
+    """What a family must support for changes at such places and roles."""
+    memory = any(pattern.partition(".")[0] == MEMORY_STREAM for pattern in sites)
+    further: dict[InterventionKind, bool] = {"memory": memory, "tiles": bool(set(roles) & set(TILES))}
+    return ("edit", *(kind for kind, is_needed in further.items() if is_needed))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +64,7 @@ class Interchange(Intervention):
     @property
     def needs(self) -> tuple[InterventionKind, ...]:
         """Edits; and a memory, where one of its places is."""
-        memory = any(pattern.partition(".")[0] == MEMORY_STREAM for pattern in self.sites)
-        return ("edit", "memory") if memory else ("edit",)
+        return needed(self.sites, self.roles)
 
     def own_settings(self) -> dict[str, Any]:
         """Where, which tokens and along what."""
@@ -105,7 +112,7 @@ class TakenOver:
     def play(self, turn: Turn) -> Played:
         """The plain inference with these tokens in it."""
         question, bench = turn.question, turn.bench
-        mask = token_mask(bench.policy, question.seen, self.place.stream, self.role)
+        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
         with patched(bench.policy, self.place.sites, mask, self._change(turn, mask.size)) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)

@@ -85,7 +85,7 @@ def _carry_out(
             "edits": _ledgers(conditions, parts),
             **asked.told(conditions),
         }
-    answers = _answers(run, [condition.name for condition in conditions], parts)
+    answers = answers_of(run, [condition.name for condition in conditions], parts)
     effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)), asked.kind)
     save(run.location, settings, key, answers, effects, certificate)
     pieces.discard()
@@ -122,7 +122,8 @@ def _replayed(
     return Replayed.joined(parts)
 
 
-def _answers(run: Run, conditions: Sequence[str], found: Replayed) -> Answers:
+def answers_of(run: Run, conditions: Sequence[str], found: Replayed) -> Answers:
+    """What K conditions gave, and for which episodes. conditions: names of the K, the plain one first."""
     rows = run.episodes.iloc[found.rows]
     columns = {
         own: rows[name].to_numpy(dtype=str)

@@ -16,6 +16,8 @@ from probe_kit.hooks.views import plays
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy, Stream
 
+TILE_ROLES = ("image.left", "image.right")
+"""Roles of the patches that see one of the two pictures; see `tiles`."""
 ALL = "all"
 """The role of every token but padding."""
 _PATTERN = re.compile(r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(@(?P<first>\d+)(-(?P<last>\d+))?)?")
@@ -97,6 +99,7 @@ def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> N
 
 
 def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
-    """Those of the wanted roles that tokens of a stream play, `all` included."""
+    """Those of the wanted roles that tokens of a stream play, `all` included, tiles where it has a picture."""
     named = policy.role_names.get(policy.tokens_of(stream), ())
-    return [role for role in wanted if role == ALL or any(plays(name, role) for name in named)]
+    tiles = TILE_ROLES if any(plays(name, "image") for name in named) else ()
+    return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]

@@ -74,7 +74,8 @@ def carry_out(bench: Bench, question: Question, condition: Condition, exchanging
         assert isinstance(seen, Observation)
         assert isinstance(other, Observation)
         seed = derive_seed(planned.policy_seed, "inference", call)
-        played = condition.play(Turn(bench, replace(question, seen=seen, exchanged=other, seed=seed)))
+        here = replace(question, seen=seen, exchanged=other, seed=seed, tiles=own.tile_masks())
+        played = condition.play(Turn(bench, here))
         ledgers += [] if played.ledger is None else [played.ledger]
         past.append(played.chunk)
         actions = _executed(bench, past)

@@ -25,6 +25,7 @@ from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.store.layout import LISTENED
 from probe_kit.extract.store.thumbnails import Ends, shrink
 from probe_kit.hooks.observation import Observation
+from probe_kit.suite.items import Side
 
 # What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
 EPISODE_ERRORS = (
@@ -117,6 +118,10 @@ class Stage:
         """End the episode as it began: its model listened and does not act. There is no outcome."""
         ends = None if self._first is None else (self._first,)
         return Ending({"outcome": LISTENED, **self._facts}, self._frames, ends)
+
+    def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
+        """(H, W) where in the last picture each tile's own picture is seen."""
+        return self._env.tile_masks()
 
     def close(self) -> None:
         """Free the simulator."""

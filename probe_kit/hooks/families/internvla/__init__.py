@@ -1,5 +1,6 @@
 """InternVLA-M1, native."""
 
+from probe_kit.hooks.families.supported import MERGED
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.interventions import Interventions
 from probe_kit.hooks.options import Option
@@ -15,6 +16,7 @@ INTERVENTIONS = Interventions(
         "backbone sites for what passes through the language model",
         "attention": "its expert attends to the queries' findings only, not to the backbone. Exchange backbone "
         "sites of one role instead",
+        "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
 """DINOv2's features reach the bridge past the backbone: an exchange of backbone sites is not the whole picture."""

@@ -1,6 +1,6 @@
 """Magma, native."""
 
-from probe_kit.hooks.families.supported import TOKENS
+from probe_kit.hooks.families.supported import MAPS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
@@ -51,6 +51,6 @@ FAMILIES = (
             "vision_tower.clip_vision_model.head.",
             "vision_tower.clip_vision_model.trunk.head.",
         ),
-        interventions=TOKENS,
+        interventions=MAPS,
     ),
 )

@@ -25,7 +25,7 @@ from probe_kit.hooks.families.magma.text import ChatText, Prompt
 from probe_kit.hooks.families.memory import ALL_BUT_LAST, kept_prompt, memory_tap
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.sampling import chooser
-from probe_kit.hooks.families.supported import TOKENS
+from probe_kit.hooks.families.supported import MAPS
 from probe_kit.hooks.families.weighing import Note, of_decoder
 from probe_kit.hooks.model import Policy, Question, Reader, Reading, Tap
 from probe_kit.hooks.observation import Observation, checked_picture
@@ -59,7 +59,7 @@ _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 class Magma(Policy, Reader):
     """A loaded Magma: acts, and answers questions in text."""
 
-    interventions = TOKENS
+    interventions = MAPS
 
     def __init__(
         self,

@@ -11,6 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from transformers import AutoTokenizer
 
@@ -131,6 +133,10 @@ class Pi0(EvaluatedPi0):
             note(block, iteration, weights[:, :, acting, : weights.shape[-1] - len(acting)])
 
         return weighed([layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned)
+
+    def patch_order(self) -> NDArray[np.int64]:
+        """A token per patch, row by row."""
+        return np.arange(self.tokens_per_camera)
 
     @property
     def tokens_per_camera(self) -> int:

@@ -161,6 +161,11 @@ class PrismaticModel(Model):
         """The ids of each whole prompt."""
         return [tuple(self.prompt(instruction)) for instruction in instructions]
 
+    def patch_order(self) -> NDArray[np.int64]:
+        """A token per patch, row by row, behind the tower's class and register tokens."""
+        prefix = int(self._towers["vision"].num_prefix_tokens)
+        return np.concatenate([np.full(prefix, -1), np.arange(self.network.patches)])
+
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output.
 

@@ -12,6 +12,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
@@ -123,6 +125,13 @@ class SmolVLA(LerobotFlow):
             yield
         finally:
             del joint.eager_attention_forward
+
+    def patch_order(self) -> NDArray[np.int64]:
+        """The connector's pixel shuffle makes one token of a square of patches."""
+        vlm = self.network.model.vlm_with_expert.vlm.config
+        side = vlm.vision_config.image_size // vlm.vision_config.patch_size
+        rows, columns = np.divmod(np.arange(side**2), side)
+        return np.asarray(rows // vlm.scale_factor * (side // vlm.scale_factor) + columns // vlm.scale_factor)
 
     @property
     def tokens_per_camera(self) -> int:

@@ -258,6 +258,10 @@ class SpatialVLA(Policy):
         picture = [f"image.{CAMERA}"] * self.config.patches
         return picture + ["special" if number in special else "language" for number in row[len(picture) :]]
 
+    def patch_order(self) -> NDArray[np.int64]:
+        """A token per patch, row by row; where a token lies in space is added to it behind the tower."""
+        return np.arange(self.config.patches)
+
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or what a block adds.
 

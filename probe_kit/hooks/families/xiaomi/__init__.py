@@ -1,5 +1,6 @@
 """Xiaomi-Robotics-R0, native."""
 
+from probe_kit.hooks.families.supported import MERGED
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.interventions import Interventions
 from probe_kit.hooks.options import Option
@@ -12,6 +13,7 @@ INTERVENTIONS = Interventions(
     unread=("backbone",),
     memory=True,
     attention=True,
+    instead={"tiles": f"{MERGED}Exchange all of `image`"},
 )
 """The expert reads keys and values of the backbone's last blocks; those of the blocks before are unread."""
 
