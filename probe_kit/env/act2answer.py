@@ -63,6 +63,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._scene: Scene | None = None
         self._trial: Trial | None = None
         self._frame: Frame | None = None
+        self._picture: Picture | None = None
         self._closed = False
 
     # -- gymnasium ---------------------------------------------------------------------------------------
@@ -90,7 +91,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     def render(self) -> Picture:
         """The picture (H, W, 3) uint8 of the scene now, as rendered."""
-        return self.scene.picture(self._current_frame())
+        if self._frame is None or self._picture is None:
+            self._picture = self.scene.picture(self._current_frame())
+        # What a caller paints into it must not be what the next one sees.
+        return self._picture.copy()
 
     def close(self) -> None:
         """Free the simulator; a second call does nothing."""
@@ -190,7 +194,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     def _current_frame(self) -> Frame:
         if self._frame is None:
-            self._frame = self.scene.frame()
+            self._frame, self._picture = self.scene.frame(), None
         return self._frame
 
     def _info(self) -> Info:

@@ -22,6 +22,7 @@ from probe_kit.intervene.passing import Passing, stored_passing
 from probe_kit.intervene.patching import Kept, Ledger, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
 from probe_kit.intervene.stored import PLAIN
+from probe_kit.intervene.tiles import TILES
 from probe_kit.train.reader import RunReader
 
 CELL = "|"
@@ -33,8 +34,8 @@ class ClosedLoop(Intervention):
     """Interchange at a few cells, carried out: dose zero, exchanged pictures, every cell, and its controls.
 
     cells: `PLACE|ROLE`, such as `backbone.02|image`; see `best_cells`. direction: along which a cell is taken over
-    as well, beside `controls` random ones of the data's own covariance, where a place is one site; `none` for
-    neither. The tokens of every cell are also taken over whole.
+    as well, beside `controls` random ones of the data's own covariance, where a place is one site and the role no
+    tile; `none` for neither. The tokens of every cell are also taken over whole.
     """
 
     cells: tuple[str, ...]
@@ -94,7 +95,7 @@ class ClosedLoop(Intervention):
         return play(bench, bench.questions(item), conditions)
 
     def _along(self, bench: Bench, place: Place, role: str, donors: tuple[Site, ...]) -> list[Condition]:
-        if self.direction == NONE or len(place.sites) != 1:
+        if self.direction == NONE or len(place.sites) != 1 or role in TILES:
             return []
         axes = axes_of(bench.run, place.only_site, role, self.direction, self.controls, self.seed)
         return [TakenOver(place, role, donors, name, axes) for name in (self.direction, *axes.control_names)]

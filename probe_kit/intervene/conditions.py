@@ -19,12 +19,12 @@ from probe_kit.intervene.stored import EXCHANGED, PLAIN
 class Turn:
     """One question on the bench, with what its conditions share.
 
-    memo: what one condition computed and another needs as well, by name.
+    memo: what one condition computed and another needs as well, by its name.
     """
 
     bench: Bench
     question: Question
-    memo: dict[str, Any] = field(default_factory=dict)
+    memo: dict[Any, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

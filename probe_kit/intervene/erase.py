@@ -20,11 +20,11 @@ from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Turn
 from probe_kit.intervene.directions import FOLDS
 from probe_kit.intervene.gathered import Gathered, gather
-from probe_kit.intervene.patching import Kept, patched
-from probe_kit.intervene.places import Place, places, roles_of, token_mask
+from probe_kit.intervene.patching import Kept, Where, patched
+from probe_kit.intervene.places import Place, places, roles_of
 from probe_kit.intervene.settings import items_of
 from probe_kit.intervene.stored import ERASE, READABLE
-from probe_kit.intervene.tiles import TILES
+from probe_kit.intervene.tiles import TILES, role_mask
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
 
@@ -137,7 +137,7 @@ class Erased:
     def play(self, turn: Turn) -> Played:
         """The plain inference without it."""
         question, bench = turn.question, turn.bench
-        mask = token_mask(bench.policy, question.seen, self.place.stream, self.role)
+        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
         change = Without(self.erasers[question.episode_id]) if self.erasers else Kept()
         with patched(bench.policy, self.place.sites, mask, change) as ledger:
             chunk = bench.act(question.seen, question.seed)
@@ -150,7 +150,7 @@ class Without:
 
     eraser: Eraser
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """Computed in float64, as it was fitted."""
         import torch
 

@@ -53,6 +53,11 @@ class Interchange(Intervention):
         super().__post_init__()
         if not self.sites or not self.roles:
             raise UsageError("an interchange needs at least one site and one role")
+        if set(self.roles) & set(TILES) and self.direction != NONE:
+            raise UsageError(
+                "tiles have no mean in the run from which a direction could be found; exchange them whole: leave "
+                "--direction out"
+            )
         if self.controls and self.direction == NONE:
             raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
 

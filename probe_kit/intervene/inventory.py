@@ -93,8 +93,8 @@ def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredInterven
         created=created,
         kind=str(settings["kind"]),
         categories=tuple(map(str, settings["categories"])),
-        items=settings["items"],
-        wording=str(settings["wording"] or ""),
+        items=settings.get("items"),
+        wording=str(settings.get("wording") or ""),
         asked={name: value for name, value in settings.items() if name not in COMMON},
     )
 

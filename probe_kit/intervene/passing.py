@@ -217,6 +217,15 @@ def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
     return found
 
 
+def stored_steering(run: RunReader) -> dict[str, list[Passing]]:
+    """By category, what the newest steering of it did, controls included; empty if there is none."""
+    found: dict[str, list[Passing]] = {}
+    for one in stored_interventions(run, "steer"):
+        rows = passing(one.answers(), run.suite, str(one.settings["toward"]), one.key)
+        found |= {str(name): [row for row in rows if row.category == name] for name in one.settings["categories"]}
+    return found
+
+
 def located_in(rows: Sequence[Passing]) -> tuple[str, ...]:
     """The places, each once, that carry half of the effect or more when their tokens are taken over whole."""
     return tuple(dict.fromkeys(row.place for row in rows if row.is_located and not row.direction))

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +52,15 @@ LEDGER = ("fires", "still", "norm", "moved", "largest")
 """What the columns of a stored ledger are."""
 
 
+Where = Union["Tensor", slice]
+"""Positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
+
+
 class Change(Protocol):
     """What becomes of the tokens of a site."""
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
-        """(T', D) float32 tokens in, as many out. where: (T',) their positions."""
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+        """(T', D) float32 tokens in, as many out, and `own` left as it is. where: their positions."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Replaced:
     donor: "Tape"
     tokens: int
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """The donor's."""
         del own
         other = self.donor[site][0]
@@ -85,7 +89,7 @@ class ReplacedAlong:
     tokens: int
     basis: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """own + (donor − own) P."""
         import torch
 
@@ -101,7 +105,7 @@ class Moved:
 
     vector: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """own + vector."""
         import torch
 
@@ -114,7 +118,7 @@ class Moved:
 class Kept:
     """As they are: a dose of zero, which is written back like any other."""
 
-    def __call__(self, site: Site, own: "Tensor", where: "Tensor") -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """own."""
         del site, where
         return own
@@ -124,29 +128,57 @@ class Kept:
 def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], change: Change) -> Iterator[Ledger]:
     """Change the tokens `mask` (T,) of some sites while the policy infers once, for one observation.
 
-    Raises CaptureError for another number of tokens, and what `hooks.edit` raises, such as for a site that fires
-    another number of times than its tap promises.
+    The ledger is complete when the context is left. Raises CaptureError for another number of tokens, and what
+    `hooks.edit` raises, such as for a site that fires another number of times than its tap promises.
     """
-    import torch
-
     from probe_kit.hooks import edit
 
-    ledger, where = Ledger(), torch.from_numpy(np.flatnonzero(mask)).to(policy.card.device)
-
-    def changer(site: Site) -> "_Changer":
-        return _Changer(site, mask.size, where, change, ledger)
-
-    with edit(policy, {site: changer(site) for site in sites}):
+    ledger, norms = Ledger(), _Norms()
+    where = _positions(mask, policy.card.device)
+    with edit(policy, {site: _Changer(site, mask.size, where, change, norms) for site in sites}):
         yield ledger
+    norms.into(ledger)
+
+
+def _positions(mask: NDArray[np.bool_], device: str) -> Where:
+    import torch
+
+    found = np.flatnonzero(mask)
+    if found.size and found.size == found[-1] + 1 - found[0]:
+        return slice(int(found[0]), int(found[-1]) + 1)
+    return torch.from_numpy(found).to(device)
+
+
+@dataclass
+class _Norms:
+    """Per fire the norms of tokens (T',) before, and of how far they moved; summed up after the inference."""
+
+    before: "list[Tensor]" = field(default_factory=list)
+    moved: "list[Tensor]" = field(default_factory=list)
+
+    def into(self, ledger: Ledger) -> None:
+        """Add them up. One transfer for all fires: a GPU waits at each."""
+        import torch
+
+        if not self.before:
+            return
+        before, moved = torch.stack(self.before), torch.stack(self.moved)
+        rows = torch.stack([before.mean(dim=1), moved.mean(dim=1), moved.amax(dim=1)]).tolist()
+        for norm, mean, largest in zip(*rows, strict=True):
+            ledger.fires += 1
+            ledger.still += int(largest == 0)
+            ledger.norm += norm
+            ledger.moved += mean
+            ledger.largest = max(ledger.largest, largest)
 
 
 @dataclass(frozen=True)
 class _Changer:
     site: Site
     tokens: int
-    where: "Tensor"
+    where: Where
     change: Change
-    ledger: Ledger
+    norms: _Norms
 
     def __call__(self, activation: "Tensor") -> "Tensor":
         import torch
@@ -155,15 +187,11 @@ class _Changer:
             raise CaptureError(
                 f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.tokens} tokens"
             )
-        before = activation[0][self.where].float()
+        passing = activation[0]
+        before = passing[self.where].float()
         after = self.change(self.site, before, self.where).to(activation.dtype)
-        activation[0, self.where] = after
-        moved = (after.float() - before).norm(dim=-1)
-        # One transfer per fire: a GPU waits at each.
-        norm, mean, largest = torch.stack([before.norm(dim=-1).mean(), moved.mean(), moved.max()]).tolist()
-        self.ledger.fires += 1
-        self.ledger.still += int(largest == 0)
-        self.ledger.norm += norm
-        self.ledger.moved += mean
-        self.ledger.largest = max(self.ledger.largest, largest)
+        # Before anything is written: neighbours are seen through a view.
+        self.norms.before.append(torch.linalg.vector_norm(before, dim=-1))
+        self.norms.moved.append(torch.linalg.vector_norm(after.float() - before, dim=-1))
+        passing[self.where] = after
         return activation

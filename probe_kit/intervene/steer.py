@@ -17,7 +17,8 @@ from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Turn
 from probe_kit.intervene.directions import MEAN_DIFFERENCE, Axes, axes_of
 from probe_kit.intervene.patching import Moved, patched
-from probe_kit.intervene.places import Place, places, token_mask
+from probe_kit.intervene.places import Place, places
+from probe_kit.intervene.tiles import TILES, role_mask
 
 Toward = Literal["wrong", "correct", "left", "right"]
 DOSES = (1.0, 2.0, 4.0)
@@ -42,6 +43,11 @@ class Steer(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.role in TILES:
+            raise UsageError(
+                f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
+                "exchange the tile (--kind interchange)"
+            )
         if self.toward not in get_args(Toward):
             raise UsageError(f"toward is {self.toward!r}; expected one of {', '.join(get_args(Toward))}")
         if not self.doses or not all(0 < dose <= 1000 for dose in self.doses):
@@ -99,7 +105,7 @@ class Pushed:
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
         length = self.dose * self.axes.half_gap(question.episode_id, question.category) * side[self.toward]
         unit = self.axes.of(self.direction, question.episode_id, question.category)
-        mask = token_mask(bench.policy, question.seen, self.place.stream, self.role)
+        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
         with patched(bench.policy, self.place.sites, mask, Moved(np.float32(length) * unit)) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)

@@ -29,7 +29,7 @@ ENOUGH = 0.1
 
 
 def role_mask(
-    policy: "Policy", question: "Question", stream: str, role: str, memo: MutableMapping[str, Any]
+    policy: "Policy", question: "Question", stream: str, role: str, memo: MutableMapping[Any, Any]
 ) -> NDArray[np.bool_]:
     """(T,) the tokens of a stream that play `role`, tiles among the roles. memo: of one question.
 
@@ -38,7 +38,9 @@ def role_mask(
     """
     declared = policy.role_names.get(policy.tokens_of(stream), ())
     if role not in TILES or role in declared:
-        return token_mask(policy, question.seen, stream, role)
+        if (stream, role) not in memo:
+            memo[stream, role] = token_mask(policy, question.seen, stream, role)
+        return np.asarray(memo[stream, role])
     policy.interventions.check("tiles", policy.card.family)
     images = token_mask(policy, question.seen, stream, f"{IMAGE}.{policy.card.cameras[0]}")
     if role not in memo:

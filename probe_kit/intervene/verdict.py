@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
+from probe_kit.hooks.sites import MEMORY_STREAM
 from probe_kit.intervene.following import WORTH, Following
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def judge(
         if encoded and located is not None:
             if not located:
                 return Judgement("inconclusive", "it follows, and no place that was tried carries half of that")
-            return Judgement("used", f"passes at {', '.join(located)}")
+            return Judgement("used", where(located))
         return Judgement(_by(encoded, "used", "acted on, not found", "follows"))
     if found.is_against:
         return Judgement(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
@@ -59,6 +60,18 @@ def judge(
         return Judgement("inconclusive", "no other category of the run follows, so following is not known to show")
     reason = f"positive control: {control}" if encoded and control else ""
     return Judgement(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
+
+
+def where(located: Sequence[str]) -> str:
+    """Where the answer passes, and, of keys and values that what acts reads, where it is read.
+
+    An exchange in the backbone says that something behind it depends on that place; one in the memory, which only
+    what acts looks at, that it is read there.
+    """
+    read = [place for place in located if place.partition(".")[0] == MEMORY_STREAM]
+    passes = [place for place in located if place not in read]
+    parts = [f"passes at {', '.join(passes)}"] * bool(passes) + [f"read at {', '.join(read)}"] * bool(read)
+    return "; ".join(parts)
 
 
 def _by(encoded: bool | None, yes: Verdict, no: Verdict, unknown: Verdict) -> Verdict:

@@ -90,5 +90,8 @@ def test_names_are_taken_apart() -> None:
 def test_nothing_is_called_used_where_nothing_was_found_inside() -> None:
     (found,) = following(answers_of({"color": follower(48)}), SUITE)
     assert judge(True, found, None, ("backbone.02",)) == Judgement("used", "passes at backbone.02")
+    both = ("backbone.00", "memory.02", "backbone.02")
+    assert judge(True, found, None, both).reason == "passes at backbone.00, backbone.02; read at memory.02"
+    assert judge(True, found, None, ("memory.02",)).reason == "read at memory.02"
     assert judge(True, found, None, ()).verdict == "inconclusive"
     assert judge(True, found, None).verdict == "used"

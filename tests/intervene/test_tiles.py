@@ -11,7 +11,7 @@ import pytest
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.hooks.registry import find_family
-from probe_kit.intervene import ClosedLoop, Erase, Interchange, Source, intervene_on
+from probe_kit.intervene import ClosedLoop, Erase, Interchange, Source, Steer, intervene_on
 from probe_kit.intervene.bench import Bench, Question, open_bench
 from probe_kit.intervene.tiles import TILES, role_mask, tokens_seeing
 from probe_kit.suite import Suite
@@ -91,11 +91,8 @@ def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy"
     )  # fmt: skip
     effects = intervene_on(copy, asked, Source(small_suite.folder), load=lambda *_: twin)
     said = effects.certificate["edits"]
-    assert set(said) == {
-        f"{place}|{role}"
-        for place in ("backbone.00", "memory.01")
-        for role in ("image", "image.left", "image.right")
-    }
+    roles = ("image", *TILES)
+    assert set(said) == {f"{place}|{role}" for place in ("backbone.00", "memory.01") for role in roles}
     for place, fires in (("backbone.00", 2), ("memory.01", 4)):
         assert all(said[f"{place}|{role}"]["fires"] == fires for role in roles)
         assert said[f"{place}|image.left"]["largest_change"] > 0
@@ -111,6 +108,10 @@ def test_families_that_cannot_say_are_refused_by_name(family: str) -> None:
             list(map(find_family(family).check_intervention, asked.needs))
 
 
-def test_an_eraser_is_of_positions_and_not_of_tiles() -> None:
+def test_what_needs_positions_or_means_is_not_asked_of_tiles() -> None:
     with pytest.raises(UsageError, match=r"image\.left is of other patches"):
         Erase(sites=("backbone.02",), roles=("image.left",))
+    with pytest.raises(UsageError, match=r"image\.left has no mean"):
+        Steer(sites=("backbone.02",), role="image.left")
+    with pytest.raises(UsageError, match="exchange them whole"):
+        Interchange(roles=("image.right",), direction="mean-difference")

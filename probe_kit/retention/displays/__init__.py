@@ -7,6 +7,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.displays.causal_curve import CausalCurveDisplay, causal_curve
 from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.dose_response import DoseResponseDisplay, dose_response
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
 from probe_kit.retention.displays.gallery import Exhibit, gallery, save_figures
 from probe_kit.retention.displays.heat_table import (
@@ -29,6 +30,7 @@ __all__ = [
     "CallCurveDisplay",
     "CausalCurveDisplay",
     "Certificate",
+    "DoseResponseDisplay",
     "Exhibit",
     "FinalPositionsDisplay",
     "HeatTableDisplay",
@@ -47,6 +49,7 @@ __all__ = [
     "call_curves",
     "causal_curve",
     "curves_side_by_side",
+    "dose_response",
     "final_positions",
     "gallery",
     "iteration_maps",

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
-from probe_kit.intervene.passing import stored_passing
+from probe_kit.intervene.passing import stored_passing, stored_steering
 from probe_kit.retention.call_curves import CallCurves, event_calls
 from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
 from probe_kit.retention.displays.causal_curve import causal_curve
+from probe_kit.retention.displays.dose_response import dose_response
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
     HeatTableDisplay,
@@ -97,6 +98,7 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
             exhibits += _of_probes(name, position, probed, table.iterations)
             exhibits += _of_calls(name, position, run, probed)
             exhibits += _of_causes(name, position, run, probed)
+        exhibits += _of_steering(name, position, run)
     return exhibits
 
 
@@ -314,6 +316,21 @@ def _of_causes(name: str, position: int, run: RunReader, results: ProbeResults) 
             "layer are taken from the same inference before exchanged pictures. A layer that is readable and "
             "turns nothing is read by nothing behind it.",
             position, partial(causal_curve, run, results, view),
+        )
+    ]  # fmt: skip
+
+
+def _of_steering(name: str, position: int, run: RunReader) -> list[Exhibit]:
+    """Only where a steering is stored with the run."""
+    if not stored_steering(run):
+        return []
+    return [
+        Exhibit(
+            f"{name}-doses", "How much of a direction turns the action", "interventions",
+            "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of the "
+            "direction is added; filled: beyond random directions of the same norm (the band). One side may be "
+            "saturated, and beyond about two norms of the tokens any direction breaks the hand.",
+            position, partial(dose_response, run),
         )
     ]  # fmt: skip
 

@@ -1,0 +1,152 @@
+"""Dose and response: how many episodes turn as more of a direction is added, by side, beside controls."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene.passing import Passing, stored_steering
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.style import (
+    GREY,
+    axes_for,
+    caption,
+    legend_above,
+    panels,
+    plain,
+    series,
+    spell,
+)
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Percent = NDArray[np.float64]
+
+
+@dataclass
+class DoseResponseDisplay(Shown):
+    """By dose, the share of episodes that turn to the side they are pushed to, minus those that turn from it.
+
+    doses: (K,) in half gaps between the class means, ascending, 0 among them. net, left, right: (K,) percent, of
+    all episodes and of those that are pushed to either side, one of which may be saturated. controls: (C, K)
+    percent of random directions of the same norm, NaN at a dose at which none was played. norm_ratio: (K,) how far
+    tokens were moved, in their own norms; what a dose of more than about two norms does is little evidence.
+    significant: (K,) beyond the controls, family-wise.
+    """
+
+    category: str
+    place: str
+    doses: NDArray[np.float64]
+    net: Percent
+    left: Percent
+    right: Percent
+    controls: Percent
+    norm_ratio: NDArray[np.float64]
+    significant: NDArray[np.bool_]
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_run(cls, run: RunReader, category: str, place: str | None = None) -> Self:
+        """From the newest steering that is stored of a category. place: one of several, as `backbone.02 image`.
+
+        Raises NoInterventionsError if there is none.
+        """
+        found = _by_place(stored_steering(run).get(category, []))
+        if not found or (place is not None and place not in found):
+            there = f"; it has it at {', '.join(found)}" if found else ""
+            raise NoInterventionsError(
+                f"{run.location} has no stored steering of {category!r}{f' at {place}' if place else ''}{there}. "
+                f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
+            )
+        chosen = place or next(iter(found))
+        return cls._of(found[chosen], category, chosen, Certificate.of_run(run))
+
+    @classmethod
+    def _of(cls, rows: Sequence[Passing], category: str, place: str, certificate: Certificate) -> Self:
+        own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.dose))
+        doses = np.array([float(row.dose) for row in own])
+        names = dict.fromkeys(row.direction for row in rows if row.is_control)
+        nets = {(row.direction, float(row.dose)): 100 * row.net for row in rows}
+        return cls(
+            category=category,
+            place=place,
+            doses=doses,
+            net=np.array([100 * row.net for row in own]),
+            left=np.array([100 * row.net_left for row in own]),
+            right=np.array([100 * row.net_right for row in own]),
+            controls=np.array([[nets.get((name, dose), np.nan) for dose in doses] for name in names]).reshape(
+                len(names), len(doses)
+            ),
+            norm_ratio=np.array([row.norm_ratio for row in own]),
+            significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in own]),
+            certificate=certificate,
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 6.2, 3.9)
+        axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
+        if self.controls.size:
+            # Nothing was added at dose 0, by a control either.
+            played = np.where(self.doses == 0, 0.0, self.controls)
+            axes.fill_between(
+                self.doses, played.min(axis=0), played.max(axis=0), color=GREY, alpha=0.35, lw=0,
+                label="random directions of the same norm",
+            )  # fmt: skip
+        lines = {"all episodes": self.net, "pushed to the left": self.left, "pushed to the right": self.right}
+        for position, (label, percent) in enumerate(lines.items()):
+            line = series(position)
+            axes.plot(self.doses, percent, color=line.colour, ls=line.dash, lw=1.6, label=label)
+            filled = self.significant if position == 0 else np.zeros(self.doses.size, bool)
+            for is_filled in (True, False):
+                axes.plot(
+                    self.doses[filled == is_filled], percent[filled == is_filled], ls="none", marker=line.marker,
+                    ms=5, mec=line.colour, mfc=line.colour if is_filled else "white",
+                )  # fmt: skip
+        plain(axes)
+        axes.set_xticks(self.doses, [f"{dose:g}\n{ratio:.1f}×" for dose, ratio in zip(
+            self.doses, self.norm_ratio, strict=True)])  # fmt: skip
+        axes.set_ylim(-108, 108)
+        axes.set_xlabel("half gaps between the class means; below: in norms of the tokens", fontsize=7.5)
+        axes.set_title(f"{spell(self.category)}, {self.place}", fontsize=9, loc="left")
+        if figure is not None:
+            axes.set_ylabel("% of episodes that turn", fontsize=9)
+            legend_above(figure, axes.get_legend_handles_labels()[0])
+        caption(figure, self.certificate)
+        self.ax_ = axes
+        return self
+
+
+def dose_response(run: RunReader) -> "Figure":
+    """A panel per category and place of the newest steering. Raises NoInterventionsError if none is stored."""
+    displays = [
+        DoseResponseDisplay._of(rows, category, place, Certificate.of_run(run))
+        for category, every in stored_steering(run).items()
+        for place, rows in _by_place(every).items()
+    ]
+    if not displays:
+        DoseResponseDisplay.from_run(run, "any")
+    figure, grid = panels(len(displays), height=2.7, share=False)
+    for display, axes in zip(displays, grid, strict=True):
+        display.plot(axes)
+    figure.supylabel("% of episodes that turn", fontsize=9)
+    caption(figure, displays[0].certificate)
+    legend_above(figure, grid[0].get_legend_handles_labels()[0])
+    return figure
+
+
+def _by_place(rows: Sequence[Passing]) -> dict[str, list[Passing]]:
+    """Rows by place and role, in words."""
+    found: dict[str, list[Passing]] = {}
+    for row in rows:
+        found.setdefault(f"{row.place} {row.role}", []).append(row)
+    return found

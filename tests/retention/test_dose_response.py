@@ -1,0 +1,80 @@
+"""Dose and response: what the figure shows is what is stored."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene.effects import effects_csv
+from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.intervene.stored import save
+from probe_kit.retention import retention
+from probe_kit.retention.displays import DoseResponseDisplay, dose_response, gallery
+from probe_kit.train import ArrayRun
+from tests.intervene.answers import answers_of, follower
+
+mpl.use("agg")
+SIGNAL = ([0.5, 0.9], [[0.7]])
+EPISODES = 48
+
+
+@pytest.fixture
+def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
+    return probed_run({"color": SIGNAL})
+
+
+def steered(run: ArrayRun) -> None:
+    """Toward the wrong side: half of the pushed turn at dose 2, all at dose 4; the control turns one in eight."""
+    answers = answers_of({"color": follower(EPISODES)})
+    plain, item = answers.of("plain"), np.arange(EPISODES)
+    turned = {
+        "mean-difference|0": item < 0, "mean-difference|2": item < EPISODES / 2, "mean-difference|4": item >= 0,
+        "control-1|2": item < 0, "control-1|4": item % 8 == 0,
+    }  # fmt: skip
+    lateral = np.vstack([plain, *(np.where(which, -plain, plain) for which in turned.values())])
+    answers = replace(
+        answers,
+        conditions=("plain", *(f"backbone.01|image|{name}" for name in turned)),
+        lateral=lateral,
+        changed=np.abs(lateral - lateral[0]),
+        ledger=np.ones((*lateral.shape, 5)),
+    )
+    settings = {
+        "format": FORMAT, "kind": "steer", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": ["color"], "toward": "wrong",
+    }  # fmt: skip
+    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
+    written = effects_csv(answers, run.suite, "wrong")
+    save(run.location, settings, key_of(settings), answers, written, {"replay": check})
+
+
+def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: ArrayRun) -> None:
+    steered(run)
+    display = DoseResponseDisplay.from_run(run, "color").plot()
+    assert display.place == "backbone.01 image"
+    np.testing.assert_allclose(display.doses, [0, 2, 4])
+    np.testing.assert_allclose(display.net, [0, 50, 100])
+    np.testing.assert_allclose((display.left + display.right) / 2, display.net)
+    np.testing.assert_allclose(display.controls, [[np.nan, 0, 12.5]])
+    np.testing.assert_allclose(display.norm_ratio, 1)
+    assert display.significant.tolist() == [False, True, True]
+    assert display.ax_ is not None
+    labels = [line.get_label() for line in display.ax_.get_lines()]
+    assert {"all episodes", "pushed to the left", "pushed to the right"} <= set(labels)
+    assert len(display.ax_.collections) == 1
+    names = [exhibit.name for exhibit in gallery([run], retention([run]))]
+    assert any(name.endswith("doses") for name in names)
+    assert len(dose_response(run).axes) == 1
+
+
+def test_without_a_steering_there_is_no_such_figure(run: ArrayRun) -> None:
+    for draw in (lambda: dose_response(run), lambda: DoseResponseDisplay.from_run(run, "color")):
+        with pytest.raises(NoInterventionsError, match="--kind steer"):
+            draw()
+    assert not any(exhibit.name.endswith("doses") for exhibit in gallery([run], retention([run])))
+    steered(run)
+    with pytest.raises(NoInterventionsError, match=r"it has it at backbone\.01 image"):
+        DoseResponseDisplay.from_run(run, "color", "backbone.02 image")
