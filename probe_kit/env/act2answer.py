@@ -91,8 +91,9 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     def render(self) -> Picture:
         """The picture (H, W, 3) uint8 of the scene now, as rendered."""
-        if self._frame is None or self._picture is None:
-            self._picture = self.scene.picture(self._current_frame())
+        scene, frame = self.scene, self._current_frame()
+        if self._picture is None:
+            self._picture = scene.picture(frame)
         # What a caller paints into it must not be what the next one sees.
         return self._picture.copy()
 
