@@ -1,6 +1,7 @@
 """What was once done to a run unseen: each is an error that names the object, on reading and to `run verify`."""
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import pytest
 from probe_kit.errors import RunDamagedError, RunIncompleteError
 from probe_kit.extract import open_run, verify_run
 from probe_kit.extract.store.commits import write_failure
-from probe_kit.extract.store.hashes import as_record
+from probe_kit.extract.store.hashes import Sum, as_record
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.strays import known_keys
@@ -26,6 +27,7 @@ from probe_kit.train.unfinished import Unfinished
 from tests.faults import Stored
 from tests.little_run import write_little_run
 from tests.reading import readings
+from tests.rehashing import rehash, write_record
 
 Edit = Callable[[dict[str, Any]], object]
 
@@ -346,8 +348,6 @@ def test_a_picture_that_no_commit_names_is_not_shown(run: Path) -> None:
 
 
 def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run: Path) -> None:
-    from tests.rehashing import rehash, write_record
-
     for path in (run / "commits").iterdir():
         commit = json.loads(path.read_text())
         del commit["pictures"]
@@ -435,8 +435,6 @@ def test_probes_of_another_run_are_found(run: Path, other: Path) -> None:
 
 def test_probes_of_activations_that_are_no_more_are_found(run: Path) -> None:
     """The same episodes with other numbers, as another machine would give with `--batch 8`."""
-    from tests.rehashing import rehash, write_record
-
     swap(run / "data.zarr/backbone/pooled/c/2/0/0/0/0", run / "data.zarr/backbone/pooled/c/9/0/0/0/0")
     rehash(run)
     identity = open_run(run).root.identity
@@ -515,6 +513,46 @@ def test_interventions_of_another_run_are_found(run: Path, other: Path) -> None:
     shutil.rmtree(run / "interventions")
     shutil.copytree(other / "interventions", run / "interventions")
     assert_found(run, "interventions/")
+
+
+# -- records that lead elsewhere ---------------------------------------------------------------------------
+
+
+def test_no_record_of_results_makes_a_training_remove_a_file_elsewhere(run: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "thesis.txt"
+    victim.write_text("do not touch")
+    for folder in stored_probes(run):
+        head = json.loads((folder / "settings.json").read_text())
+        head["files"]["scores.csv"] = ["../../../thesis.txt", *head["files"]["scores.csv"][1:]]
+        write_record(folder / "settings.json", head)
+    with pytest.raises(RunDamagedError, match=r"thesis\.txt.*no file beside it"):
+        train_probes(open_run(run), permutations=1, controls=("position",))
+    assert victim.read_text() == "do not touch"
+    assert any("thesis.txt" in problem for problem in verify_run(run).problems)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path: Path, absolute: bool) -> None:
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"of somebody else")
+    key = str(outside) if absolute else "../../outside"
+    path = run / "commits" / "00000003.json"
+    commit = json.loads(path.read_text())
+    commit["objects"][key] = Sum.of(outside.read_bytes()).to_json()
+    write_record(path, commit)
+    found = verify_run(run, deep=True)
+    assert any("outside" in problem and "missing" in problem for problem in found.problems)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")
+@pytest.mark.parametrize("key", ["plan.json", "commits/00000002.json", "data.zarr/zarr.json", "certificate.json"])
+def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, key: str) -> None:
+    (run / key).unlink()
+    os.mkfifo(run / key)
+    found = verify_run(run, deep=True)
+    assert not found.ok or found.committed < found.planned
+    with pytest.raises((RunDamagedError, RunIncompleteError)):
+        readings(run)
 
 
 # -- nothing -----------------------------------------------------------------------------------------------

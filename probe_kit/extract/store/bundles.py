@@ -181,6 +181,8 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
     if (head["key"], head["run"]) != (key, run):
         raise RunDamagedError(f"{name} is {head['key']} of run {head['run']}; this is run {run}. {advice}")
     files = {one: (actual, Sum(*known)) for one, (actual, *known) in head["files"].items()}
+    if strange := sorted(actual for actual, _ in files.values() if "/" in actual or actual in ("", ".", "..")):
+        raise RunDamagedError(f"{name} names {strange[0]!r}, which is no file beside it. {advice}")
     rest = {part: value for part, value in head.items() if part not in (HASH, "key", "run", "files")}
     return Bundle(location, home, key, rest, files)
 

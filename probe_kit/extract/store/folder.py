@@ -13,7 +13,7 @@ from typing import IO, BinaryIO
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
-from probe_kit.errors import DiskSpaceError, SettingsMismatchError
+from probe_kit.errors import DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.extract.store.layout import (
     CERTIFICATES,
     COLUMNS,
@@ -83,26 +83,27 @@ class Folder(Location):
 
     def exists(self, key: str) -> bool:
         """Whether the file is there."""
-        return (self._path / key).is_file()
+        return _inside(key) and (self._path / key).is_file()
 
     def read(self, key: str) -> bytes:
         """The file."""
-        return (self._path / key).read_bytes()
+        return self._object(key).read_bytes()
 
     def pieces(self, key: str) -> Iterator[memoryview]:
         """Into the same memory again and again, which stays in the processor's cache."""
         buffer = memoryview(bytearray(_PIECE))
-        with (self._path / key).open("rb", buffering=0) as file:
+        with self._object(key).open("rb", buffering=0) as file:
             while length := file.readinto(buffer):
                 yield buffer[:length]
 
     def open(self, key: str) -> BinaryIO:
         """The file."""
-        return (self._path / key).open("rb")
+        return self._object(key).open("rb")
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """One file after another."""
-        return {path.name: path.read_bytes() for path in sorted((self._path / folder).glob(f"*{suffix}"))}
+        found = sorted((self._path / folder).glob(f"*{suffix}"))
+        return {path.name: path.read_bytes() for path in found if path.is_file()}
 
     def keys(self, folder: str) -> list[str]:
         """Every file."""
@@ -111,7 +112,7 @@ class Folder(Location):
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
         """From the directory entries."""
-        paths = {key: self._path / folder / key for key in keys}
+        paths = {key: self._path / folder / key for key in keys if _inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
     def confirm(self, lengths: Mapping[str, int]) -> None:
@@ -119,7 +120,7 @@ class Folder(Location):
 
     def create(self, key: str, content: bytes) -> bool:
         """Written aside, flushed to the disk, then linked to its name."""
-        path = self._path / key
+        path = self._place(key)
         path.parent.mkdir(exist_ok=True)
         with _written_aside(path, content, flush=True) as aside:
             try:
@@ -130,14 +131,14 @@ class Folder(Location):
 
     def write(self, key: str, content: bytes) -> None:
         """Written aside, then renamed."""
-        path = self._path / key
+        path = self._place(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         with _written_aside(path, content, flush=False) as aside:
             aside.replace(path)
 
     def delete(self, key: str) -> None:
         """The file."""
-        (self._path / key).unlink(missing_ok=True)
+        self._place(key).unlink(missing_ok=True)
 
     def remove(self, folder: str) -> None:
         """The folder and all in it."""
@@ -181,6 +182,25 @@ class Folder(Location):
             yield
             if _alone(file):
                 self._clear_orphans()
+
+    def _object(self, key: str) -> Path:
+        """Where an object lies. Raises FileNotFoundError for what is no plain file, or not in the folder.
+
+        Records of others may name a device or a pipe, which never ends, and anybody's files.
+        """
+        path = self._path / key
+        if not (_inside(key) and path.is_file()):
+            raise FileNotFoundError(errno.ENOENT, "no file of the run", str(path))
+        return path
+
+    def _place(self, key: str) -> Path:
+        """Where an object is written or removed. Raises RunDamagedError for a key that leads out of the folder."""
+        if not _inside(key):
+            raise RunDamagedError(
+                f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
+                "such name. Take the run from where it was made"
+            )
+        return self._path / key
 
     def _clear_orphans(self) -> None:
         for pattern in _ORPHANS:
@@ -229,6 +249,11 @@ class Folder(Location):
             aside.rename(self._path / self.derived(folder, stamp))
         finally:
             shutil.rmtree(aside, ignore_errors=True)
+
+
+def _inside(key: str) -> bool:
+    """Whether a key stays below the folder it is read in."""
+    return not key.startswith("/") and ".." not in key.split("/")
 
 
 def _alone(file: IO[str]) -> bool:
