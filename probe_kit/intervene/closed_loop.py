@@ -21,6 +21,7 @@ from probe_kit.intervene.interchange import NONE, TakenOver, needed
 from probe_kit.intervene.passing import Passing, stored_passing
 from probe_kit.intervene.patching import Kept, Ledger, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
+from probe_kit.intervene.settings import CHUNK
 from probe_kit.intervene.stored import PLAIN
 from probe_kit.intervene.tiles import TILES
 from probe_kit.train.reader import RunReader
@@ -45,6 +46,8 @@ class ClosedLoop(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.readout != CHUNK:
+            raise UsageError("a closed loop is read where the cube ends; leave --readout out")
         if not self.cells or any(cell.count(CELL) != 1 for cell in self.cells):
             raise UsageError(f"cells are {self.cells}; expected PLACE|ROLE, such as backbone.02|image")
         if self.controls and self.direction == NONE:

@@ -74,6 +74,13 @@ def intervene(
     toward: Annotated[
         str | None, typer.Option(help="Steer: wrong (default), correct, left or right.", rich_help_panel=INSIDE)
     ] = None,
+    readout: Annotated[
+        str,
+        typer.Option(
+            help="chunk: what the first inference would do. shadow: what every inference of the unedited episode "
+            "would, for policies whose inference is one action (OpenVLA, SpatialVLA, Magma).",
+        ),
+    ] = "chunk",
     seed: Annotated[int, typer.Option(help="Of controls and folds of directions.", rich_help_panel=INSIDE)] = 0,
     suite: Annotated[
         Path | None, typer.Option(help="Folder of the run's suite; default the embedded one.")
@@ -106,7 +113,7 @@ def intervene(
     from probe_kit.hooks.options import read_pairs
     from probe_kit.intervene import Source, intervene_on
     from probe_kit.intervene.intervening import refuse_unsupported
-    from probe_kit.intervene.settings import refuse_unfit
+    from probe_kit.intervene.settings import readout_of, refuse_unfit
 
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
@@ -116,7 +123,7 @@ def intervene(
     asked = _asked(
         opened,
         kind,
-        {"categories": split(categories), "items": items},
+        {"categories": split(categories), "items": items, "readout": readout_of(readout)},
         {"sites": split(sites), "roles": split(roles), "direction": direction, "controls": controls,
          "doses": None if doses is None else tuple(map(_dose, split(doses) or ())), "toward": toward,
          "seed": seed or None},

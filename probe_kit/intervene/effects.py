@@ -12,6 +12,7 @@ from probe_kit.intervene.following import Following, following, stored_following
 from probe_kit.intervene.frames import frame_of
 from probe_kit.intervene.passing import Passing, passing, stored_places
 from probe_kit.intervene.sensitivity import sensitivity
+from probe_kit.intervene.settings import SHADOW
 from probe_kit.intervene.stored import (
     ERASE,
     EXCHANGED,
@@ -125,11 +126,16 @@ class Effects:
 
     def _one_step(self) -> list[str]:
         is_shadow = self.certificate.get("supported", {}).get("readout") == "shadow"
+        if self.settings.get("readout") == SHADOW:
+            return [
+                "Shadow: every condition was evaluated at every inference of the unedited episode, and what its "
+                "actions would add across is summed up; nothing of it was carried out."
+            ]
         if not is_shadow or self.answers.outcomes is not None:
             return []
         return [
             "This family's inference is one action in greedy bins: what the first one does says little of where "
-            "the hand will go, and small effects stay within a bin."
+            "the hand will go, and small effects stay within a bin. Ask with --readout shadow."
         ]
 
     def _large_doses(self) -> list[str]:

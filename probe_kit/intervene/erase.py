@@ -22,7 +22,7 @@ from probe_kit.intervene.directions import FOLDS
 from probe_kit.intervene.gathered import Gathered, gather
 from probe_kit.intervene.patching import Kept, Where, patched
 from probe_kit.intervene.places import Place, places, roles_of
-from probe_kit.intervene.settings import items_of
+from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import ERASE, READABLE
 from probe_kit.intervene.tiles import TILES, role_mask
 from probe_kit.statistics.folds import Fold, grouped_folds
@@ -51,6 +51,8 @@ class Erase(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.readout != CHUNK:
+            raise UsageError("what erases is fitted on the first inference; leave --readout out")
         if not self.sites or not self.roles:
             raise UsageError("erasing needs at least one site and one role")
         if tiles := set(self.roles) & set(TILES):

@@ -17,7 +17,8 @@ from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
 from probe_kit.intervene.passing import Named
 from probe_kit.intervene.patching import LEDGER
-from probe_kit.intervene.settings import items_of, key_of, refuse_unfit, settings_of
+from probe_kit.intervene.settings import SHADOW, items_of, key_of, refuse_unfit, settings_of
+from probe_kit.intervene.shadow import shadowed
 from probe_kit.intervene.stored import EXCHANGED, Answers, is_stored, save
 from probe_kit.notebook import notebook_progress
 
@@ -112,7 +113,7 @@ def _replayed(
         name = f"{number:06d}"
         stored = pieces.read(name)
         if stored is None:
-            part = asked.play(bench, item, conditions)
+            part = _played(bench, asked, item, conditions)
             pieces.keep(name, part.arrays)
         else:
             part = Replayed(**stored)
@@ -120,6 +121,12 @@ def _replayed(
         if progress is not None:
             progress(number + 1, len(items), item)
     return Replayed.joined(parts)
+
+
+def _played(bench: Bench, asked: Intervention, item: str, conditions: Sequence[Condition]) -> Replayed:
+    if asked.readout == SHADOW:
+        return shadowed(bench, bench.questions(item), conditions)
+    return asked.play(bench, item, conditions)
 
 
 def answers_of(run: Run, conditions: Sequence[str], found: Replayed) -> Answers:

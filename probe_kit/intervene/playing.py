@@ -49,7 +49,7 @@ def play(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condi
     assert found.outcomes is not None
     for column, question in enumerate(questions):
         plain = carry_out(bench, question, conditions[0], exchanging=False)
-        found.apart[column] = _apart_from_stored(bench, question, plain)
+        found.apart[column] = apart_from_stored(bench, question, plain)
         for number, condition in enumerate(conditions):
             carried = carry_out(bench, question, condition) if number else plain
             found.lateral[number, column] = bench.across(np.array(carried.cube))
@@ -65,7 +65,7 @@ def carry_out(bench: Bench, question: Question, condition: Condition, exchanging
     exchanging: whether the condition looks at exchanged pictures; then a second stage is moved alike.
     """
     own, beside = bench.stages()
-    planned, turned = _planned(bench, question)
+    planned, turned = planned_of(bench, question)
     seen: Answer = own.begin(planned, False)
     other: Answer = beside.begin(turned, False) if exchanging else seen
     past: list[Chunk] = []
@@ -78,10 +78,10 @@ def carry_out(bench: Bench, question: Question, condition: Condition, exchanging
         played = condition.play(Turn(bench, here))
         ledgers += [] if played.ledger is None else [played.ledger]
         past.append(played.chunk)
-        actions = _executed(bench, past)
+        actions = executed(bench, past)
         seen = own.advance(actions)
         other = beside.advance(actions) if exchanging else seen
-        _check_alike(question, seen, other)
+        check_alike(question, seen, other)
         if isinstance(seen, Ending):
             break
     assert isinstance(seen, Ending)
@@ -91,7 +91,7 @@ def carry_out(bench: Bench, question: Question, condition: Condition, exchanging
     return Carried(str(outcome["outcome"]), where, seen.trajectory, Ledger.sum(ledgers))
 
 
-def _planned(bench: Bench, question: Question) -> tuple[PlannedEpisode, PlannedEpisode]:
+def planned_of(bench: Bench, question: Question) -> tuple[PlannedEpisode, PlannedEpisode]:
     """The episode as the run planned it, and the one with its pictures exchanged."""
     record = bench.run.episodes.iloc[question.row]
     item = replace(bench.items[question.item_id], instruction=question.seen.instruction)
@@ -101,13 +101,13 @@ def _planned(bench: Bench, question: Question) -> tuple[PlannedEpisode, PlannedE
     return own, turned
 
 
-def _executed(bench: Bench, past: Sequence[Chunk]) -> Chunk:
+def executed(bench: Bench, past: Sequence[Chunk]) -> Chunk:
     """As in the run: the head of the newest chunk, or one action averaged over all."""
     exponent = bench.policy.card.ensemble
     return past[-1][: int(bench.run.settings["execute"])] if exponent is None else ensemble(past, exponent)[None]
 
 
-def _check_alike(question: Question, seen: Answer, other: Answer) -> None:
+def check_alike(question: Question, seen: Answer, other: Answer) -> None:
     """Pictures have no weight, so that the same actions lead both stages to the same state."""
     if isinstance(seen, Observation) and isinstance(other, Observation):
         alike = np.array_equal(seen.state, other.state, equal_nan=True)
@@ -121,7 +121,7 @@ def _check_alike(question: Question, seen: Answer, other: Answer) -> None:
         )
 
 
-def _apart_from_stored(bench: Bench, question: Question, plain: Carried) -> float:
+def apart_from_stored(bench: Bench, question: Question, plain: Carried) -> float:
     """By how much the episode differs from the stored one; NaN where the run keeps no trajectory.
 
     Raises CaptureChangedActionError for another outcome.

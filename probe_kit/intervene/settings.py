@@ -9,11 +9,13 @@ from probe_kit.extract.store.run import Run
 from probe_kit.identity import sha256_json
 
 FORMAT = 1  # raise when stored numbers would be others
-Readout = Literal["chunk"]
+Readout = Literal["chunk", "shadow"]
 READOUTS: Mapping[str, str] = {
-    "chunk": "where the first inference's actions would bring the hand, with nothing carried out"
+    "chunk": "where the first inference's actions would bring the hand, with nothing carried out",
+    "shadow": "what every inference of the unedited episode would add across, with only the plain one carried out",
 }
 CHUNK: Readout = "chunk"
+SHADOW: Readout = "shadow"
 
 
 @dataclass(frozen=True, kw_only=True)

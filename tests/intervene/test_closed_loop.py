@@ -22,7 +22,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.bench import Bench, open_bench
 from probe_kit.intervene.conditions import Plain
-from probe_kit.intervene.playing import _check_alike, carry_out
+from probe_kit.intervene.playing import carry_out, check_alike
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def test_the_other_stage_is_in_the_same_state_with_pictures_exchanged(
         np.testing.assert_array_equal(own.state, other.state)
         assert (own.image != other.image).any()
     with pytest.raises(OtherFramesError, match="led to another state"):
-        _check_alike(question, seen[0][0], replace(seen[0][1], state=seen[1][1].state))
+        check_alike(question, seen[0][0], replace(seen[0][1], state=seen[1][1].state))
 
 
 @pytest.mark.parametrize(
