@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -228,8 +228,9 @@ class Folder(Location):
         handle = os.open(path, os.O_RDONLY)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
-            for leftover in path.glob("*.tmp"):
-                leftover.unlink()
+            with suppress(PermissionError):  # whoever may only read the run finds what is stored all the same
+                for leftover in path.glob("*.tmp"):
+                    leftover.unlink()
             yield
         finally:
             os.close(handle)
