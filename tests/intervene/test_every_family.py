@@ -1,0 +1,154 @@
+"""The same analysis on a tiny checkpoint of every family that acts: every kind runs, or is refused by name."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import UnsupportedInterventionError
+from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.hooks.registry import find_family, known_families
+from probe_kit.intervene import (
+    ClosedLoop,
+    Effects,
+    Erase,
+    Follow,
+    Interchange,
+    Source,
+    Steer,
+    Words,
+    intervene_on,
+)
+from probe_kit.suite import Suite
+from tests.internvla_checkpoints import write_checkpoint as write_internvla
+from tests.magma_checkpoints import write_checkpoint as write_magma
+from tests.prismatic_checkpoints import write_checkpoint as write_openvla
+from tests.spatialvla_checkpoints import write_checkpoint as write_spatialvla
+from tests.xiaomi_checkpoints import write_checkpoint as write_xiaomi
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
+ITEMS = 6
+COMMON: dict[str, Any] = {"categories": ("color",), "items": ITEMS}
+
+
+@dataclass(frozen=True)
+class Tiny:
+    """How a family's tiny checkpoint is made: written, or one of the golden references, or the embedded one."""
+
+    write: Callable[[Path], Path] | None = None
+    golden: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+FAMILIES = {
+    "pi0-tiny": Tiny(),
+    "pi0": Tiny(golden="golden_pi0"),
+    "smolvla": Tiny(golden="golden_smolvla"),
+    "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
+    "spatialvla": Tiny(write_spatialvla),
+    "magma": Tiny(write_magma),
+    "xiaomi-r0": Tiny(write_xiaomi),
+    "internvla-m1": Tiny(write_internvla),
+}
+
+
+def test_every_family_that_acts_is_here() -> None:
+    acting = {name for name, family in known_families().items() if family.acts}
+    assert acting - {"pi0-tiny-early"} == FAMILIES.keys()
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def made(
+    request: pytest.FixtureRequest, small_suite: Suite, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Run, Source]:
+    tiny = FAMILIES[request.param]
+    checkpoint = None
+    if tiny.golden:
+        golden = tmp_path_factory.mktemp("golden") / "copy"
+        checkpoint = str(knowing(request.getfixturevalue(tiny.golden), small_suite, golden) / "checkpoint")
+    elif tiny.write is not None:
+        checkpoint = str(tiny.write(tmp_path_factory.mktemp("checkpoint")))
+    settings = ExtractSettings(
+        request.param, checkpoint, suite=small_suite.folder, items=ITEMS, categories=("color",), frames="none",
+        scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
+    )  # fmt: skip
+    run = extract_run(settings, tmp_path_factory.mktemp("families") / request.param)
+    return run, Source(small_suite.folder, checkpoint, tiny.options)
+
+
+def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
+    """A reference whose tokenizer has the suite's words in the place of others."""
+    shutil.copytree(golden, copy)
+    (file,) = copy.rglob("tokenizer.json")
+    tokenizer = json.loads(file.read_text())
+    vocabulary, special = tokenizer["model"]["vocab"], {own["content"] for own in tokenizer["added_tokens"]}
+    asked = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
+    spare = [word for word in vocabulary if word not in special | {"\n", *asked}]
+    missing = [word for word in asked if word not in vocabulary]
+    assert len(missing) <= len(spare)
+    for word, other in zip(missing, spare, strict=False):
+        vocabulary[word] = vocabulary.pop(other)
+    file.write_text(json.dumps(tokenizer))
+    return copy
+
+
+def asked_of(run: Run, kind: str) -> Follow | Words | Interchange | Steer | Erase | ClosedLoop:
+    last = f"backbone.{run.streams['backbone'].layers - 1:02d}"
+    acting = next(stream for stream in run.streams.values() if stream.part == "action")
+    late = f"{acting.name}.01@0-{(acting.iterations or 1) - 1}"
+    role = "action"
+    return {
+        "follow": lambda: Follow(**COMMON),
+        "words": lambda: Words(**COMMON),
+        "interchange": lambda: Interchange(
+            **COMMON, sites=("backbone.00", last, late), roles=("all", "image", "language", role)
+        ),
+        "direction": lambda: Interchange(
+            **COMMON, sites=("backbone.01",), roles=("image",), direction="mean-difference", controls=1
+        ),
+        "memory": lambda: Interchange(**COMMON, sites=("memory.*",), roles=("all", "image")),
+        "shadow": lambda: Interchange(**COMMON | {"items": 2}, sites=("backbone.00", last), readout="shadow"),
+        "tiles": lambda: Interchange(**COMMON, sites=("backbone.00",), roles=("image.left", "image.right")),
+        "steer": lambda: Steer(**COMMON, sites=("backbone.01",), role="image", doses=(2.0,), controls=1),
+        "erase": lambda: Erase(**COMMON, sites=("backbone.01",), controls=1),
+        "closed-loop": lambda: ClosedLoop(**COMMON | {"items": 2}, cells=("backbone.00|all", "backbone.01|image")),
+    }[kind]()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["follow", "words", "interchange", "direction", "memory", "tiles", "shadow", "steer", "erase", "closed-loop"],
+)
+def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, Source], kind: str) -> None:
+    run, source = made
+    asked, supported = asked_of(run, kind), find_family(run.model).interventions
+    if any(not supported.supports(needed) for needed in asked.needs):
+        with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
+            intervene_on(run, asked, source)
+        return
+    effects = intervene_on(run, asked, source)
+    check = effects.certificate["replay"]
+    assert check["equal"] == check["compared"] > 0
+    assert np.isfinite(effects.answers.lateral).all()
+    assert effects.to_csv().count("\n") > 1
+    assert effects.to_rich() is not None
+    _check_ledger(run, effects)
+
+
+def _check_ledger(run: Run, effects: Effects) -> None:
+    """Every change fired; what writes back what is there, or is read by nothing, changes nothing."""
+    supported = find_family(run.model).interventions
+    last = f"backbone.{run.streams['backbone'].layers - 1:02d}|"
+    for name, said in effects.certificate["edits"].items():
+        assert said["fires"] > 0, name
+        if name == "plain" or name.endswith("|0"):
+            assert said["largest_change"] == 0.0
+            assert said["still"] == said["fires"]
+        if name.startswith(last) and "backbone" in supported.unread:
+            assert said["largest_change"] == 0.0, name
