@@ -29,7 +29,7 @@ SHARES = {"color": 0.28, "shape": 0.42, LEFT_OPEN: 0.30}
 """Of each category in a batch."""
 TABLE = "table"
 PICTURE_SEED = 715_517
-COUPLES = {1: 1600, 2: 3200}
+COUPLES = {1: 1200, 2: 2400}
 """By version of the suite's pictures."""
 DEMONSTRATIONS = range(90)
 BATCH = 32

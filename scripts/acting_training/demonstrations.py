@@ -22,8 +22,6 @@ KICK, KICK_SHARE = 0.02, 0.2
 """Standard deviation, metres, of a disturbance while the cube is held, and how often there is one."""
 DETOUR, DETOUR_SHARE = (0.03, 0.06, 0.03), 0.5
 """Standard deviation, metres, of where an episode is led astray to before it begins, and how often."""
-CHANGED_MIND, CHANGED_MIND_SHARE = 8, 0.5
-"""Most actions for which an episode first goes to the other tile, and how often one does."""
 START_JITTER = 0.001
 LONGEST = 40
 LIFTED = 4
@@ -91,18 +89,16 @@ class Recorder:
         env.reset(seed=seed, options={"layout": "original" if side == 0 else "swapped"})
         ways = [Carrying.to(env, name) for name in SIDES]
         detour = rng.normal(0, DETOUR) if rng.random() < DETOUR_SHARE else np.zeros(3)
-        astray = int(rng.integers(1, CHANGED_MIND + 1)) if rng.random() < CHANGED_MIND_SHARE else 0
         kept, lifted, resting = [], 0, 0
         while lifted < LIFTED and env.trial.steps < LONGEST:
             position, opened = env.trial.controller.target.position, env.scene.arm.opening() > OPENED
-            way = ways[1 - side if env.trial.steps < astray else side]
-            action = way.action(position, opened)
+            action = ways[side].action(position, opened)
             rests = not opened and float(np.linalg.norm(action[:3])) < RESTING
             resting = resting + 1 if rests else 0
             if resting % RESTING_STRIDE == (1 if rests else 0):
                 kept.append((*self._seen(), np.stack([way.ahead(position, opened, CHUNK) for way in ways])))
             lifted += opened
-            env.advance(self._disturbed(action, way, position, opened, detour, rng))
+            env.advance(self._disturbed(action, ways[side], position, opened, detour, rng))
             detour = np.zeros(3)
         if not lifted or env.outcome().zone != "correct" or env.outcome().is_grasped:
             return None
