@@ -23,7 +23,7 @@ EPISODES = [0, 1]
 def settings(small_suite: Suite) -> ExtractSettings:
     scene = SceneSpec(max_steps=1)
     return ExtractSettings(
-        "expert", suite=small_suite.folder, categories=("color",), items=1, scene=scene, env_workers=0
+        "expert", suite=small_suite.folder, categories=("color",), items=2, scene=scene, env_workers=0
     )
 
 
