@@ -113,6 +113,18 @@ class Replayed:
     apart: NDArray[np.float64]
     outcomes: NDArray[np.str_] | None = None
 
+    @classmethod
+    def none_yet(cls, questions: Sequence["Question"], conditions: Sequence["Condition"]) -> "Replayed":
+        """Room for what is going to be played."""
+        shape = len(conditions), len(questions)
+        return cls(
+            np.array([question.row for question in questions], np.int64),
+            np.empty(shape),
+            np.zeros(shape),
+            np.zeros((*shape, len(LEDGER))),
+            np.empty(len(questions)),
+        )
+
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Those that are there, by name."""
@@ -132,14 +144,7 @@ class Replayed:
 
 def replay(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
     """Play every condition on every question; the first one is the plain one."""
-    shape = len(conditions), len(questions)
-    found = Replayed(
-        np.array([question.row for question in questions], np.int64),
-        np.empty(shape),
-        np.zeros(shape),
-        np.zeros((*shape, len(LEDGER))),
-        np.empty(len(questions)),
-    )
+    found = Replayed.none_yet(questions, conditions)
     for column, question in enumerate(questions):
         turn = Turn(bench, question)
         plain = conditions[0].play(turn).chunk

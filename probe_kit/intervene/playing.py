@@ -16,7 +16,7 @@ from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench, Chunk, Question
 from probe_kit.intervene.conditions import Condition, Replayed, Turn
-from probe_kit.intervene.patching import LEDGER, Ledger
+from probe_kit.intervene.patching import Ledger
 from probe_kit.suite.items import LAYOUTS, Episode
 
 
@@ -37,16 +37,8 @@ def play(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condi
     the first condition's from the stored one's. Raises CaptureChangedActionError if an outcome is not the stored
     one, OtherFramesError if the state beside exchanged pictures goes its own way.
     """
-    shape = len(conditions), len(questions)
-    found = Replayed(
-        np.array([question.row for question in questions], np.int64),
-        np.empty(shape),
-        np.zeros(shape),
-        np.zeros((*shape, len(LEDGER))),
-        np.empty(len(questions)),
-        np.zeros(shape, "U7"),
-    )
-    assert found.outcomes is not None
+    outcomes = np.zeros((len(conditions), len(questions)), "U7")
+    found = replace(Replayed.none_yet(questions, conditions), outcomes=outcomes)
     for column, question in enumerate(questions):
         plain = carry_out(bench, question, conditions[0], exchanging=False)
         found.apart[column] = apart_from_stored(bench, question, plain)
@@ -55,7 +47,7 @@ def play(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condi
             found.lateral[number, column] = bench.across(np.array(carried.cube))
             found.changed[number, column] = _largest(carried.frames, plain.frames)
             found.ledger[number, column] = carried.ledger.row()
-            found.outcomes[number, column] = carried.outcome
+            outcomes[number, column] = carried.outcome
     return found
 
 

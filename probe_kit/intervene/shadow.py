@@ -16,7 +16,7 @@ from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench, Chunk, Question
 from probe_kit.intervene.conditions import Condition, Replayed, Turn
-from probe_kit.intervene.patching import LEDGER, Ledger
+from probe_kit.intervene.patching import Ledger
 from probe_kit.intervene.playing import Carried, apart_from_stored, check_alike, executed, planned_of
 
 
@@ -37,14 +37,7 @@ def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[C
     left positive. Raises CaptureChangedActionError if an outcome is not the stored one, OtherFramesError if the
     state beside exchanged pictures goes its own way.
     """
-    shape = len(conditions), len(questions)
-    found = Replayed(
-        np.array([question.row for question in questions], np.int64),
-        np.empty(shape),
-        np.zeros(shape),
-        np.zeros((*shape, len(LEDGER))),
-        np.empty(len(questions)),
-    )
+    found = Replayed.none_yet(questions, conditions)
     for column, question in enumerate(questions):
         own = _evaluated(bench, question, conditions)
         found.apart[column] = apart_from_stored(bench, question, own.plain)

@@ -1,12 +1,12 @@
 """Noisy demonstrations of the scripted expert on plain tiles; pictures are painted onto the tiles later."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from vlm_tiny_training.recorded import Recorded
 
 from pi0_tiny_training.window import seen_by_policy
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
@@ -27,7 +27,7 @@ IDLE_STEPS = 4
 
 
 @dataclass(frozen=True)
-class Demonstrations:
+class Demonstrations(Recorded):
     """Every frame of every episode, as the policy sees it.
 
     pictures: (F, 96, 96, 3) uint8. tiles: (F, 2, 96, 96) uint8, share of a pixel that shows the left and the
@@ -42,21 +42,6 @@ class Demonstrations:
     chunks: NDArray[np.float32]
     side: NDArray[np.int8]
     deciding: NDArray[np.bool_]
-
-    def save(self, path: Path) -> None:
-        """Write to one .npz file."""
-        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """Read what `save` wrote."""
-        with np.load(path) as arrays:
-            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
-
-    @classmethod
-    def joined(cls, parts: list[Self]) -> Self:
-        """Several recordings as one."""
-        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
 @dataclass(frozen=True)

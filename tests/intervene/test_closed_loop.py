@@ -39,18 +39,6 @@ CALLS = 2
 
 
 @pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
-
-
-@pytest.fixture(scope="module")
 def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Two inferences per episode, so that the second one meets what the first one did."""
     from probe_kit.env import SceneSpec

@@ -12,7 +12,6 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.intervene import Answers, Effects, Erase, Source, intervene_on, load_effects, stored_following
 from probe_kit.intervene.erased import Erasing, erased
-from probe_kit.suite import Suite
 from tests.intervene.answers import answers_of, follower, habit
 
 if TYPE_CHECKING:
@@ -20,23 +19,6 @@ if TYPE_CHECKING:
 
 ASKED = Erase(categories=("color",), items=6, sites=("backbone.02", "backbone.03"), controls=1)
 EPISODES = 12
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("erase") / "run"))
-
-
-@pytest.fixture(scope="module")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
 
 
 @pytest.fixture(scope="module")

@@ -1,49 +1,23 @@
 """Changes inside a real network: what is put in, along what, and what the ledger says of it."""
 
-import shutil
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import Run
 from probe_kit.hooks import Site
 from probe_kit.intervene import Effects, Interchange, Source, Steer, intervene_on, load_effects, stored_passing
-from probe_kit.intervene.bench import Bench, open_bench
+from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.directions import axes_of
 from probe_kit.intervene.patching import Replaced, ReplacedAlong
 from probe_kit.intervene.places import places, token_mask
-from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 LAST = 3
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("inside") / "run"))
-
-
-@pytest.fixture(scope="module")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
-
-
-@pytest.fixture(scope="module")
-def bench(copy: Run, source: Source, twin: "Policy") -> Iterator[Bench]:
-    with open_bench(copy, source, lambda *_: twin) as opened, opened.ready():
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,32 +20,13 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.intervene import Effects, Follow, Source, intervene_on, load_effects, stored_interventions
-from probe_kit.intervene.bench import Bench, open_bench
+from probe_kit.intervene.bench import Bench
 from probe_kit.retention import retention
-from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 FILES = ("episodes.npz", "effects.csv", "certificate.json")
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The recorded run, with which interventions may be stored."""
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("intervened") / "run"))
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +39,6 @@ def mine(copy: Run, effects: Effects, tmp_path: Path) -> Run:
     """One that a test may damage."""
     assert effects
     return open_run(shutil.copytree(copy.path, tmp_path / "run"))
-
-
-@pytest.fixture(scope="module")
-def bench(copy: Run, source: Source, twin: "Policy") -> Iterator[Bench]:
-    with open_bench(copy, source, lambda *_: twin) as opened, opened.ready():
-        yield opened
 
 
 # -- replaying -----------------------------------------------------------------------------------------------

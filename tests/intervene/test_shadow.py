@@ -1,6 +1,5 @@
 """Shadow: conditions are evaluated at every inference of the unedited episode, and not carried out."""
 
-import shutil
 from dataclasses import replace
 from math import ceil
 from typing import TYPE_CHECKING
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import Run
 from probe_kit.intervene import ClosedLoop, Effects, Erase, Follow, Interchange, Source, intervene_on
 from probe_kit.intervene.bench import open_bench
 from probe_kit.intervene.settings import key_of, settings_of
@@ -22,18 +21,6 @@ ASKED = Interchange(
     categories=("color",), items=1, sites=("backbone.00", "backbone.03"), roles=("all",), readout="shadow"
 )
 EPISODES, STEPS = 2, 4
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("shadow") / "run"))
 
 
 @pytest.fixture(scope="module")

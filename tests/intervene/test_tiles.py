@@ -1,7 +1,5 @@
 """Tokens by tile: where the renderer says a tile is seen, and which patches of a policy see it."""
 
-import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,33 +7,15 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import Run
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import ClosedLoop, Erase, Interchange, Source, Steer, intervene_on
-from probe_kit.intervene.bench import Bench, Question, open_bench
+from probe_kit.intervene.bench import Bench, Question
 from probe_kit.intervene.tiles import TILES, role_mask, tokens_seeing
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("tiles") / "run"))
-
-
-@pytest.fixture(scope="module")
-def bench(copy: Run, small_suite: Suite, twin: "Policy") -> Iterator[Bench]:
-    with open_bench(copy, Source(small_suite.folder), lambda *_: twin) as opened, opened.ready():
-        yield opened
 
 
 @pytest.fixture(scope="module")

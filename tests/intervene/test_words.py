@@ -1,6 +1,5 @@
 """Words as donors, what one step owes to them, and the memory as a place: on a real run of the random twin."""
 
-import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,42 +9,16 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import Run
 from probe_kit.intervene import Effects, Interchange, Source, Words, intervene_on, load_effects
-from probe_kit.intervene.bench import Bench, open_bench
+from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.places import places, roles_of, token_mask
 from probe_kit.intervene.sensitivity import sensitivity
 from probe_kit.intervene.stored import Answers
 from probe_kit.intervene.words import words_of_twin
-from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from probe_kit.hooks import Policy
-
-
-@pytest.fixture(scope="module")
-def twin() -> "Policy":
-    from probe_kit.hooks import load_policy
-
-    return load_policy("pi0-tiny", random_weights=True)
-
-
-@pytest.fixture(scope="module")
-def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("worded") / "run"))
-
-
-@pytest.fixture(scope="module")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
-
-
-@pytest.fixture(scope="module")
-def bench(copy: Run, source: Source, twin: "Policy") -> "Iterator[Bench]":
-    with open_bench(copy, source, lambda *_: twin) as opened, opened.ready():
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,39 @@
+"""A real run of the random twin, with which interventions may be stored, and what they are made with."""
+
+import shutil
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from probe_kit.extract import Run, open_run
+from probe_kit.intervene import Source
+from probe_kit.intervene.bench import Bench, open_bench
+from probe_kit.suite import Suite
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+
+@pytest.fixture(scope="session")
+def twin() -> "Policy":
+    from probe_kit.hooks import load_policy
+
+    return load_policy("pi0-tiny", random_weights=True)
+
+
+@pytest.fixture(scope="module")
+def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Of the recorded run, one for every file."""
+    return open_run(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("intervened") / "run"))
+
+
+@pytest.fixture(scope="session")
+def source(small_suite: Suite) -> Source:
+    return Source(small_suite.folder)
+
+
+@pytest.fixture(scope="module")
+def bench(copy: Run, source: Source, twin: "Policy") -> Iterator[Bench]:
+    with open_bench(copy, source, lambda *_: twin) as opened, opened.ready():
+        yield opened
