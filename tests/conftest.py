@@ -2,14 +2,14 @@
 
 import gc
 import os
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from filelock import FileLock
+
+from tests.made_once import made_once, shared_folder
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -26,9 +26,9 @@ SHARED = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[2] / "sh
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests neither read nor fill the user's cache."""
+    """Tests neither read nor fill the user's cache; what one process draws for it, the others find."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PROBE_KIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("PROBE_KIT_CACHE", str(shared_folder(tmp_path_factory) / "cache"))
         yield
 
 
@@ -136,23 +136,6 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
     return build_suite(tmp_path_factory.mktemp("suite") / "small", ["color", "shape"], 12)
 
 
-def _made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """The folder that `make` fills: one process of the suite does so, and every other gets a copy of its own."""
-    own = tmp_path_factory.mktemp(name) / name
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        make(own)
-        return own
-    everybodys = tmp_path_factory.getbasetemp().parent / name
-    with FileLock(f"{everybodys}.lock"):
-        if not everybodys.exists():
-            make(own)
-            shutil.copytree(own, f"{everybodys}.part")
-            Path(f"{everybodys}.part").rename(everybodys)
-            return own
-    shutil.copytree(everybodys, own)
-    return own
-
-
 @pytest.fixture(scope="session")
 def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of two runs without a model, `run` and `other`, of other seeds, with everything a run can hold."""
@@ -164,7 +147,7 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
             probe_little_run(made)
             intervene_on_little_run(made)
 
-    return _made_once(tmp_path_factory, "little", make)
+    return made_once(tmp_path_factory, "little", make)
 
 
 @pytest.fixture(scope="session")
@@ -176,4 +159,4 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
     settings = ExtractSettings(
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
     )
-    return open_run(_made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))
+    return open_run(made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))

@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 
-from probe_kit.suite import Suite, build_suite
+from probe_kit.suite import Suite, build_suite, load_suite
+from tests.made_once import made_once
 
 
 @pytest.fixture(scope="session")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     """All embedded categories with 40 items each."""
-    return build_suite(tmp_path_factory.mktemp("embedded") / "suite", items_per_category=40)
+    return load_suite(made_once(tmp_path_factory, "embedded", lambda at: build_suite(at, items_per_category=40)))
 
 
 @pytest.fixture
