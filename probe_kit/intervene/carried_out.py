@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
-from probe_kit.intervene.following import WORTH
-from probe_kit.intervene.passing import Named, beyond_controls, ledger_sums
+from probe_kit.intervene.following import WORTH, net_interval
+from probe_kit.intervene.passing import Named, beyond_controls, controls_of, ledger_sums
 from probe_kit.intervene.stored import PLAIN, Answers
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.mcnemar import sign_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -104,17 +103,13 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[
     in_zone = np.isin(answers.outcomes, (CORRECT, WRONG)).mean(axis=1)
     broken = in_zone < BROKEN * in_zone[0]
     net = wrong - wrong[0]
-    controls = [
-        [at for at, other in enumerate(names) if other.is_control_of(name) and not broken[at]] for name in names
-    ]
+    controls = [[at for at in own if not broken[at]] for own in controls_of(names)]
     tested = [
         at for at, name in enumerate(names) if name.place != PLAIN and not name.is_control and not broken[at]
     ]
     found = _tests(answers, category, suite, net, controls, tested)
-    drawn = units_seed(answers.groups, suite)
     rows = []
     for at, name in enumerate(names):
-        low, high = group_bootstrap(net[at][:, None], answers.groups, drawn, bounds=GAINS)
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
         t, p, p_fwe = found.get(at, (None, None, None))
         rows.append(
@@ -131,7 +126,7 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[
                 in_zone=float(in_zone[at]),
                 wrong_in_zone=float(wrong[at].mean() / in_zone[at]) if in_zone[at] else None,
                 net=float(net[at].mean()),
-                net_ci=(float(low[0]), float(high[0])),
+                net_ci=net_interval(net[at], answers, suite),
                 net_left=_mean(net[at][answers.sides == "right"]),
                 net_right=_mean(net[at][answers.sides == "left"]),
                 control_net=float(net[controls[at]].mean()) if controls[at] else None,

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
-from probe_kit.intervene.following import WORTH
-from probe_kit.intervene.passing import HALF, Named, beyond_controls, ledger_sums
+from probe_kit.intervene.following import WORTH, net_interval
+from probe_kit.intervene.passing import HALF, Named, beyond_controls, controls_of, ledger_sums
 from probe_kit.intervene.stored import PLAIN, Answers
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -99,7 +98,7 @@ def _of_category(answers: Answers, category: str, suite: str, key: str, readable
     conditions = [name for name in answers.conditions if name != PLAIN]
     names = [Named.of(condition) for condition in conditions]
     values = np.array([toward * answers.of(condition) for condition in conditions])
-    controls = [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
+    controls = controls_of(names)
     tested = [at for at, name in enumerate(names) if not name.is_control and not name.dose]
     away = plain - values
     beyond = beyond_controls(away, controls, tested)
@@ -108,10 +107,8 @@ def _of_category(answers: Answers, category: str, suite: str, key: str, readable
     goes_there = paired_greater_p(plain, answers.items, answers.groups) < SIGNIFICANCE
     kept = values.sum(axis=1) / plain.sum() if goes_there else None
     net = (plain > 0).astype(float) - (values > 0)
-    drawn = units_seed(answers.groups, suite)
     rows = []
     for at, (condition, name) in enumerate(zip(conditions, names, strict=True)):
-        low, high = group_bootstrap(net[at][:, None], answers.groups, drawn, bounds=GAINS)
         row, beside = answers.conditions.index(condition), controls[at]
         tested_at = place_of.get(at)
         rows.append(
@@ -127,7 +124,7 @@ def _of_category(answers: Answers, category: str, suite: str, key: str, readable
                 right=float((values[at] > 0).mean()),
                 kept=None if kept is None else float(kept[at]),
                 net=float(net[at].mean()),
-                net_ci=(float(low[0]), float(high[0])),
+                net_ci=net_interval(net[at], answers, suite),
                 shift=float(away[at].mean()),
                 control_kept=_mean(kept, beside),
                 control_net=_mean(net.mean(axis=1), beside),

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.intervene.stored import EXCHANGED, PLAIN, Answers, stored_interventions
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
@@ -68,7 +69,6 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> Follo
     plain, exchanged = (answers.toward * answers.of(name) for name in (PLAIN, EXCHANGED))
     follows, against = (plain > 0) & (exchanged < 0), (plain < 0) & (exchanged > 0)
     net = follows.astype(float) - against
-    low, high = group_bootstrap(net[:, None], answers.groups, units_seed(answers.groups, suite), bounds=GAINS)
     shift = plain - exchanged
     return Following(
         category=category,
@@ -78,12 +78,19 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> Follo
         follows=float(follows.mean()),
         against=float(against.mean()),
         net=float(net.mean()),
-        net_ci=(float(low[0]), float(high[0])),
+        net_ci=net_interval(net, answers, suite),
         p_follows=paired_greater_p(shift, answers.items, answers.groups),
         p_against=paired_greater_p(-shift, answers.items, answers.groups),
         shift=float(np.median(np.abs(shift))),
         key=key,
     )
+
+
+def net_interval(net: NDArray[np.float64], answers: Answers, suite: str) -> tuple[float, float]:
+    """95 % interval by groups of the mean over episodes of (E,) gains."""
+    drawn = units_seed(answers.groups, suite)
+    low, high = group_bootstrap(net[:, None], answers.groups, drawn, bounds=GAINS)
+    return float(low[0]), float(high[0])
 
 
 def stored_following(run: RunReader) -> dict[str, Following]:

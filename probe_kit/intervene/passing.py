@@ -7,16 +7,15 @@ away from it as well.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
-from probe_kit.intervene.following import following
+from probe_kit.intervene.following import following, net_interval
 from probe_kit.intervene.patching import LEDGER
 from probe_kit.intervene.stored import EXCHANGED, PLAIN, UNCHANGED, Answers, stored_interventions
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
@@ -128,7 +127,7 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
         return []
     names = [Named.of(answers.conditions[row]) for row in rows]
     shifts = push * (answers.lateral[rows] - plain)
-    controls = [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
+    controls = controls_of(names)
     tested = [at for at, name in enumerate(names) if not name.is_control]
     seed = derive_seed("sign flips", suite, category)
     t, p, p_fwe = max_t(beyond_controls(shifts, controls, tested), answers.items, answers.groups, seed)
@@ -137,8 +136,6 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
     found = []
     for at, name in enumerate(names):
         turned = _turned(push, plain, answers.lateral[rows[at]])
-        drawn = units_seed(answers.groups, suite)
-        low, high = group_bootstrap(turned[:, None], answers.groups, drawn, bounds=GAINS)
         tested_at = place_of.get(at)
         found.append(
             Passing(
@@ -152,7 +149,7 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
                 n_items=np.unique(answers.items).size,
                 effect=None if share is None else float(share[at]),
                 net=float(turned.mean()),
-                net_ci=(float(low[0]), float(high[0])),
+                net_ci=net_interval(turned, answers, suite),
                 net_left=_mean(turned[push > 0]),
                 net_right=_mean(turned[push < 0]),
                 shift=float(shifts[at].mean()),
@@ -166,6 +163,11 @@ def _of_category(answers: Answers, category: str, suite: str, toward: str, key: 
             )
         )
     return found
+
+
+def controls_of(names: Sequence[Named]) -> list[list[int]]:
+    """For every condition, which others it is held against."""
+    return [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
 
 
 def beyond_controls(values: Values, controls: Sequence[list[int]], tested: Sequence[int]) -> Values:
@@ -210,18 +212,19 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
     """By category, what the newest interchange of it found; empty if there is none. Raises RunDamagedError."""
-    found: dict[str, list[Passing]] = {}
-    for one in stored_interventions(run, "interchange"):
-        rows = passing(one.answers(), run.suite, key=one.key)
-        found |= {str(name): [row for row in rows if row.category == name] for name in one.settings["categories"]}
-    return found
+    return _stored(run, "interchange")
 
 
 def stored_steering(run: RunReader) -> dict[str, list[Passing]]:
     """By category, what the newest steering of it did, controls included; empty if there is none."""
+    return _stored(run, "steer")
+
+
+def _stored(run: RunReader, kind: Literal["interchange", "steer"]) -> dict[str, list[Passing]]:
     found: dict[str, list[Passing]] = {}
-    for one in stored_interventions(run, "steer"):
-        rows = passing(one.answers(), run.suite, str(one.settings["toward"]), one.key)
+    for one in stored_interventions(run, kind):
+        toward = str(one.settings["toward"]) if kind == "steer" else "exchanged"
+        rows = passing(one.answers(), run.suite, toward, one.key)
         found |= {str(name): [row for row in rows if row.category == name] for name in one.settings["categories"]}
     return found
 
