@@ -27,6 +27,11 @@ def to_device(array: NDArray[Any], device: str | None) -> Array:
     return torch.as_tensor(array, device=device)
 
 
+def to_device_of(like: Array, array: NDArray[Any]) -> Array:
+    """`array` where `like` is, and made by the same module."""
+    return array if isinstance(like, np.ndarray) else namespace(like).as_tensor(array, device=like.device)
+
+
 def to_numpy(array: Array) -> NDArray[Any]:
     """`array` as a numpy array in this machine's memory."""
     return array if isinstance(array, np.ndarray) else np.asarray(array.cpu())

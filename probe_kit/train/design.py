@@ -1,7 +1,9 @@
 """Training samples as the solver needs them: products with them, never all their entries."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import cached_property
+from typing import Any, Protocol, Self
 
 from probe_kit.train.arrays import Array, namespace
 from probe_kit.train.rows import ChosenRows
@@ -17,7 +19,14 @@ class Design(Protocol):
 
     @property
     def spectrum(self) -> Array:
-        """(R, 1) squared length of every column."""
+        """(R, 1) squared length of every column, or (R, K) where label columns have samples of their own."""
+
+    @property
+    def small(self) -> bool:
+        """Whether the moments of all label columns cost less than the many small calls of an iteration."""
+
+    def of(self, _columns: Array) -> "Design":
+        """What the label columns of a mask (K,) need of it."""
 
     def __matmul__(self, weights: Array) -> Array:
         """Z · weights, (N, K) for (R, K)."""
@@ -29,8 +38,18 @@ class Design(Protocol):
         """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
 
 
+class _OfAllColumns:
+    """The same samples for every label column."""
+
+    small = False
+
+    def of(self, _columns: Array) -> Self:
+        """Itself."""
+        return self
+
+
 @dataclass(frozen=True)
-class DenseDesign:
+class DenseDesign(_OfAllColumns):
     """Samples in memory, (N, R) float64."""
 
     samples: Array
@@ -58,7 +77,63 @@ class DenseDesign:
 
 
 @dataclass(frozen=True)
-class StreamedDesign:
+class StackedDesign:
+    """Samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
+
+    fold_of: (K,) the fold that each label column belongs to.
+    """
+
+    samples: Array
+    fold_of: Array
+
+    small = True
+
+    @classmethod
+    def of_folds(cls, folds: Sequence[Design], columns: int) -> "StackedDesign":
+        """Of dense designs, each with so many label columns of its own."""
+        dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
+        xp, like = namespace(dense[0]), dense[0]
+        count, width = (max(samples.shape[axis] for samples in dense) for axis in (0, 1))
+        filled = xp.zeros((len(folds), count, width), dtype=like.dtype, device=like.device)
+        for fold, samples in zip(filled, dense, strict=True):
+            fold[: len(samples), : samples.shape[1] - 1] = samples[:, :-1]
+            fold[: len(samples), -1] = samples[:, -1]
+        numbers = xp.arange(len(folds) * columns, device=like.device)
+        return cls(filled, numbers // columns)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, R)."""
+        return self.samples.shape[1], self.samples.shape[2]
+
+    @property
+    def spectrum(self) -> Array:
+        """(R, K) squared length of every column of a label column's samples."""
+        return namespace(self.samples).square(self.samples).sum(axis=1)[self.fold_of].T
+
+    def of(self, columns: Array) -> "StackedDesign":
+        """The same samples for the label columns of a mask (K,)."""
+        return StackedDesign(self.samples, self.fold_of[columns])
+
+    @cached_property
+    def _own(self) -> Array:
+        """(K, N, R) the samples of every label column."""
+        return self.samples[self.fold_of]
+
+    def __matmul__(self, weights: Array) -> Array:
+        return (self._own @ weights.T[..., None])[..., 0].T
+
+    def gather(self, values: Array) -> Array:
+        """Zᵀ · values, (R, K) for (N, K)."""
+        return (values.T[:, None] @ self._own)[:, 0].T
+
+    def moments(self, weights: Array) -> Array:
+        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        return (self._own * weights.T[..., None]).swapaxes(1, 2) @ self._own
+
+
+@dataclass(frozen=True)
+class StreamedDesign(_OfAllColumns):
     """Samples made from raw features block by block in every product: standardised, then turned to `axes`.
 
     axes: (kept, R − 1). variances: (R − 1,) squared lengths of the columns without the intercept's.

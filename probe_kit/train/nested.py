@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.train.arrays import Array, to_numpy
+from probe_kit.train.features import Coordinates
 
 Matrix = NDArray[np.float64]
 
@@ -54,6 +56,14 @@ class FittedFold:
     weights: Matrix
     intercept: float
     spread: float
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, weights: Array, decisions: Matrix, strengths: Matrix) -> "FittedFold":
+        """With the first column of `weights` (R, K), found in `coordinates`."""
+        raw, intercept = coordinates.raw_weights(weights[:, 0])
+        along = float(np.std(to_numpy(coordinates.train @ weights[:, 0])))
+        length = float(np.linalg.norm(raw))
+        return cls(decisions, strengths, raw, intercept, along / length if length else 0.0)
 
 
 def least_loss(loss: Matrix) -> NDArray[np.intp]:

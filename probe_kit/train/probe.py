@@ -23,6 +23,7 @@ from probe_kit.train.nested import (
 )
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness, log_loss
+from probe_kit.train.small_probe import cross_validate_together, is_small
 from probe_kit.train.solver import LogisticSolver
 
 __all__ = [
@@ -95,11 +96,14 @@ def refuse_non_finite(samples: Samples) -> None:
 def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
     """The probes of every outer fold, each column of (E, K) labels on its own.
 
-    Many tokens per feature are solved for all training sets together, where these have the same features.
+    Many tokens per feature are solved for all training sets together, where these have the same features, and so
+    are small problems.
     Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
     """
     if can_be_joint(samples) and (site := JointSite.of(samples, folds)).alike:
         return cross_validate_jointly(site, samples, labels, folds)
+    if is_small(samples, labels):
+        return cross_validate_together(samples, labels, folds)
     return [_fit_fold(samples, labels, f.outer, choose_strengths(samples, labels, f.inner)) for f in folds]
 
 
@@ -128,11 +132,8 @@ def _fit_fold(samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths
         (weights,) = solver.path(training_labels[:, columns], np.array([strength]))
         decisions[:, columns] = to_numpy(held_out @ weights)
         if columns[0] == 0:
-            first = weights[:, 0]
-    raw, intercept = coordinates.raw_weights(first)
-    along = float(np.std(to_numpy(coordinates.train @ first)))
-    length = float(np.linalg.norm(raw))
-    return FittedFold(decisions, strengths, raw, intercept, along / length if length else 0.0)
+            first = weights
+    return FittedFold.of(coordinates, first, decisions, strengths)
 
 
 def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:

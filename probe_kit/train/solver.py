@@ -7,8 +7,8 @@ need a few products each, and all label columns share them as matrix–matrix pr
 tensors: samples on a GPU are solved there, in float64 as well.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +19,26 @@ from probe_kit.train.design import Design
 
 MAX_NEWTON_STEPS = 100
 MAX_CG_STEPS = 100
-FEW_COLUMNS, SMALL_HESSIAN = 32, 2**20
-"""Up to so many label columns, each of so many multiplications (N · R²), whole Hessians cost less than the many
-small products of conjugate gradients."""
 
 
 @dataclass(frozen=True)
 class _Problems:
     """Problems still to be solved, one column each: where they are, and the objective there."""
 
+    samples: Design
     columns: Array
+    strength: Array  # (K,)
+    rounding: Array  # (K,) gradients as small as this are zero
     signs: Array  # (N, K) labels as −1 and +1
     weights: Array  # (R, K)
     decisions: Array  # (N, K)
     objective: Array  # (K,)
 
     def only(self, chosen: Array) -> "_Problems":
-        return _Problems(*(member[..., chosen] for member in vars(self).values()))
+        if chosen.all():
+            return self
+        arrays = {name: member[..., chosen] for name, member in vars(self).items() if name != "samples"}
+        return _Problems(self.samples.of(chosen), **arrays)
 
 
 class LogisticSolver:
@@ -51,9 +54,9 @@ class LogisticSolver:
         self.tolerance = tolerance
         self.spectrum = samples.spectrum
         self.xp = namespace(self.spectrum)
-        self.penalty = self.xp.ones_like(self.spectrum)
+        self.penalty = self.xp.ones_like(self.spectrum[:, :1])
         self.penalty[-1] = 0.0
-        self.rounding = 1e-15 * (float(self.spectrum.sum()) * samples.shape[0]) ** 0.5
+        self.rounding = 1e-15 * (self.spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
 
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
         """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
@@ -61,53 +64,63 @@ class LogisticSolver:
         Raises ProbeNotConvergedError rather than return a column that is not at its optimum, and
         TooFewGroupsError for a column with a single class, which has no optimum.
         """
-        if (labels.all(axis=0) | ~labels.any(axis=0)).any():
-            raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
-        xp, device = self.xp, self.spectrum.device
-        signs = 2.0 * xp.asarray(labels, dtype=xp.float64, device=device) - 1.0
-        weights = xp.zeros((self.samples.shape[1], signs.shape[1]), dtype=xp.float64, device=device)
+        refuse_single_class(labels)
+        signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.spectrum.device) - 1.0
+        yield from self.path_of_signs(signs, strengths)
+
+    def path_of_signs(self, signs: Array, strengths: Iterable[float | Array]) -> Iterator[Array]:
+        """`path` for labels as −1 and +1, (N, K); a sample with 0 is none."""
+        shape = self.samples.shape[1], signs.shape[1]
+        weights = self.xp.zeros(shape, dtype=signs.dtype, device=signs.device)
         for strength in strengths:
-            weights = self.solve(signs, float(strength), weights)
+            weights = self.solve(signs, strength, weights)
             yield weights
 
-    def solve(self, signs: Array, strength: float, start: Array) -> Array:
-        """Optimal weights (R, K) of labels −1/+1 (N, K) at C = `strength`, found from `start` (R, K)."""
+    def solve(self, signs: Array, strength: float | Array, start: Array) -> Array:
+        """Optimal weights (R, K) of labels −1/+1 (N, K), found from `start` (R, K).
+
+        strength: C of all, or (K,) of every column.
+        """
         xp = self.xp
         solved = xp.empty_like(start)
         decisions = self.samples @ start
+        each = xp.ones_like(start[-1])
         objective = self._objective(signs, strength, start, decisions)
-        todo = _Problems(xp.arange(signs.shape[1], device=signs.device), signs, start, decisions, objective)
+        columns = xp.arange(signs.shape[1], device=signs.device)
+        todo = _Problems(
+            self.samples, columns, each * strength, each * self.rounding, signs, start, decisions, objective
+        )
         for _ in range(MAX_NEWTON_STEPS):
             misfit = _sigmoid(-todo.signs * todo.decisions)
-            gradient = self.penalty * todo.weights - strength * self.samples.gather(todo.signs * misfit)
+            gradient = self.penalty * todo.weights - todo.strength * todo.samples.gather(todo.signs * misfit)
             size = xp.linalg.norm(gradient, axis=0)
             scale = xp.maximum(xp.linalg.norm(todo.weights[:-1], axis=0), size)
             relative = size / scale.clip(np.finfo(float).tiny)
             # Negated, so that NaN stays open and ends in an error.
-            open_ = ~((relative <= self.tolerance) | (size <= self.rounding * strength))
+            open_ = ~((relative <= self.tolerance) | (size <= todo.rounding * todo.strength))
             solved[:, todo.columns[~open_]] = todo.weights[:, ~open_]
             if not open_.any():
                 return solved
-            curvature = strength * (misfit * (1 - misfit))[:, open_]
-            # A step more precise than the point it starts from is wasted work.
-            precision = xp.sqrt(relative[open_]).clip(max=0.1)
-            step = self._newton_step(gradient[:, open_], curvature, precision)
-            todo = self._moved(todo.only(open_), strength, gradient[:, open_], step)
+            todo, misfit, gradient = todo.only(open_), misfit[:, open_], gradient[:, open_]
+            curvature = todo.strength * misfit * (1 - misfit)
+            if todo.samples.small:
+                step = self._exact_newton_steps(todo.samples, gradient, curvature)
+            else:  # a step more precise than the point it starts from is wasted work
+                step = self._newton_steps(gradient, curvature, xp.sqrt(relative[open_]).clip(max=0.1))
+            todo = self._moved(todo, gradient, step)
         raise ProbeNotConvergedError(
-            f"{todo.columns.size} of {signs.shape[1]} logistic problems (N={len(signs)}, C={strength:g}) are "
-            f"not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst relative gradient "
-            f"{relative.max():.1e}, expected at most {self.tolerance:.0e}. Look for extreme feature values."
+            f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
+            f"C={todo.strength[0]:g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst "
+            f"relative gradient {relative.max():.1e}, expected at most {self.tolerance:.0e}. "
+            "Look for extreme feature values."
         )
 
-    def _newton_step(self, gradient: Array, curvature: Array, precision: Array) -> Array:
+    def _newton_steps(self, gradient: Array, curvature: Array, precision: Array) -> Array:
         """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision`.
 
         Columns that conjugate gradients do not settle in time are solved exactly.
         """
         xp = self.xp
-        samples, columns = curvature.shape
-        if columns <= FEW_COLUMNS and samples * len(gradient) ** 2 <= SMALL_HESSIAN:
-            return self._exact_newton_steps(gradient, curvature)
         step = xp.zeros_like(gradient)
         todo = xp.arange(gradient.shape[1], device=gradient.device)
         target = precision * xp.linalg.norm(gradient, axis=0)
@@ -134,31 +147,40 @@ class LogisticSolver:
             direction = scaled + (slope / previous) * direction
         for place, column in enumerate(todo):  # one after another: all Hessians may be more than the memory holds
             one = slice(place, place + 1)
-            step[:, column] = self._exact_newton_steps(gradient[:, column, None], curvature[:, one])[:, 0]
+            exact = self._exact_newton_steps(self.samples, gradient[:, column, None], curvature[:, one])
+            step[:, column] = exact[:, 0]
         return step
 
-    def _exact_newton_steps(self, gradient: Array, curvature: Array) -> Array:
-        hessians = self.samples.moments(curvature) + self.xp.diag(self.penalty[:, 0])
+    def _exact_newton_steps(self, samples: Design, gradient: Array, curvature: Array) -> Array:
+        hessians = samples.moments(curvature)
+        diagonal = self.xp.arange(len(gradient))
+        hessians[:, diagonal, diagonal] += self.penalty[:, 0]
         return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
-    def _moved(self, todo: _Problems, strength: float, gradient: Array, step: Array) -> _Problems:
+    def _moved(self, todo: _Problems, gradient: Array, step: Array) -> _Problems:
         """`todo` moved along `step`, which is halved per column until the objective falls enough."""
-        change = self.samples @ step
+        change = todo.samples @ step
         slope = (gradient * step).sum(axis=0)
         length = self.xp.ones_like(slope)
         while True:
             weights, decisions = todo.weights + length * step, todo.decisions + length * change
-            objective = self._objective(todo.signs, strength, weights, decisions)
+            objective = self._objective(todo.signs, todo.strength, weights, decisions)
             bound = todo.objective + 1e-4 * length * slope + 1e-12 * abs(todo.objective)
             too_far = objective > bound
             if not too_far.any():
-                return _Problems(todo.columns, todo.signs, weights, decisions, objective)
+                return replace(todo, weights=weights, decisions=decisions, objective=objective)
             length[too_far] /= 2
 
-    def _objective(self, signs: Array, strength: float, weights: Array, decisions: Array) -> Array:
+    def _objective(self, signs: Array, strength: float | Array, weights: Array, decisions: Array) -> Array:
         margins = signs * decisions
         loss = ((-margins).clip(0.0) + self.xp.log1p(self.xp.exp(-abs(margins)))).sum(axis=0)
         return strength * loss + 0.5 * (self.penalty * weights * weights).sum(axis=0)
+
+
+def refuse_single_class(labels: NDArray[np.bool_]) -> None:
+    """Raise TooFewGroupsError for a column of (N, K) training labels that has no optimum."""
+    if (labels.all(axis=0) | ~labels.any(axis=0)).any():
+        raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
 
 
 def _sigmoid(values: Array) -> Array:

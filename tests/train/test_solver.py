@@ -8,7 +8,7 @@ from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
 from probe_kit.train import solver
-from probe_kit.train.design import DenseDesign
+from probe_kit.train.design import DenseDesign, StackedDesign
 from probe_kit.train.features import Coordinates
 from probe_kit.train.probe import STRENGTHS
 from probe_kit.train.solver import LogisticSolver
@@ -19,10 +19,29 @@ LABELS = GENERATOR.random(90) < 0.5
 SIGNS = np.where(LABELS, 1.0, -1.0)[:, None]
 
 
-@pytest.fixture(params=["whole Hessians", "conjugate gradients"], autouse=True)
-def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small problems are solved in one way, large ones in the other; every test holds for both."""
-    monkeypatch.setattr(solver, "FEW_COLUMNS", 32 if request.param == "whole Hessians" else 0)
+Path = Callable[[Coordinates, np.ndarray, np.ndarray], list[np.ndarray]]
+
+
+@pytest.fixture(params=["alone", "beside another fold"])
+def path(request: pytest.FixtureRequest) -> Path:
+    """Large problems are solved alone, small ones together with other folds'; every test holds for both."""
+    return alone if request.param == "alone" else beside_another_fold
+
+
+def alone(coordinates: Coordinates, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
+    return list(LogisticSolver(coordinates.train).path(labels, strengths))
+
+
+def beside_another_fold(coordinates: Coordinates, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
+    """With samples filled up to the size of a larger fold."""
+    larger = Coordinates.fit(np.random.default_rng(1).standard_normal((95, 120)))
+    count, (samples, rank) = labels.shape[1], coordinates.train.shape
+    design = StackedDesign.of_folds([coordinates.train, larger.train], count)
+    signs = np.zeros((95, 2 * count))
+    signs[:samples, :count] = 2.0 * labels - 1.0
+    signs[:, count:] = np.where(np.arange(95) % 2, 1.0, -1.0)[:, None]
+    together = LogisticSolver(design).path_of_signs(signs, strengths)
+    return [np.vstack([weights[: rank - 1, :count], weights[-1:, :count]]) for weights in together]
 
 
 def near_duplicates() -> np.ndarray:
@@ -55,7 +74,7 @@ CASES: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_decisions_equal_scikit_learn_at_its_own_optimum(
-    case: Callable[[], tuple[np.ndarray, np.ndarray]],
+    case: Callable[[], tuple[np.ndarray, np.ndarray]], path: Path
 ) -> None:
     features, labels = case()
     coordinates = Coordinates.fit(features)
@@ -64,7 +83,7 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
     ours = np.vstack([coordinates(features), coordinates(others)])
 
     both = np.column_stack([labels, ~labels])
-    for strength, weights in zip(STRENGTHS, LogisticSolver(coordinates.train).path(both, STRENGTHS), strict=True):
+    for strength, weights in zip(STRENGTHS, path(coordinates, both, STRENGTHS), strict=True):
         oracle = LogisticRegression(C=strength, tol=1e-10, solver="newton-cholesky", max_iter=1000)
         expected = oracle.fit(samples[:90], labels).decision_function(samples)
         found = ours @ weights
@@ -73,13 +92,13 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
         assert ((found[:, 0] > 0) == (expected > 0)).all()
 
 
-def test_columns_solved_together_equal_columns_solved_alone() -> None:
-    samples = Coordinates.fit(NOISE).train
+def test_columns_solved_together_equal_columns_solved_alone(path: Path) -> None:
+    samples = Coordinates.fit(NOISE)
     labels = GENERATOR.random((90, 7)) < 0.5
-    together = list(LogisticSolver(samples).path(labels, STRENGTHS))
+    together = path(samples, labels, STRENGTHS)
     for column in range(7):
-        alone = list(LogisticSolver(samples).path(labels[:, [column]], STRENGTHS))
-        for many, one in zip(together, alone, strict=True):
+        single = alone(samples, labels[:, [column]], STRENGTHS)
+        for many, one in zip(together, single, strict=True):
             assert np.linalg.norm(many[:, column] - one[:, 0]) < 1e-8 * np.linalg.norm(one)
 
 
@@ -93,20 +112,31 @@ def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
     np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
-def test_an_unfinished_probe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_probe_is_an_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver, "MAX_NEWTON_STEPS", 2)
-    with pytest.raises(ProbeNotConvergedError, match=r"1 of 1 logistic problems \(N=90, C=10\)"):
-        list(LogisticSolver(Coordinates.fit(NOISE).train).path(LABELS[:, None], np.array([10.0])))
+    with pytest.raises(ProbeNotConvergedError, match=r"of [12] logistic problems \(N=9[05], C=10\)"):
+        path(Coordinates.fit(NOISE), LABELS[:, None], np.array([10.0]))
 
 
-def test_non_finite_samples_never_pass_as_converged() -> None:
-    samples = Coordinates.fit(NOISE).train
-    assert isinstance(samples, DenseDesign)
-    samples.samples[0, 0] = np.nan
+def test_non_finite_samples_never_pass_as_converged(path: Path) -> None:
+    coordinates = Coordinates.fit(NOISE)
+    assert isinstance(coordinates.train, DenseDesign)
+    coordinates.train.samples[0, 0] = np.nan
     with pytest.raises(ProbeNotConvergedError):
-        list(LogisticSolver(samples).path(LABELS[:, None], np.array([1.0])))
+        path(coordinates, LABELS[:, None], np.array([1.0]))
 
 
 def test_a_single_class_has_no_optimum() -> None:
     with pytest.raises(TooFewGroupsError, match="same label"):
         list(LogisticSolver(Coordinates.fit(NOISE).train).path(np.ones((90, 1), dtype=bool), STRENGTHS))
+
+
+def test_every_column_can_have_a_strength_of_its_own() -> None:
+    samples = Coordinates.fit(NOISE)
+    of_columns = LogisticSolver(samples.train).path_of_signs(
+        np.repeat(SIGNS, 3, axis=1), [np.array([1.0, 0.01, 1.0])]
+    )
+    (found,) = of_columns
+    for column, strength in enumerate((1.0, 0.01, 1.0)):
+        (expected,) = alone(samples, LABELS[:, None], np.array([strength]))
+        np.testing.assert_allclose(found[:, [column]], expected, atol=1e-8)
