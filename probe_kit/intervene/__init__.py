@@ -23,10 +23,14 @@ if TYPE_CHECKING:
     from probe_kit.intervene.steer import Steer
     from probe_kit.intervene.stored import Answers, stored_interventions
     from probe_kit.intervene.verdict import Judgement, Verdict, judge, judgements
+    from probe_kit.intervene.weigh import Attention
+    from probe_kit.intervene.weighed import Attending, Weighed, stored_attention
     from probe_kit.intervene.words import Words
 
 __all__ = [
     "Answers",
+    "Attending",
+    "Attention",
     "Bench",
     "CarriedOut",
     "ClosedLoop",
@@ -42,12 +46,14 @@ __all__ = [
     "Source",
     "Steer",
     "Verdict",
+    "Weighed",
     "Words",
     "best_cells",
     "intervene_on",
     "judge",
     "judgements",
     "load_effects",
+    "stored_attention",
     "stored_following",
     "stored_interventions",
     "stored_passing",
@@ -64,6 +70,10 @@ __getattr__ = lazy_names(
         "Steer": "steer",
         "Interchange": "interchange",
         "Answers": "stored",
+        "Attending": "weighed",
+        "Attention": "weigh",
+        "Weighed": "weighed",
+        "stored_attention": "weighed",
         "Bench": "bench",
         "CarriedOut": "carried_out",
         "ClosedLoop": "closed_loop",

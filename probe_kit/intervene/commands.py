@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from probe_kit.intervene.conditions import Intervention
     from probe_kit.intervene.effects import Effects
 
-KINDS = ("follow", "words", "interchange", "steer", "closed-loop", "erase")
-INSIDE = "Inside the network (interchange, steer, closed-loop, erase)"
+KINDS = ("follow", "words", "interchange", "steer", "closed-loop", "erase", "attention")
+INSIDE = "Inside the network (interchange, steer, closed-loop, erase, attention)"
 _FORMATS = ("table", "json", "csv")
 
 
@@ -27,7 +27,8 @@ def intervene(
             "same pictures, asked for the other one? interchange: where "
             "inside does that pass? steer: a direction added, beside matched controls. closed-loop: the best "
             "place of an interchange and its controls, with every episode played again. erase: what can be read "
-            "linearly taken away per token, beside random subspaces; says less than an exchange."
+            "linearly taken away per token, beside random subspaces; says less than an exchange. attention: how "
+            "much of it what acts pays to pictures, tiles, words and state; describes, and changes nothing."
         ),
     ] = "follow",
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
@@ -45,7 +46,8 @@ def intervene(
         typer.Option(
             help="Comma-separated: all, image, image.left, image.right, language, state, action; default "
             "all,image,language. Steer: the "
-            "one whose tokens are moved. Closed loop: with --sites, default all. Erase: default image.",
+            "one whose tokens are moved. Closed loop: with --sites, default all. Erase: default image. Attention: "
+            "default all that the family has.",
             rich_help_panel=INSIDE,
         ),
     ] = None,
@@ -146,12 +148,13 @@ _OPTIONS = {
     "steer": ("sites", "roles", "direction", "controls", "doses", "toward", "seed"),
     "closed-loop": ("sites", "roles", "direction", "controls", "seed"),
     "erase": ("sites", "roles", "direction", "controls", "seed"),
+    "attention": ("roles",),
 }
 
 
 def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
     """What was asked. Raises UsageError for an option that this kind does not have."""
-    from probe_kit.intervene import Follow, Interchange, Steer, Words
+    from probe_kit.intervene import Attention, Follow, Interchange, Steer, Words
 
     given = {name: value for name, value in inside.items() if value is not None}
     if meaningless := [name for name in given if name not in _OPTIONS[kind]]:
@@ -160,6 +163,8 @@ def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]
         )
     if kind in ("follow", "words"):
         return Words(**common) if kind == "words" else Follow(**common)
+    if kind == "attention":
+        return Attention(**common, **given)
     if kind == "closed-loop":
         return _closed_loop(run, common, given)
     if kind == "interchange":

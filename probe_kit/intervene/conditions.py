@@ -2,12 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.extract.store.run import Run
 from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.intervene.bench import Bench, Chunk, Question
 from probe_kit.intervene.patching import LEDGER, Ledger
@@ -29,10 +30,14 @@ class Turn:
 
 @dataclass(frozen=True)
 class Played:
-    """The actions (chunk, 7) of one inference, and what was changed in it, if anything."""
+    """The actions (chunk, 7) of one inference, and what was changed in it, if anything.
+
+    mass: (B, I, H, R) what attention was paid in it, if it was asked for; see `weighed.Weighed`.
+    """
 
     chunk: Chunk
     ledger: Ledger | None = None
+    mass: NDArray[np.float32] | None = None
 
 
 class Condition(Protocol):
@@ -63,9 +68,14 @@ class Intervention(Asked, ABC):
         """What the conditions give for the episodes of one item."""
         return replay(bench, bench.questions(item), conditions)
 
-    def told(self, conditions: "Sequence[Condition]") -> dict[str, Any]:
-        """What else its certificate says of its conditions, as plain JSON."""
-        del conditions
+    def told(self, conditions: "Sequence[Condition]", found: "Replayed") -> dict[str, Any]:
+        """What else its certificate says of its conditions and what they gave, as plain JSON."""
+        del conditions, found
+        return {}
+
+    def files(self, run: Run, conditions: "Sequence[Condition]", found: "Replayed") -> dict[str, bytes]:
+        """What else is stored, by the file's name."""
+        del run, conditions, found
         return {}
 
     @abstractmethod
@@ -95,6 +105,10 @@ class Exchanged:
         return Played(turn.bench.act(turn.question.exchanged, turn.question.seed))
 
 
+Noted = tuple[int, int, NDArray[np.float32]]
+"""The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
+
+
 @dataclass(frozen=True)
 class Replayed:
     """What K conditions gave for E episodes.
@@ -103,7 +117,8 @@ class Replayed:
     difference of any action from the plain one's. ledger: (K, E, 5) what was changed, see `patching.LEDGER`.
     apart: (E,) of the plain one from the stored one; NaN where the run does not say. outcomes: (K, E) where the
     cube ended, correct, wrong or oob, for episodes that were played to their end; then `lateral` is the cube's,
-    and `changed` and `apart` are of the trajectory. None where nothing was carried out.
+    and `changed` and `apart` are of the trajectory. None where nothing was carried out. mass: (N, B, I, H, R) the
+    attention of N inferences, inferences: (N, 2) of which row and call they are; None where nobody asked for it.
     """
 
     rows: NDArray[np.int64]
@@ -112,6 +127,15 @@ class Replayed:
     ledger: NDArray[np.float64]
     apart: NDArray[np.float64]
     outcomes: NDArray[np.str_] | None = None
+    mass: NDArray[np.float32] | None = None
+    inferences: NDArray[np.int64] | None = None
+
+    def with_mass(self, noted: "Sequence[Noted]") -> "Replayed":
+        """With the attention of its inferences, if any was noted."""
+        if not noted:
+            return self
+        rows, calls, masses = zip(*noted, strict=True)
+        return replace(self, mass=np.stack(masses), inferences=np.stack([rows, calls], axis=1).astype(np.int64))
 
     @classmethod
     def none_yet(cls, questions: Sequence["Question"], conditions: Sequence["Condition"]) -> "Replayed":
@@ -145,6 +169,7 @@ class Replayed:
 def replay(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
     """Play every condition on every question; the first one is the plain one."""
     found = Replayed.none_yet(questions, conditions)
+    noted: list[Noted] = []
     for column, question in enumerate(questions):
         turn = Turn(bench, question)
         plain = conditions[0].play(turn).chunk
@@ -155,4 +180,5 @@ def replay(bench: Bench, questions: Sequence[Question], conditions: Sequence[Con
             found.changed[number, column] = float(np.abs(played.chunk - plain).max())
             if played.ledger is not None:
                 found.ledger[number, column] = played.ledger.row()
-    return found
+            noted += [] if played.mass is None else [(question.row, 0, played.mass)]
+    return found.with_mass(noted)

@@ -1,8 +1,10 @@
 """What an intervention did: a table, the verdicts, and the ways to write them down."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError
@@ -19,11 +21,13 @@ from probe_kit.intervene.stored import (
     NOISE,
     PICTURES,
     READABLE,
+    WEIGHED,
     Answers,
     Stored,
     find_stored,
 )
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
+from probe_kit.intervene.weighed import Weighed
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
 
@@ -45,7 +49,7 @@ class Effects:
     """One intervention: what was asked, what it gave, and what that means.
 
     key: name of its folder. label: of the run. settings, certificate: as stored. verdicts: by category, from this
-    and what else is stored with the run.
+    and what else is stored with the run. attention: what was weighed, of the kind `attention` only.
     """
 
     key: str
@@ -55,6 +59,7 @@ class Effects:
     settings: dict[str, Any]
     certificate: dict[str, Any]
     answers: Answers = field(repr=False)
+    attention: Weighed | None = field(default=None, repr=False)
     verdicts: dict[str, Judgement] = field(default_factory=dict)
 
     @property
@@ -91,12 +96,14 @@ class Effects:
     @property
     def table(self) -> "pd.DataFrame":
         """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`, of
-        `Erasing` or, in a closed loop, of `CarriedOut`.
+        `Erasing` or, in a closed loop, of `CarriedOut`; or per block, iteration, head and role, of `Attending`.
         """
         if self.answers.outcomes is not None:
             return frame_of(self.carried_out)
         if self.kind == ERASE:
             return frame_of(self.erased)
+        if self.attention is not None:
+            return self.attention.frame()
         if self.kind == WORDS:
             return words_frame(self.answers, self.suite, self.key)
         if self.kind != FOLLOW:
@@ -117,6 +124,7 @@ class Effects:
             *self._large_doses(),
             *self._broken_hands(),
             *self._less_than_exchanging(),
+            *self._no_cause(),
         )
 
     def _passed_over(self) -> list[str]:
@@ -124,7 +132,17 @@ class Effects:
         left_out = counts["asked"] - counts["played"]
         return [f"{left_out} of {counts['asked']} items have no twin and were passed over."] if left_out else []
 
+    def _no_cause(self) -> list[str]:
+        if self.attention is None:
+            return []
+        return [
+            "Attention weighs, and is no cause: what is weighed need not be used. It enters no verdict; what is "
+            "read says an exchange (--kind interchange --sites memory.*)."
+        ]
+
     def _one_step(self) -> list[str]:
+        if self.attention is not None:
+            return []
         is_shadow = self.certificate.get("supported", {}).get("readout") == "shadow"
         if self.settings.get("readout") == SHADOW:
             return [
@@ -213,6 +231,10 @@ class Effects:
             from probe_kit.intervene.erased_table import erased_table
 
             return erased_table(self.erased, of)
+        if self.attention is not None:
+            from probe_kit.intervene.weighed_table import weighed_table
+
+            return weighed_table(self.attention, self.suite, of)
         if self.kind == WORDS:
             return words_table(self.rows, sensitivity(self.answers), of)
         if self.kind != FOLLOW:
@@ -238,6 +260,7 @@ def effects_of(run: RunReader, stored: Stored) -> Effects:
         settings=dict(stored.settings),
         certificate=stored.certificate(),
         answers=stored.answers(),
+        attention=Weighed.of(stored),
         verdicts=verdicts_of(run),
     )
 
@@ -251,8 +274,19 @@ def verdicts_of(run: RunReader) -> dict[str, Judgement]:
     return judgements(stored_following(run), encoded_in(results), stored_places(run))
 
 
-def effects_csv(answers: Answers, suite: str, toward: str = EXCHANGED, kind: str = "") -> str:
-    """As stored beside the answers, without verdicts, which later probes may change."""
+def effects_csv(
+    answers: Answers,
+    suite: str,
+    toward: str = EXCHANGED,
+    kind: str = "",
+    further: Mapping[str, bytes] = MappingProxyType({}),
+) -> str:
+    """As stored beside the answers, without verdicts, which later probes may change.
+
+    further: what else is stored, by the file's name.
+    """
+    if WEIGHED in further:
+        return Weighed.from_bytes(further[WEIGHED]).frame().to_csv(index=False)
     if kind == ERASE:
         # What probes read stands in the certificate.
         frame = frame_of(erased(answers, suite))

@@ -17,7 +17,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench
-from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Turn
+from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Replayed, Turn
 from probe_kit.intervene.directions import FOLDS
 from probe_kit.intervene.gathered import Gathered, gather
 from probe_kit.intervene.patching import Kept, Where, patched
@@ -89,8 +89,9 @@ class Erase(Intervention):
             raise UsageError(f"no token of {', '.join(found)} plays {', '.join(self.roles)}")
         return conditions
 
-    def told(self, conditions: Sequence[Condition]) -> dict[str, Any]:
+    def told(self, conditions: Sequence[Condition], found: Replayed) -> dict[str, Any]:
         """How well a fresh probe reads the answer behind each condition, by category."""
+        del found
         return {READABLE: {one.name: dict(one.readable) for one in conditions if isinstance(one, Erased)}}
 
     def _of(self, place: Place, role: str, gathered: Mapping[str, Gathered]) -> list[Condition]:

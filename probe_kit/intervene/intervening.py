@@ -84,11 +84,12 @@ def _carry_out(
             "items": {"asked": len(wanted), "played": len(items)},
             "supported": bench.policy.interventions.to_json(),
             "edits": _ledgers(conditions, parts),
-            **asked.told(conditions),
+            **asked.told(conditions, parts),
         }
     answers = answers_of(run, [condition.name for condition in conditions], parts)
-    effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)), asked.kind)
-    save(run.location, settings, key, answers, effects, certificate)
+    further = asked.files(run, conditions, parts)
+    effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)), asked.kind, further)
+    save(run.location, settings, key, answers, effects, certificate, further)
     pieces.discard()
 
 

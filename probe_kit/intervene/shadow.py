@@ -15,19 +15,23 @@ from probe_kit.extract.play.stage import Answer, Ending
 from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench, Chunk, Question
-from probe_kit.intervene.conditions import Condition, Replayed, Turn
+from probe_kit.intervene.conditions import Condition, Noted, Replayed, Turn
 from probe_kit.intervene.patching import Ledger
 from probe_kit.intervene.playing import Carried, apart_from_stored, check_alike, executed, planned_of
 
 
 @dataclass(frozen=True)
 class _Evaluated:
-    """K conditions along one episode. lateral, changed: (K,). ledger: (K, 5). plain: how the episode went."""
+    """K conditions along one episode. lateral, changed: (K,). ledger: (K, 5). plain: how the episode went.
+
+    noted: what attention was asked for, a call each.
+    """
 
     lateral: NDArray[np.float64]
     changed: NDArray[np.float64]
     ledger: NDArray[np.float64]
     plain: Carried
+    noted: list[Noted]
 
 
 def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
@@ -38,12 +42,14 @@ def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[C
     state beside exchanged pictures goes its own way.
     """
     found = Replayed.none_yet(questions, conditions)
+    noted: list[Noted] = []
     for column, question in enumerate(questions):
         own = _evaluated(bench, question, conditions)
         found.apart[column] = apart_from_stored(bench, question, own.plain)
         found.lateral[:, column], found.changed[:, column] = own.lateral, own.changed
         found.ledger[:, column] = own.ledger
-    return found
+        noted += own.noted
+    return found.with_mass(noted)
 
 
 def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]) -> _Evaluated:
@@ -55,6 +61,7 @@ def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]
     lateral = np.full(len(conditions), bench.across(seen.state[:2].astype(np.float64)))
     changed, past = np.zeros(len(conditions)), list[Chunk]()
     ledgers: list[list[Ledger]] = [[] for _ in conditions]
+    noted: list[Noted] = []
     for call in count():
         assert isinstance(seen, Observation)
         assert isinstance(other, Observation)
@@ -66,6 +73,7 @@ def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]
             lateral[number] += _added(bench, executed(bench, [*past, played.chunk]), seen)
             changed[number] = max(changed[number], float(np.abs(played.chunk - plain.chunk).max()))
             ledgers[number] += [] if played.ledger is None else [played.ledger]
+            noted += [] if played.mass is None else [(question.row, call, played.mass)]
         past.append(plain.chunk)
         actions = executed(bench, past)
         seen, other = own.advance(actions), beside.advance(actions)
@@ -77,7 +85,7 @@ def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]
     where = float(seen.outcome["cube_x"]), float(seen.outcome["cube_y"])
     carried = Carried(str(seen.outcome["outcome"]), where, seen.trajectory, Ledger.sum(ledgers[0]))
     rows = np.array([Ledger.sum(one).row() for one in ledgers])
-    return _Evaluated(lateral, changed, rows, carried)
+    return _Evaluated(lateral, changed, rows, carried, noted)
 
 
 def _added(bench: Bench, actions: Chunk, seen: Observation) -> float:

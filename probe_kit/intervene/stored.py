@@ -3,6 +3,7 @@
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
 episodes.npz       per condition and episode where the action would go, and how far it changed
 effects.csv        the same in numbers per category, for people and other programs
+attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
 certificate.json   what was loaded, and what was checked
 """
 
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import BytesIO
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,9 @@ PICTURES, NOISE = "pictures", "noise"
 """Of `words`, where the words are what is exchanged: the pictures instead, and only the noise drawn anew."""
 ERASE, READABLE = "erase", "readable"
 """A kind, and what its certificate calls what probes read behind its conditions."""
-UNCHANGED = frozenset({PLAIN, EXCHANGED, PICTURES, NOISE})
+ATTENTION, NOTED, WEIGHED = "attention", "noted", "attention.npz"
+"""A kind, its condition in which somebody notes the weights, and the file in which they are."""
+UNCHANGED = frozenset({PLAIN, EXCHANGED, PICTURES, NOISE, NOTED})
 """Conditions in which nothing inside the network is changed."""
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
 
@@ -140,12 +144,15 @@ def save(
     answers: Answers,
     effects: str,
     certificate: Mapping[str, Any],
+    further: Mapping[str, bytes] = MappingProxyType({}),
 ) -> None:
-    """Write `interventions/<key>/`, all or nothing; what is there is kept."""
+    """Write `interventions/<key>/`, all or nothing; what is there is kept. further: other files, by name."""
     if is_stored(run, key):
         tidy_bundle(run, INTERVENTIONS, key)
         return
-    files = {EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate)}
+    files = {
+        EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
+    }  # fmt: skip
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings), "created": now}, files)
 

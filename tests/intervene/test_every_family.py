@@ -15,6 +15,7 @@ from probe_kit.errors import UnsupportedInterventionError
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks.registry import find_family, known_families
 from probe_kit.intervene import (
+    Attention,
     ClosedLoop,
     Effects,
     Erase,
@@ -98,7 +99,7 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     return copy
 
 
-def asked_of(run: Run, kind: str) -> Follow | Words | Interchange | Steer | Erase | ClosedLoop:
+def asked_of(run: Run, kind: str) -> Attention | Follow | Words | Interchange | Steer | Erase | ClosedLoop:
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}"
     acting = next(stream for stream in run.streams.values() if stream.part == "action")
     late = f"{acting.name}.01@0-{(acting.iterations or 1) - 1}"
@@ -117,13 +118,28 @@ def asked_of(run: Run, kind: str) -> Follow | Words | Interchange | Steer | Eras
         "tiles": lambda: Interchange(**COMMON, sites=("backbone.00",), roles=("image.left", "image.right")),
         "steer": lambda: Steer(**COMMON, sites=("backbone.01",), role="image", doses=(2.0,), controls=1),
         "erase": lambda: Erase(**COMMON, sites=("backbone.01",), controls=1),
+        "attention": lambda: Attention(**COMMON | {"items": 2}),
+        "attention-shadow": lambda: Attention(**COMMON | {"items": 1}, readout="shadow"),
         "closed-loop": lambda: ClosedLoop(**COMMON | {"items": 2}, cells=("backbone.00|all", "backbone.01|image")),
     }[kind]()
 
 
 @pytest.mark.parametrize(
     "kind",
-    ["follow", "words", "interchange", "direction", "memory", "tiles", "shadow", "steer", "erase", "closed-loop"],
+    [
+        "follow",
+        "words",
+        "interchange",
+        "direction",
+        "memory",
+        "tiles",
+        "shadow",
+        "steer",
+        "erase",
+        "attention",
+        "attention-shadow",
+        "closed-loop",
+    ],
 )
 def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, Source], kind: str) -> None:
     run, source = made

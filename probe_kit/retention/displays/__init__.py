@@ -4,6 +4,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 `gallery` makes all figures that fit a table of runs.
 """
 
+from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.displays.causal_curve import CausalCurveDisplay, causal_curve
 from probe_kit.retention.displays.certificate import Certificate
@@ -27,6 +28,7 @@ from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_cur
 from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_side_by_side
 
 __all__ = [
+    "AttentionDisplay",
     "CallCurveDisplay",
     "CausalCurveDisplay",
     "Certificate",
@@ -46,6 +48,7 @@ __all__ = [
     "SideTableDisplay",
     "SuccessTableDisplay",
     "aligned_curves",
+    "attention_curve",
     "call_curves",
     "causal_curve",
     "curves_side_by_side",

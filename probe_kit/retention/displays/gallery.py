@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.intervene.passing import stored_passing, stored_steering
+from probe_kit.intervene.weighed import stored_attention
 from probe_kit.retention.call_curves import CallCurves, event_calls
 from probe_kit.retention.cells import model_name
+from probe_kit.retention.displays.attention import attention_curve
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
 from probe_kit.retention.displays.causal_curve import causal_curve
 from probe_kit.retention.displays.dose_response import dose_response
@@ -98,7 +100,7 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
             exhibits += _of_probes(name, position, probed, table.iterations)
             exhibits += _of_calls(name, position, run, probed)
             exhibits += _of_causes(name, position, run, probed)
-        exhibits += _of_steering(name, position, run)
+        exhibits += [*_of_steering(name, position, run), *_of_attention(name, position, run)]
     return exhibits
 
 
@@ -331,6 +333,21 @@ def _of_steering(name: str, position: int, run: RunReader) -> list[Exhibit]:
             "direction is added; filled: beyond random directions of the same norm (the band). One side may be "
             "saturated, and beyond about two norms of the tokens any direction breaks the hand.",
             position, partial(dose_response, run),
+        )
+    ]  # fmt: skip
+
+
+def _of_attention(name: str, position: int, run: RunReader) -> list[Exhibit]:
+    """Only where attention is stored with the run."""
+    if not stored_attention(run):
+        return []
+    return [
+        Exhibit(
+            f"{name}-attention", "What is weighed", "interventions",
+            "How much of the attention that what acts pays lies on the pictures, the words and its own tokens, by "
+            "the block whose keys are read. Dots: single heads; bars: from the least to the most of any "
+            "iteration. It describes and is no cause: what is weighed need not be used, and it enters no verdict.",
+            position, partial(attention_curve, run),
         )
     ]  # fmt: skip
 

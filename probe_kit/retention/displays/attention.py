@@ -1,0 +1,126 @@
+"""What is weighed: by block, how much attention what acts pays to the pictures, the words and itself."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene.places import ALL, TILE_ROLES
+from probe_kit.intervene.weighed import CORRECT, OTHER, Axis, Weighed, stored_attention
+from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.showing import Shown
+from probe_kit.retention.displays.style import (
+    axes_for,
+    caption,
+    layer_axis,
+    legend_above,
+    panels,
+    plain,
+    series,
+    spell,
+)
+from probe_kit.train.reader import RunReader
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Percent = NDArray[np.float64]
+_LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", "own": "its own tokens"}
+
+
+@dataclass
+class AttentionDisplay(Shown):
+    """By block of the backbone, the share of attention in percent that lies on one role's tokens.
+
+    blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
+    iterations, heads and inferences. iterations: (R, B, I) over heads and inferences. heads: (R, B, H) over
+    iterations and inferences. It describes: what is weighed need not be used, and enters no verdict.
+    """
+
+    category: str
+    blocks: NDArray[np.int64]
+    roles: tuple[str, ...]
+    mean: Percent
+    iterations: Percent
+    heads: Percent
+    certificate: Certificate
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_run(cls, run: RunReader, category: str) -> Self:
+        """From the newest attention that is stored of a category. Raises NoInterventionsError if there is none."""
+        found = stored_attention(run).get(category)
+        if found is None:
+            raise NoInterventionsError(
+                f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
+                "--kind attention`"
+            )
+        return cls._of(found, category, Certificate.of_run(run))
+
+    @classmethod
+    def _of(cls, weighed: Weighed, category: str, certificate: Certificate) -> Self:
+        left_out = {ALL, "special", *TILE_ROLES}
+        blocks = np.unique(weighed.frame(("block",))["block"].to_numpy(np.int64))
+        roles = tuple(role for role in weighed.shares() if role not in left_out)
+
+        def shares(*by: Axis) -> Percent:
+            frame = weighed.frame(("block", *by))
+            table = frame.pivot_table(index=["role", "block"], columns=list(by) or None, values="share")
+            return 100 * np.stack([table.loc[role].loc[blocks].to_numpy(float) for role in roles])
+
+        return cls(
+            category=category,
+            blocks=blocks,
+            roles=roles,
+            mean=shares()[..., 0],
+            iterations=shares("iteration"),
+            heads=shares("head"),
+            certificate=certificate,
+        )
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        axes, figure = axes_for(ax, 6.2, 3.9)
+        for position, role in enumerate(self.roles):
+            line, x = series(position), self.blocks + 0.06 * (position - len(self.roles) / 2)
+            reach = np.nanmin(self.iterations[position], axis=1), np.nanmax(self.iterations[position], axis=1)
+            axes.vlines(x, *reach, color=line.colour, lw=3, alpha=0.25)
+            axes.plot(
+                np.repeat(x, self.heads.shape[2]), self.heads[position].ravel(), ls="none", marker=".", ms=2.5,
+                color=line.colour, alpha=0.6,
+            )  # fmt: skip
+            axes.plot(
+                x, self.mean[position], color=line.colour, ls=line.dash, marker=line.marker, ms=5, mfc="white",
+                lw=1.4, label=_LABELS.get(role, role),
+            )  # fmt: skip
+        plain(axes)
+        layer_axis(axes, int(self.blocks.max()) + 1, label=False)
+        axes.set_xlabel("block whose keys are read", fontsize=8.5)
+        axes.set_ylim(bottom=0)
+        axes.set_title(spell(self.category), fontsize=10, loc="left")
+        if figure is not None:
+            axes.set_ylabel("% of attention", fontsize=9)
+            legend_above(figure, axes.get_legend_handles_labels()[0])
+        caption(figure, self.certificate)
+        self.ax_ = axes
+        return self
+
+
+def attention_curve(run: RunReader) -> "Figure":
+    """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
+    displays = [
+        AttentionDisplay._of(weighed, category, Certificate.of_run(run))
+        for category, weighed in stored_attention(run).items()
+    ]
+    if not displays:
+        AttentionDisplay.from_run(run, "any")
+    figure, grid = panels(len(displays))
+    for display, axes in zip(displays, grid, strict=True):
+        display.plot(axes)
+    figure.supylabel("% of attention (describes, no cause)", fontsize=9)
+    caption(figure, displays[0].certificate)
+    legend_above(figure, grid[0].get_legend_handles_labels()[0])
+    return figure

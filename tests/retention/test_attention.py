@@ -1,0 +1,72 @@
+"""What is weighed: what the figure shows is what is stored."""
+
+from collections.abc import Callable
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene import Weighed
+from probe_kit.intervene.effects import effects_csv
+from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.intervene.stored import WEIGHED, save
+from probe_kit.retention import retention
+from probe_kit.retention.displays import AttentionDisplay, attention_curve, gallery
+from probe_kit.train import ArrayRun
+from tests.intervene.answers import answers_of, follower
+
+mpl.use("agg")
+ROLES = ("all", "image", "image.left", "image.right", "language")
+
+
+@pytest.fixture
+def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
+    return probed_run({"color": ([0.5, 0.9], [[0.7]])})
+
+
+def noted(run: ArrayRun) -> Weighed:
+    """Four inferences, three blocks of which one is not read, two iterations, two heads."""
+    draw = np.random.default_rng(0)
+    mass = draw.uniform(0, 0.2, (4, 3, 2, 2, len(ROLES))).astype(np.float32)
+    mass[..., 0] = mass[..., 1] + mass[..., 4]
+    mass[:, 1] = np.nan
+    names = np.array(["a", "b", "c", "d"])
+    sides = np.array(["left", "right"] * 2)
+    weighed = Weighed(ROLES, names, names, np.array(["color"] * 4), sides, np.zeros(4, int), mass)
+    answers = answers_of({"color": follower(4)})
+    settings = {
+        "format": FORMAT, "kind": "attention", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": ["color"],
+    }  # fmt: skip
+    check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
+    further = {WEIGHED: weighed.to_bytes()}
+    written = effects_csv(answers, run.suite, kind="attention", further=further)
+    save(run.location, settings, key_of(settings), answers, written, check, further)
+    return weighed
+
+
+def test_it_shows_means_by_block_and_how_heads_and_iterations_differ(run: ArrayRun) -> None:
+    weighed = noted(run)
+    display = AttentionDisplay.from_run(run, "color").plot()
+    assert display.blocks.tolist() == [0, 2]
+    assert display.roles == ("image", "language", "image.correct", "image.other", "own")
+    assert (display.iterations.shape, display.heads.shape) == ((5, 2, 2), (5, 2, 2))
+    shares = weighed.shares()
+    for row, role in enumerate(display.roles):
+        np.testing.assert_allclose(display.mean[row], 100 * shares[role][:, [0, 2]].mean(axis=(0, 2, 3)))
+        np.testing.assert_allclose(display.iterations[row], 100 * shares[role][:, [0, 2]].mean(axis=(0, 3)))
+        np.testing.assert_allclose(display.heads[row], 100 * shares[role][:, [0, 2]].mean(axis=(0, 2)))
+    assert display.ax_ is not None
+    labels = {line.get_label() for line in display.ax_.get_lines()}
+    assert {"correct picture's tile", "other picture's tile", "its own tokens", "language"} <= labels
+    assert len(attention_curve(run).axes) == 1
+    (shown,) = (one for one in gallery([run], retention([run])) if one.name.endswith("attention"))
+    assert "no verdict" in shown.reading
+
+
+def test_without_attention_there_is_no_such_figure(run: ArrayRun) -> None:
+    for draw in (lambda: attention_curve(run), lambda: AttentionDisplay.from_run(run, "color")):
+        with pytest.raises(NoInterventionsError, match="--kind attention"):
+            draw()
+    assert not any(one.name.endswith("attention") for one in gallery([run], retention([run])))
