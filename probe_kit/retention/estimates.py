@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
 from probe_kit.retention.crossfit import Crossfit
-from probe_kit.retention.measure import Peak, Retention
+from probe_kit.retention.measure import Peak, Retention, backbone_is_known
 from probe_kit.retention.success import shares_of, units_of
 from probe_kit.statistics.bootstrap import (
     GAINS,
@@ -118,12 +118,15 @@ def probe_estimates(
 
 
 def retention_draws(fit: Crossfit, chance: float, units: int) -> NDArray[np.float64]:
-    """Debiased retention in every draw of groups. NaN where the backbone is not above chance.
+    """Retention in every draw of groups. NaN where the backbone is not above chance, and in every draw where its
+    score is not known well enough to divide by.
 
     Groups are drawn with the chosen sites given, so that runs on the same groups stay paired. What choosing adds
     to the covariance is drawn on top, for every run on its own.
     """
     times = draw_groups(fit.sizes.size, units)
+    if not backbone_is_known(fit):
+        return np.full(len(times), np.nan)
     scored = (times @ fit.held_out.T / (times @ fit.sizes)[:, None]).T - chance
     own = np.random.default_rng(derive_seed("choosing", units, fit.held_out.tobytes().hex()))
     expert, backbone = scored + _root(fit.covariance - fit.scoring) @ own.standard_normal(scored.shape)

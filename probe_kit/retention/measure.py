@@ -4,7 +4,7 @@ That is the action expert or, in a policy without one, the positions that choose
 """
 
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan, sqrt
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,13 @@ Iterations = Literal["all", "best", "last"] | int
 
 Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
 curve draws a line for each of `all`, and one line for the `best` of every layer.
+"""
+
+LEAST_KNOWN = 0.25
+"""Share of the backbone's score above chance that the lower end of its 95 % interval must reach.
+
+A score that may be a quarter of what it seems makes the upper limit of the ratio four times as large; a limit
+beyond that says how near the interval comes to chance, and nothing of the expert.
 """
 
 
@@ -124,9 +131,20 @@ def measure_retention(
 
 
 def retention_interval(fit: Crossfit) -> Interval:
-    """95 % Fieller interval of the ratio of the two scores."""
-    degrees = min(fit.sizes.size - 1, HALVINGS)  # a variance is no better known than by the halvings it is from
-    return fieller_interval(fit.expert, fit.backbone, fit.covariance, _t_quantile(degrees))
+    """95 % Fieller interval of the ratio of the two scores; without limits unless `backbone_is_known`."""
+    if not backbone_is_known(fit):
+        return Interval(-inf, inf)
+    return fieller_interval(fit.expert, fit.backbone, fit.covariance, _t_quantile(_degrees(fit)))
+
+
+def backbone_is_known(fit: Crossfit) -> bool:
+    """Whether the backbone's score above chance is known well enough to divide by it; see LEAST_KNOWN."""
+    low = fit.backbone - _t_quantile(_degrees(fit)) * sqrt(fit.covariance[1, 1])
+    return fit.backbone > 0 and low >= LEAST_KNOWN * fit.backbone
+
+
+def _degrees(fit: Crossfit) -> int:
+    return min(fit.sizes.size - 1, HALVINGS)  # a variance is no better known than by the halvings it is from
 
 
 def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]:

@@ -5,12 +5,22 @@ from dataclasses import asdict, replace
 from itertools import product
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.special import stdtrit
 
-from probe_kit.retention import Difference, RetentionRow, RetentionTable, layer_curve, retention
+from probe_kit.retention import (
+    Difference,
+    RetentionRow,
+    RetentionTable,
+    layer_curve,
+    measure_retention,
+    retention,
+)
 from probe_kit.retention.displays import LayerCurveDisplay
+from probe_kit.retention.estimates import average, probe_estimates
 from probe_kit.statistics.bootstrap import GAINS, SHARES, group_bootstrap, unseen
-from probe_kit.train import ArrayRun, load_results
+from probe_kit.train import ArrayRun, Curve, load_results
 from probe_kit.train.add_controls import add_twin
 
 ProbedRun = Callable[..., ArrayRun]
@@ -130,3 +140,44 @@ def test_a_band_of_few_relabellings_is_not_drawn(probed_run: ProbedRun) -> None:
     few = {place: replace(curve, null=curve.null[:, :5]) for place, curve in results.curves.items()}
     assert LayerCurveDisplay.from_results(replace(results, curves=few), "color").null_band is None
     layer_curve(replace(results, curves=few))
+
+
+@pytest.mark.parametrize(("backbone", "expert"), [(1.0, 1.0), (0.95, 0.75), (0.8, 0.6)])
+@pytest.mark.parametrize("items", [3, 6, 8, 30])
+def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
+    curve_of: Callable[..., Curve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
+    expert: float,
+) -> None:  # fmt: skip
+    curve = curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]])
+    found = measure_retention(curve)
+    assert found is not None
+    drawn = probe_estimates(curve, {}, found, "suite")
+    for kind, interval, fit in (
+        ("debiased", found.interval, found.fit),
+        ("bounded", found.bounded_interval, found.bounded_fit),
+        ("area", found.area_interval, found.area_fit),
+    ):
+        quantile = stdtrit(min(items - 1, 100), 0.975)
+        known = fit.backbone - quantile * fit.covariance[1, 1] ** 0.5 >= fit.backbone / 4 > 0
+        assert interval.bounded == known, kind
+        assert (drawn[f"retention_{kind}"].ci == (None, None)) >= (not known), kind
+        if known:  # four times what the expert alone would allow at the most
+            most = fit.expert + quantile * fit.covariance[0, 0] ** 0.5
+            assert interval.high <= 4 * most / fit.backbone, kind
+        halved = replace(drawn[f"retention_{kind}"], value=0.5)
+        assert ((halved - drawn[f"retention_{kind}"]).ci == (None, None)) >= (not known), kind
+
+
+def test_six_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_mean_and_difference_with_them(
+    curve_of: Callable[..., Curve], outcome_table: Callable[..., pd.DataFrame]
+) -> None:
+    few, many = (curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]) for items in (6, 60))
+    scores = [measure_retention(one) for one in (few, many)]
+    estimates = [probe_estimates(one, {}, score, "suite") for one, score in zip((few, many), scores, strict=True)]
+    assert [score.bounded_interval.bounded for score in scores if score] == [False, True]
+    for name in (f"retention_{kind}" for kind in ("debiased", "bounded", "area")):
+        here, there = (found[name] for found in estimates)
+        assert here.value == there.value == 1
+        assert there.ci != (None, None)
+        for unclear in (here, here - there, there - here, average([here, there]), average([here, there]).centred):
+            assert unclear.ci == (None, None), name

@@ -101,7 +101,8 @@ GLOSSARY = MappingProxyType(
         ),
         "debiased": (
             "The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
-            "interval; “unbounded” means that the backbone's signal is too weak for any ratio."
+            "interval; “unbounded” means that with so few groups of questions the backbone's score above chance "
+            "may be a quarter of what it seems, or nothing: too little to divide by."
         ),
         "gap": "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
         "groups": "Independent groups of questions; questions that share a picture count once.",
