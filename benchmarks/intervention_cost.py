@@ -1,10 +1,11 @@
 """What changing streams costs: one inference plain, with one site changed, and with all of them.
 
-    python benchmarks/intervention_cost.py [--repeats 40] [--device cpu]
+    python benchmarks/intervention_cost.py [--pairs 200] [--device cpu]
 
-The embedded policy, one observation, one process, ways in an order drawn for every repeat; prints the median
-processor time of each way, and its ratio to the plain one: of medians, of lower fifths (what neighbours on the
-machine disturb least), and the median of pairs. How far the second plain way is from 1 is the noise. Changes take
+The embedded policy, one observation, one process. Every pair is a plain inference and a changed one, in drawn
+order, one directly behind the other, so that neighbours on the machine disturb both alike. Prints, per way, the
+median of the pairs' ratios of processor time with its 95 % bootstrap interval, and of the times themselves the
+ratio of medians and of lower fifths. The second plain way says what the measurement itself adds. Changes take
 tokens over from an inference before another picture, ledger included.
 """
 
@@ -12,7 +13,7 @@ import argparse
 import random
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -33,12 +34,15 @@ def observations() -> tuple[Observation, Observation]:
 def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     """By name, what is timed."""
     seen, other = observations()
-    backbone = policy.streams["backbone"].sites()
-    with capture(policy, backbone) as donor:
+    backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
+    acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
+    with capture(policy, [*backbone, *acting]) as donor:
         policy.act([other], [0])
-    mask = policy.roles([seen])["backbone"][0].valid
+    roles = policy.roles([seen])
 
     def changed(sites: list[Site]) -> Callable[[], object]:
+        mask = roles[sites[0].stream][0].valid
+
         def run() -> object:
             with patched(policy, sites, mask, Replaced(donor, mask.size)) as ledger:
                 policy.act([seen], [0])
@@ -52,35 +56,55 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
         "plain again": lambda: policy.act([seen], [0]),
         "one backbone site": changed(backbone[2:3]),
         f"all {len(backbone)} backbone sites": changed(backbone),
+        f"expert's end, {len(acting)} iterations": changed(acting),
     }
 
 
 def main() -> None:
-    """Time every way in turn."""
+    """Time every way against plain."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=40)
+    parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     policy = load_policy("pi0-tiny", device=arguments.device)
     every, draw = ways(policy), random.Random(0)
-    times: dict[str, list[float]] = {name: [] for name in every}
-    for repeat in range(arguments.repeats + 2):
+    plain = every.pop("plain")
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in every}
+    for pair in range(arguments.pairs + 2):
         for name, run in draw.sample(list(every.items()), len(every)):
-            start = time.process_time()
-            run()
-            if repeat >= 2:  # the first two warm up
-                times[name].append(time.process_time() - start)
-    plain = times["plain"]
+            first = draw.random() < 0.5
+            before = timed(plain) if first else 0.0
+            own = timed(run)
+            other = before if first else timed(plain)
+            if pair >= 2:  # the first two warm up
+                times[name].append((own, other))
     for name, found in times.items():
-        paired = statistics.median(own / other for own, other in zip(found, plain, strict=True))
+        own, other = (sorted(column) for column in zip(*found, strict=True))
+        low, high = interval([changed / unchanged for changed, unchanged in found])
         print(
-            f"{name:26} {1000 * statistics.median(found):8.2f} ms  of plain: "
-            f"{statistics.median(found) / statistics.median(plain):6.3f} medians, "
-            f"{fifth(found) / fifth(plain):6.3f} lower fifths, {paired:6.3f} pairs"
+            f"{name:26} {1000 * statistics.median(own):8.2f} ms  of plain: "
+            f"{statistics.median(changed / unchanged for changed, unchanged in found):6.3f} "
+            f"[{low:.3f}, {high:.3f}] median of {len(found)} pairs, "
+            f"{statistics.median(own) / statistics.median(other):6.3f} medians, "
+            f"{fifth(own) / fifth(other):6.3f} lower fifths"
         )
 
 
-def fifth(times: list[float]) -> float:
+def timed(run: Callable[[], object]) -> float:
+    """Seconds of processor time."""
+    start = time.process_time()
+    run()
+    return time.process_time() - start
+
+
+def interval(ratios: Sequence[float]) -> tuple[float, float]:
+    """95 % bootstrap interval of their median."""
+    draws = np.random.default_rng(0).choice(np.array(ratios), (2000, len(ratios)))
+    low, high = np.quantile(np.median(draws, axis=1), (0.025, 0.975))
+    return float(low), float(high)
+
+
+def fifth(times: Sequence[float]) -> float:
     """What a fifth of them stay below."""
     return sorted(times)[len(times) // 5]
 

@@ -172,7 +172,7 @@ class Model(ABC):
         """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
         every = self.every_stream()
         stream = every.get(site.stream)
-        if stream is None or site.quantity not in stream.quantities or site not in stream.sites(site.quantity):
+        if stream is None or not stream.holds(site):
             there = "; ".join(
                 f"{own.name}: {own.layers} layers"
                 + (f" x {own.iterations} iterations" if own.iterations else "")

@@ -1,7 +1,7 @@
 """Sites: the names under which activations are captured, stored, probed and plotted. Imports no torch."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -113,10 +113,22 @@ class Stream:
             raise UnknownSiteError(
                 f"the stream {self.name} has no quantity {quantity!r}; it has {', '.join(self.quantities)}"
             )
+        return [
+            Site(self.name, layer, quantity, step) for step in self._steps for layer in self._layers_of(quantity)
+        ]
+
+    def holds(self, site: Site) -> bool:
+        """Whether `site` is one of its `sites`; none are listed for it, as it is asked at every edit."""
+        named = (site.stream, site.quantity in self.quantities) == (self.name, True)
+        return named and site.iteration in self._steps and site.layer in self._layers_of(site.quantity)
+
+    @property
+    def _steps(self) -> "Sequence[int | None]":
+        return (None,) if self.iterations is None else range(self.iterations)
+
+    def _layers_of(self, quantity: str) -> range:
         once = {"residual": range(self.layers), "final_norm": range(self.layers - 1, self.layers)}
-        layers = once.get(quantity, range(self.layers - 1))
-        steps: list[int | None] = [None] if self.iterations is None else list(range(self.iterations))
-        return [Site(self.name, layer, quantity, step) for step in steps for layer in layers]
+        return once.get(quantity, range(self.layers - 1))
 
 
 def memory_stream(blocks: int, width: int) -> Stream:

@@ -131,7 +131,7 @@ def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], ch
     The ledger is complete when the context is left. Raises CaptureError for another number of tokens, and what
     `hooks.edit` raises, such as for a site that fires another number of times than its tap promises.
     """
-    from probe_kit.hooks import edit
+    from probe_kit.hooks.capture_context import edit
 
     ledger, norms = Ledger(), _Norms()
     where = _positions(mask, policy.card.device)

@@ -15,6 +15,20 @@ def test_another_form_is_refused(name: str) -> None:
         Site.parse(name)
 
 
+@pytest.mark.parametrize("iterations", [None, 3])
+def test_a_stream_holds_the_sites_that_it_lists_and_no_other(iterations: int | None) -> None:
+    stream = Stream(
+        "expert", layers=3, width=8, iterations=iterations, quantities=("residual", "mlp", "final_norm")
+    )
+    every = {site for quantity in stream.quantities for site in stream.sites(quantity)}
+    for name in ("expert", "backbone"):
+        for layer in range(-1, 5):
+            for quantity in (*stream.quantities, "attention"):
+                for iteration in (None, -1, 0, 2, 3):
+                    site = Site(name, layer, quantity, iteration)
+                    assert stream.holds(site) == (site in every)
+
+
 def test_a_stream_lists_its_sites_by_iteration_then_layer() -> None:
     assert [str(site) for site in Stream("expert", layers=2, width=8, iterations=2).sites()] == [
         "expert.00.residual@0",

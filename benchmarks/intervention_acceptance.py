@@ -1,0 +1,236 @@
+"""What an intervention must find in the organisms: every property of the list, true or false.
+
+    python benchmarks/intervention_acceptance.py FOLDER [--seed 0] [--items 24] [--steps N] [--loop 4]
+
+Draws a suite of its own seed, has every organism of `probe_kit.organisms` act on it, fits probes, and intervenes.
+What is true of each is taken from there; places and layers from what is found. --steps plays shorter episodes:
+enough for all that is read off first actions, and the closed loop then repeats those. --loop: items per category
+that are played again. Finished work in FOLDER is reused. Exits with 1 if a property does not hold.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from probe_kit.errors import CaptureChangedActionError
+from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.intervene import (
+    ClosedLoop,
+    Effects,
+    Follow,
+    Interchange,
+    Passing,
+    Source,
+    Steer,
+    intervene_on,
+)
+from probe_kit.intervene.conditions import Intervention
+from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, verdict
+from probe_kit.retention import retention
+from probe_kit.suite import Suite, build_suite
+from probe_kit.train import train_probes
+
+ABSENT = "counting"
+"""A category of which nothing was trained."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """Whether one property holds, and what was seen."""
+
+    name: str
+    holds: bool
+    seen: str
+
+    def __str__(self) -> str:
+        return f"{'true ' if self.holds else 'FALSE'}  {self.name}: {self.seen}"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The trained organism's run, and what is true of it. used, unused: its categories."""
+
+    run: Run
+    source: Source
+    used: tuple[str, ...]
+    unused: tuple[str, ...]
+
+    def done(self, asked: Intervention) -> Effects:
+        """One intervention; a stored one is read back."""
+        return intervene_on(self.run, asked, self.source)
+
+
+def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, twin: Run | None) -> Run:
+    """The organism's episodes, probes and `follow`."""
+    settings = ExtractSettings(
+        organism.model, suite=suite.folder, random_weights=organism.random_weights, frames="none", env_workers=0
+    )
+    if steps is not None:
+        settings = replace(settings, scene=replace(settings.scene, max_steps=steps))
+    run = extract_run(settings, folder / organism.folder)
+    train_probes(run, permutations=100, controls=("binding",), suite=suite.folder, twin=twin)
+    intervene_on(run, Follow(), Source(suite.folder))
+    return run
+
+
+def verdicts(runs: Sequence[tuple[Organism, Run]]) -> Iterator[Property]:
+    """Every organism and category."""
+    for organism, run in runs:
+        for row in retention([run]).rows:
+            expected, found = organism.expected(row.category), verdict(row)
+            yield Property(f"verdict of {organism.name}, {row.category}", expected == found, found)
+
+
+def maps(trial: Trial, last: int) -> Iterator[Property]:
+    """Where the answer passes: the whole at the beginning, nothing at the end, nowhere what is not used."""
+    categories = (*trial.used, *trial.unused)
+    effects = trial.done(Interchange(categories=categories))
+    check = effects.certificate["replay"]
+    yield Property(
+        "plain inferences are the run's bit for bit", check["equal"] == check["compared"] > 0,
+        f"{check['equal']} of {check['compared']}",
+    )  # fmt: skip
+    end = f"backbone.{last:02d}"
+    for category in categories:
+        rows = {(row.place, row.role): row for row in effects.changes if row.category == category}
+        unread = rows[end, "all"]
+        yield Property(
+            f"{category}: {end} is read by nothing", unread.changed == 0 and unread.fires > unread.still == 0,
+            f"largest change {unread.changed:g}; {unread.fires} fires moved tokens {unread.norm_ratio:.2f} norms",
+        )  # fmt: skip
+        located = [row.name for row in rows.values() if row.is_located]
+        yield Property(
+            f"{category}: passes somewhere" if category in trial.used else f"{category}: passes nowhere",
+            bool(located) == (category in trial.used), ", ".join(located) or "nowhere",
+        )  # fmt: skip
+        if category in trial.used:
+            whole = rows["backbone.00", "all"].effect
+            yield Property(
+                f"{category}: all tokens of the first layer are the whole exchange",
+                whole is not None and abs(whole - 1) < 0.01, shown(whole),
+            )  # fmt: skip
+
+
+def last_located(trial: Trial) -> tuple[str, str] | None:
+    """The last place, and there the role with the largest effect, of what is located in every used category."""
+    effects = trial.done(Interchange(categories=(*trial.used, *trial.unused)))
+    everywhere: dict[tuple[str, str], list[float]] = {}
+    for row in effects.changes:
+        if row.category in trial.used and row.is_located and row.role != "all":
+            everywhere.setdefault((row.place, row.role), []).append(row.effect or 0.0)
+    found = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
+    return max(found, key=lambda name: (name[0], found[name]), default=None)
+
+
+def memories(trial: Trial) -> Iterator[Property]:
+    """One block is read, and the others are not."""
+    effects = trial.done(Interchange(categories=trial.used, sites=("memory.*",), roles=("all",)))
+    for category in trial.used:
+        found = {row.place: row.effect for row in effects.changes if row.category == category}
+        read = [place for place, effect in found.items() if effect is not None and effect >= 0.95]
+        rest = [effect for place, effect in found.items() if place not in read]
+        holds = len(read) == 1 and all(effect is not None and abs(effect) <= 0.05 for effect in rest)
+        yield Property(
+            f"{category}: the keys and values of one block carry ≥ .95, of the others ≤ .05", holds,
+            ", ".join(f"{place} {shown(effect)}" for place, effect in found.items()),
+        )  # fmt: skip
+
+
+def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
+    """Along one direction it passes, along a random one it does not; what is not used turns nothing."""
+    categories = (*trial.used, *trial.unused)
+    effects = trial.done(
+        Interchange(categories=categories, sites=(place,), roles=(role,), direction="mean-difference", controls=1)
+    )
+    steered = trial.done(Steer(categories=trial.used, sites=(place,), role=role, doses=(4.0,), controls=1))
+    for category in categories:
+        own, control = pair(effects.changes, category)
+        if category in trial.unused:
+            yield Property(
+                f"{category}: rank 1 at {place} {role} turns ≤ .1", abs(own.net) <= 0.1, f"turned {own.net:+.2f}"
+            )
+            continue
+        yield Property(
+            f"{category}: rank 1 along the mean difference at {place} {role} ≥ .8",
+            own.effect is not None and own.effect >= 0.8, shown(own.effect),
+        )  # fmt: skip
+        yield Property(
+            f"{category}: its random control ≤ .05",
+            control.effect is not None and abs(control.effect) <= 0.05, shown(control.effect),
+        )  # fmt: skip
+        _, orthogonal = pair([row for row in steered.changes if row.dose != "0"], category)
+        yield Property(
+            f"{category}: an orthogonal direction at dose 4 turns ≤ .05", abs(orthogonal.net) <= 0.05,
+            f"turned {orthogonal.net:+.2f}",
+        )  # fmt: skip
+
+
+def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
+    """Dose zero gives the run's own episodes again."""
+    asked = ClosedLoop(
+        categories=(*trial.used, *trial.unused), items=items, cells=(cell,), direction="none", controls=0
+    )
+    try:
+        effects = trial.done(asked)
+    except CaptureChangedActionError as error:
+        yield Property("closed loop, dose 0: the run's own outcomes", False, str(error))
+        return
+    check = effects.certificate["replay"]
+    yield Property(
+        "closed loop, dose 0: the run's own outcomes, and trajectories bit for bit",
+        check["outcomes_equal"] == check["episodes"] and check["equal"] == check["compared"],
+        f"{check['outcomes_equal']} of {check['episodes']}; {check['equal']} of {check['compared']}",
+    )
+
+
+def pair(rows: Sequence[Passing], category: str) -> tuple[Passing, Passing]:
+    """The change of one category along its direction, and along the random one beside it."""
+    own = [row for row in rows if row.category == category]
+    (first,), (second,) = ([row for row in own if row.is_control == control] for control in (False, True))
+    return first, second
+
+
+def shown(effect: float | None) -> str:
+    """A share of the whole exchange."""
+    return "n/a" if effect is None else f"{effect:.3f}"
+
+
+def main() -> int:
+    """Make what is missing, and say of every property whether it holds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=0, help="of the suite")
+    parser.add_argument("--items", type=int, default=24, help="per category")
+    parser.add_argument("--steps", type=int, help="of an episode; default the scene's own")
+    parser.add_argument("--loop", type=int, default=4, help="items per category of the closed loop; 0 for none")
+    arguments = parser.parse_args()
+    truth = dict(TRAINED.truth)
+    suite = build_suite(arguments.folder / "suite", [*truth, ABSENT], arguments.items, seed=arguments.seed)
+    twin = acted(RANDOM_TWIN, suite, arguments.folder, arguments.steps, None)
+    runs = [
+        (one, twin if one == RANDOM_TWIN else acted(one, suite, arguments.folder, arguments.steps, twin))
+        for one in ORGANISMS
+    ]
+    run = dict(runs)[TRAINED]
+    used, unused = (
+        tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "encoded, unused")
+    )
+    trial = Trial(run, Source(suite.folder), used, unused)
+    properties = list(maps(trial, run.streams["backbone"].layers - 1))
+    properties += memories(trial)
+    if (best := last_located(trial)) is not None:
+        properties += directions(trial, *best)
+        if arguments.loop:
+            properties += loops(trial, "|".join(best), arguments.loop)
+    properties = [*verdicts(runs), *properties]
+    weights = str(run.weights_sha256)[:12]
+    print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")
+    print(*properties, sep="\n")
+    failed = sum(not one.holds for one in properties)
+    print(f"{len(properties) - failed} of {len(properties)} hold")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
