@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True))
 """Roles by tile, and the tile."""
 IMAGE = "image"
+PATCHES = "patches"
+"""Under which a question remembers its own, which all tiles are held against."""
 ENOUGH = 0.1
 """Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
 
@@ -44,7 +46,9 @@ def role_mask(
     policy.interventions.check("tiles", policy.card.family)
     images = token_mask(policy, question.seen, stream, f"{IMAGE}.{policy.card.cameras[0]}")
     if role not in memo:
-        memo[role] = tokens_seeing(policy, question.seen, question.tiles[TILES[role]])
+        if PATCHES not in memo:
+            memo[PATCHES] = patches(policy, question.seen)
+        memo[role] = tokens_seeing(policy, question.seen, question.tiles[TILES[role]], memo[PATCHES])
     mask = np.zeros_like(images)
     mask[np.flatnonzero(images)[memo[role]]] = True
     if not mask.any():
@@ -52,13 +56,19 @@ def role_mask(
     return mask
 
 
-def tokens_seeing(policy: "Policy", seen: Observation, pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(tokens of the picture,) which of them come of patches that see any of some pixels (H, W)."""
+def tokens_seeing(
+    policy: "Policy", seen: Observation, pixels: NDArray[np.bool_], before: NDArray[np.float32] | None = None
+) -> NDArray[np.bool_]:
+    """(tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
+
+    before: what `patches` gives of `seen`, where somebody has it.
+    """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)
     # Every pixel changes by at least half of what it can.
     turned = np.where(pixels[..., None], np.where(seen.image < 128, 255, 0), seen.image).astype(np.uint8)
-    before, after = (_patches(policy, replace(seen, image=image)) for image in (seen.image, turned))
+    before = patches(policy, seen) if before is None else before
+    after = patches(policy, replace(seen, image=turned))
     moved = np.linalg.norm(after - before, axis=-1)
     order = policy.patch_order()
     found = np.zeros(int(order.max()) + 1, bool)
@@ -66,12 +76,12 @@ def tokens_seeing(policy: "Policy", seen: Observation, pixels: NDArray[np.bool_]
     return found
 
 
-def _patches(policy: "Policy", seen: Observation) -> NDArray[np.float32]:
+def patches(policy: "Policy", seen: Observation) -> NDArray[np.float32]:
     """(V, D) the first camera's patches as they enter the first block of the vision tower."""
     from probe_kit.hooks import capture
 
     site = policy.every_stream()["vision"].sites()[0]
     with capture(policy, [site]) as tape:
         policy.act([seen], [0])
-    patches: NDArray[np.float32] = tape[site][0].float().cpu().numpy()
-    return patches
+    found: NDArray[np.float32] = tape[site][0].float().cpu().numpy()
+    return found

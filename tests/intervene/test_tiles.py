@@ -64,6 +64,19 @@ def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
         role_mask(bench.policy, nothing, "backbone", "image.left", {})
 
 
+def test_both_tiles_are_held_against_the_same_plain_patches(
+    bench: Bench, copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (question, _) = bench.questions(str(copy.episodes["item_id"][0]))
+    act, seen = bench.policy.act, []
+    monkeypatch.setattr(bench.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
+    memo: dict[object, object] = {}
+    together = [role_mask(bench.policy, question, "backbone", role, memo) for role in TILES]
+    assert len(seen) == 1 + len(TILES)
+    for role, mask in zip(TILES, together, strict=True):
+        np.testing.assert_array_equal(mask, role_mask(bench.policy, question, "backbone", role, {}))
+
+
 def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy") -> None:
     asked = Interchange(
         categories=("color",), items=1, sites=("backbone.00", "memory.01", "expert.00@0"),
