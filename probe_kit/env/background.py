@@ -1,5 +1,6 @@
 """What lies behind robot, cube and tiles under visual matching: a photo, or a wooden table of our own."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
         ) from error
 
 
+@lru_cache(maxsize=8)
 def wooden_table(camera: Camera) -> Picture:
     """A table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
     fine = camera.magnified(SUPERSAMPLING)

@@ -1,7 +1,7 @@
 """The table top in the physics server: table, tiles, cube and arm, built once and restored per episode."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from probe_kit.env.bullet import BulletClient
 from probe_kit.env.camera import Backdrop, Camera, Frame, Picture
 from probe_kit.env.kinematics import Pose
 from probe_kit.env.rotations import Array, to_vector, yaw_quaternion
-from probe_kit.env.spec import XY, XYZ, SceneSpec
+from probe_kit.env.spec import XY, XYZ, CameraSpec, LightSpec, SceneSpec
 from probe_kit.env.tiles import TextureCache, write_quad
 from probe_kit.errors import SceneError
 from probe_kit.suite.items import Side
@@ -42,6 +42,10 @@ GRASP_GAP = 0.003
 """Space between each finger and a cube that starts in the hand, before the fingers close, metres."""
 QUAD_LIFT = 0.0005
 """How far the picture lies above its box, metres; enough for the depth buffer to tell them apart."""
+_EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], Frame] = {}
+_TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
+_KEPT = 8
+"""What scenes of this process saw before anything was on their table; the next like them need not draw it."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +164,9 @@ class Scene:
         """Robot, cube and tiles as the camera sees them, without the table."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
+        return self._draw()
+
+    def _draw(self) -> Frame:
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
     def picture(self, frame: Frame) -> Picture:
@@ -187,7 +194,7 @@ class Scene:
         self.textures = TextureCache(client, folder)
         self.table = self._box(TABLE_SIZE, TABLE_CENTRE, TABLE_COLOR)
         self.floor = self._box(FLOOR_SIZE, FLOOR_CENTRE, FLOOR_COLOR)
-        empty = self.camera.render(client, spec.light, spec.light_level)
+        empty = _drawn_once(_EMPTY_TABLES, (spec.camera, spec.light, spec.light_level), self._draw)
         self.backdrop = Backdrop(self._surroundings(empty), empty.depth)
         for body in (self.table, self.floor):
             client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
@@ -269,8 +276,14 @@ class Scene:
             self.quads[side] = self.client.createMultiBody(
                 0, -1, shape, (x, y, spec.tile_height + QUAD_LIFT), turn
             )
-        bodies = self.camera.widened().render(self.client, spec.light, spec.light_level).bodies
-        self._tile_pixels = {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
+        places = tuple(spec.tile_xy(side) for side in SIDES)
+        lie = (spec.camera, spec.tile_side, spec.tile_height, spec.tile_yaw, places)
+        self._tile_pixels = _drawn_once(_TILE_PIXELS, lie, self._count_tile_pixels)
+
+    def _count_tile_pixels(self) -> dict[Side, int]:
+        """Of each picture with nothing in front of it, on screen or just outside."""
+        bodies = self.camera.widened().render(self.client, self.spec.light, self.spec.light_level).bodies
+        return {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
 
     def _tile_start(self, side: Side) -> XYZ:
         return (*self.spec.tile_xy(side), self.spec.tile_height / 2)
@@ -309,3 +322,12 @@ class Scene:
         body: int = client.createMultiBody(mass, collision, visual, centre, turn)
         client.changeDynamics(body, -1, lateralFriction=self.spec.physics.friction)
         return body
+
+
+def _drawn_once[Key, Seen](kept: dict[Key, Seen], key: Key, draw: Callable[[], Seen]) -> Seen:
+    """What `draw` gave when it was last called for `key`; renderings are the same bit for bit."""
+    if key not in kept:
+        if len(kept) == _KEPT:
+            kept.clear()
+        kept[key] = draw()
+    return kept[key]
