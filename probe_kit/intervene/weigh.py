@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CaptureChangedActionError, CaptureError, UsageError
+from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.hooks.sites import first_of
@@ -124,16 +124,24 @@ class Noting:
         from probe_kit.hooks.attention import attention
 
         question, bench = turn.question, turn.bench
-        masks = [role_mask(bench.policy, question, self.stream, role, turn.memo) for role in self.roles]
+        masks = [self._mask(turn, role) for role in self.roles]
         with attention(bench.policy) as mass:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, mass=by_role(mass, masks))
 
+    def _mask(self, turn: Turn, role: str) -> NDArray[np.bool_] | None:
+        """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
+        try:
+            return role_mask(turn.bench.policy, turn.question, self.stream, role, turn.memo)
+        except EmptyRoleError:
+            return None
 
-def by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
-    """(B, I, H, R) shares by block, iteration, head and role, NaN where a block is not read in an iteration.
 
-    Of one observation. masks: (T,) each. Raises CaptureError for blocks with different numbers of heads.
+def by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
+    """(B, I, H, R) shares by block, iteration, head and role.
+
+    NaN where a block is not read in an iteration, and of a role that nobody plays. Of one observation. masks: (T,)
+    each, None of nobody. Raises CaptureError for blocks with different numbers of heads.
     """
     shapes = {found.shape[:2] for found in mass.by_head.values()}
     if len(shapes) != 1 or next(iter(shapes))[0] != 1:
@@ -141,6 +149,8 @@ def by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArra
     blocks, iterations = (max(own) + 1 for own in zip(*mass.by_head, strict=True))
     shares = np.full((blocks, iterations, next(iter(shapes))[1], len(masks)), np.nan, np.float32)
     for role, tokens in enumerate(masks):
+        if tokens is None:
+            continue
         for (block, iteration), share in mass.heads_on(tokens).items():
             shares[block, iteration, :, role] = share[0]
     return shares

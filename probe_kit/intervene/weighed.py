@@ -32,7 +32,8 @@ class Weighed:
     """Attention of N inferences. roles: names of R, the first one `all`.
 
     episodes, groups, categories, sides: (N,), `sides` those of the correct picture. calls: (N,) inference of the
-    episode, counted from 0. mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration.
+    episode, counted from 0. mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration
+    and of roles that no token of an inference plays, such as a tile behind the arm.
     """
 
     roles: tuple[str, ...]
@@ -119,8 +120,10 @@ class Weighed:
             apart = (shares[CORRECT] - shares[OTHER])[:, block : block + 1]
             if np.isnan(apart).all():
                 continue
-            values = _mean(_per_episode(apart, episodes), (1, 2, 3))
-            low, high = group_bootstrap(values[:, None], groups, units_seed(groups, suite), bounds=GAINS)
+            every = _mean(_per_episode(apart, episodes), (1, 2, 3))
+            seen = ~np.isnan(every)
+            values, units = every[seen], groups[seen]
+            low, high = group_bootstrap(values[:, None], units, units_seed(units, suite), bounds=GAINS)
             found[block] = float(values.mean()), (float(low[0]), float(high[0]))
         return found
 
@@ -173,12 +176,12 @@ def stored_attention(run: RunReader) -> dict[str, Weighed]:
 
 
 def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
-    """(E, …) means over the inferences of every episode."""
-    sums = np.zeros((episodes.max() + 1, *values.shape[1:]))
-    np.add.at(sums, episodes, values)
-    counts = np.bincount(episodes)
-    found: Shares = sums / counts.reshape(-1, *(1,) * (values.ndim - 1))
-    return found
+    """(E, …) means over the inferences of every episode, of those that are not NaN."""
+    sums, counts = (np.zeros((episodes.max() + 1, *values.shape[1:])) for _ in range(2))
+    known = ~np.isnan(values)
+    np.add.at(sums, episodes, np.where(known, values, 0.0))
+    np.add.at(counts, episodes, known)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
 def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:

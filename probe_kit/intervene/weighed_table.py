@@ -29,10 +29,12 @@ def weighed_table(weighed: Weighed, suite: str, of: str) -> "FittingTable":
         for block in blocks:
             found = {row.role: row.share for row in rows if (row.category, row.block) == (category, block)}
             names.append(f"{category} · block {block:02d}")
-            shares.append(tuple(Cell(f"{100 * found[role]:.1f}") for role in roles))
+            shares.append(tuple(Cell(f"{100 * found[role]:.1f}" if role in found else "–") for role in roles))
             if block in apart:
                 value, (low, high) = apart[block]
                 sides.append((Cell(f"{100 * value:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"),))
+            else:
+                sides.append((Cell("–"),))
     parts = [Part("Where the attention lies, %", tuple(roles), tuple(shares))]
     if set(TILE_ROLES) <= set(roles):
         parts.append(Part("Tiles by answer", ("correct − other [95 %]",), tuple(sides)))

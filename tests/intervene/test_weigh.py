@@ -29,6 +29,7 @@ from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Replayed
 from probe_kit.intervene.tiles import TILES
 from probe_kit.intervene.weigh import Noting, by_role
+from probe_kit.intervene.weighed_table import weighed_table
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -128,6 +129,22 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
         weighed.rows(("layer",))  # type: ignore[arg-type]
 
 
+def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: Weighed) -> None:
+    mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
+    mass[..., at["special"]] = np.nan
+    mass[0, ..., at["image.left"]] = np.nan
+    hidden = replace(weighed, mass=mass)
+    found = {row.role: row.share for row in hidden.rows(())}
+    assert "special" not in found
+    assert found["image.left"] == pytest.approx(float(mass[1:, ..., at["image.left"]].mean()), rel=1e-5)
+    values = (hidden.shares()["image.correct"] - hidden.shares()["image.other"])[1:, 1]
+    assert hidden.toward_correct("suite")[1][0] == pytest.approx(values.mean())
+    every = replace(weighed, mass=np.where(np.arange(mass.shape[-1]) == at["special"], np.nan, weighed.mass))
+    assert weighed_table(every, "suite", "of").parts[0].headings == tuple(
+        role for role in weighed_table(weighed, "suite", "of").parts[0].headings if role != "special"
+    )
+
+
 def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, noted: Effects) -> None:
     assert any("no cause" in note for note in noted.notes)
     assert noted.verdicts == {}
@@ -204,8 +221,10 @@ def test_what_cannot_be_told_is_refused_by_name(bench: Bench) -> None:
 def test_blocks_with_other_numbers_of_heads_are_no_table() -> None:
     weights = np.ones((1, 2, 3), np.float32) / 3
     mass = AttentionMass({(0, 0): weights, (2, 1): weights})
-    found = by_role(mass, [np.array([True, False, True])])
-    assert found.shape == (3, 2, 2, 1)
+    found = by_role(mass, [np.array([True, False, True]), None])
+    assert found.shape == (3, 2, 2, 2)
+    assert np.isnan(found[..., 1]).all()
+    found = found[..., :1]
     np.testing.assert_allclose(found[0, 0], 2 / 3)
     assert np.isnan(found[1]).all()
     assert np.isnan(found[0, 1]).all()
