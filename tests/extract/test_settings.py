@@ -1,12 +1,14 @@
-"""What a run is called."""
+"""What a run is called, and which questions its settings ask for."""
 
 from pathlib import Path
 
 import pytest
 
 from probe_kit.extract import ExtractSettings
+from probe_kit.extract.prepared import check_run
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks import Edit, Site
+from probe_kit.suite import load_suite
 
 ZERO = Edit("zero", (Site("backbone", 1),))
 
@@ -29,3 +31,13 @@ def test_an_edited_run_is_called_so_and_is_another_run() -> None:
     plain, edited = ExtractSettings("pi0"), ExtractSettings("pi0", edits=(ZERO,))
     assert run_label(edited).startswith("pi0 · edited ")
     assert plain.choices() != edited.choices()
+
+
+def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
+    suite = check_run(ExtractSettings("expert", categories=("color",), items=2))
+    assert len(suite.items) == 2
+    (drawn,) = (tmp_path / "suites").iterdir()
+    assert {item.category for item in load_suite(drawn).items} == {"color"}
