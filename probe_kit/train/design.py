@@ -1,13 +1,16 @@
 """Training samples as the solver needs them: products with them, never all their entries."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, Self
 
 from probe_kit.train.arrays import Array, namespace
 from probe_kit.train.rows import ChosenRows
 from probe_kit.train.standardiser import Standardiser
+
+WORTH_NARROWING = 2**17
+"""Entries from which on products in float32 gain more than their operands cost to convert: 1 MB of float64."""
 
 
 class Design(Protocol):
@@ -28,6 +31,9 @@ class Design(Protocol):
     def of(self, _columns: Array) -> "Design":
         """What the label columns of a mask (K,) need of it."""
 
+    def narrow(self) -> "Design":
+        """The same in float32 where its products gain more than their operands cost to convert, else itself."""
+
     def __matmul__(self, weights: Array) -> Array:
         """Z · weights, (N, K) for (R, K)."""
 
@@ -47,10 +53,14 @@ class _OfAllColumns:
         """Itself."""
         return self
 
+    def narrow(self) -> Self:
+        """Itself."""
+        return self
+
 
 @dataclass(frozen=True)
 class DenseDesign(_OfAllColumns):
-    """Samples in memory, (N, R) float64."""
+    """Samples in memory, (N, R) float64, or float32 if narrowed."""
 
     samples: Array
 
@@ -74,6 +84,13 @@ class DenseDesign(_OfAllColumns):
     def moments(self, weights: Array) -> Array:
         """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
         return (self.samples.T * weights.T[:, None, :]) @ self.samples
+
+    def narrow(self) -> Self:
+        """The same in float32, unless it is small."""
+        xp, (count, width) = namespace(self.samples), self.shape
+        if count * width < WORTH_NARROWING:
+            return self
+        return replace(self, samples=xp.asarray(self.samples, dtype=xp.float32))
 
 
 @dataclass(frozen=True)
@@ -114,6 +131,10 @@ class StackedDesign:
     def of(self, columns: Array) -> "StackedDesign":
         """The same samples for the label columns of a mask (K,)."""
         return StackedDesign(self.samples, self.fold_of[columns])
+
+    def narrow(self) -> Self:
+        """Itself."""
+        return self
 
     @cached_property
     def _own(self) -> Array:

@@ -3,12 +3,14 @@
 The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
 Samples come in principal coordinates (`features.Coordinates`), whose columns are orthogonal: there the
 Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
-need a few products each, and all label columns share them as matrix–matrix products. numpy arrays or torch
-tensors: samples on a GPU are solved there, in float64 as well.
+need a few products each, and all label columns share them as matrix–matrix products. Steps through many samples
+are found in float32; whether a solution is accepted is decided by gradients in float64, so that the precision of a
+step shapes the way, never the optimum. numpy arrays or torch tensors: samples on a GPU are solved there.
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from probe_kit.train.design import Design
 
 MAX_NEWTON_STEPS = 100
 MAX_CG_STEPS = 100
+FINEST = 1e-4
+"""Relative precision of a step beyond which float32 is rounding."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,8 @@ class LogisticSolver:
             curvature = todo.strength * misfit * (1 - misfit)
             if todo.samples.small:
                 step = self._exact_newton_steps(todo.samples, gradient, curvature)
-            else:  # a step more precise than the point it starts from is wasted work
-                step = self._newton_steps(gradient, curvature, xp.sqrt(relative[open_]).clip(max=0.1))
+            else:
+                step = self._newton_steps(gradient, curvature, self._precision(relative[open_]))
             todo = self._moved(todo, gradient, step)
         raise ProbeNotConvergedError(
             f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
@@ -115,27 +119,37 @@ class LogisticSolver:
             "Look for extreme feature values."
         )
 
+    def _precision(self, relative: Array) -> Array:
+        """(K,) of a step from points with such gradients: more than the point has, or is asked, is wasted work."""
+        enough = (0.1 * self.tolerance / relative).clip(min=FINEST)
+        return self.xp.maximum(self.xp.sqrt(relative), enough).clip(max=0.1)
+
     def _newton_steps(self, gradient: Array, curvature: Array, precision: Array) -> Array:
         """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision`.
 
         Columns that conjugate gradients do not settle in time are solved exactly.
         """
         xp = self.xp
+        design, exact = self._narrow, (gradient, curvature)
+        penalty, spectrum, gradient, curvature, precision = (
+            xp.asarray(part, dtype=design.spectrum.dtype)
+            for part in (self.penalty, self.spectrum, gradient, curvature, precision)
+        )
         step = xp.zeros_like(gradient)
         todo = xp.arange(gradient.shape[1], device=gradient.device)
         target = precision * xp.linalg.norm(gradient, axis=0)
-        diagonal = self.penalty + self.spectrum * curvature.mean(axis=0)
+        diagonal = penalty + spectrum * curvature.mean(axis=0)
         rest = -gradient
         direction = rest / diagonal
         slope = (rest * direction).sum(axis=0)
         for _ in range(MAX_CG_STEPS):
-            product = self.penalty * direction + self.samples.gather(curvature * (self.samples @ direction))
+            product = penalty * direction + design.gather(curvature * (design @ direction))
             length = slope / (direction * product).sum(axis=0)
             step[:, todo] += length * direction
             rest = rest - length * product
             keep = xp.linalg.norm(rest, axis=0) > target[todo]
             if not keep.any():
-                return step
+                return xp.asarray(step, dtype=xp.float64)
             if not keep.all():
                 todo = todo[keep]
                 rest, direction, diagonal, curvature = (
@@ -145,11 +159,16 @@ class LogisticSolver:
             scaled = rest / diagonal
             previous, slope = slope, (rest * scaled).sum(axis=0)
             direction = scaled + (slope / previous) * direction
-        for place, column in enumerate(todo):  # one after another: all Hessians may be more than the memory holds
-            one = slice(place, place + 1)
-            exact = self._exact_newton_steps(self.samples, gradient[:, column, None], curvature[:, one])
-            step[:, column] = exact[:, 0]
+        step, (gradient, curvature) = xp.asarray(step, dtype=xp.float64), exact
+        for column in todo:  # one after another: all Hessians may be more than the memory holds
+            one = gradient[:, column, None], curvature[:, column, None]
+            step[:, column] = self._exact_newton_steps(self.samples, *one)[:, 0]
         return step
+
+    @cached_property
+    def _narrow(self) -> Design:
+        """What steps are found with."""
+        return self.samples.narrow()
 
     def _exact_newton_steps(self, samples: Design, gradient: Array, curvature: Array) -> Array:
         hessians = samples.moments(curvature)

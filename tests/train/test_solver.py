@@ -7,7 +7,7 @@ import pytest
 from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train import solver
+from probe_kit.train import design, solver
 from probe_kit.train.design import DenseDesign, StackedDesign
 from probe_kit.train.features import Coordinates
 from probe_kit.train.probe import STRENGTHS
@@ -22,10 +22,15 @@ SIGNS = np.where(LABELS, 1.0, -1.0)[:, None]
 Path = Callable[[Coordinates, np.ndarray, np.ndarray], list[np.ndarray]]
 
 
-@pytest.fixture(params=["alone", "beside another fold"])
-def path(request: pytest.FixtureRequest) -> Path:
-    """Large problems are solved alone, small ones together with other folds'; every test holds for both."""
-    return alone if request.param == "alone" else beside_another_fold
+@pytest.fixture(params=["alone", "by steps in float32", "beside another fold"])
+def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Large problems are solved alone, by steps in float32, small ones together with other folds'.
+
+    Every test holds for all.
+    """
+    if request.param == "by steps in float32":
+        monkeypatch.setattr(design, "WORTH_NARROWING", 0)
+    return beside_another_fold if request.param == "beside another fold" else alone
 
 
 def alone(coordinates: Coordinates, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
@@ -110,6 +115,22 @@ def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
     monkeypatch.setattr(solver, "MAX_CG_STEPS", 1)
     (found,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
     np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = Coordinates.fit(outliers_and_constants()).train
+    labels = GENERATOR.random((90, 40)) < 0.5
+    wide = list(LogisticSolver(samples).path(labels, STRENGTHS))
+    monkeypatch.setattr(design, "WORTH_NARROWING", 0)
+    assert samples.narrow().spectrum.dtype == np.float32
+    exact = []
+    monkeypatch.setattr(
+        LogisticSolver, "_exact_newton_steps", lambda _self, _samples, gradient, _curvature: exact.append(gradient)
+    )
+    for one, other in zip(wide, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
+        assert other.dtype == np.float64
+        assert (np.linalg.norm(one - other, axis=0) < 1e-7 * np.linalg.norm(one, axis=0)).all()
+    assert not exact, "conjugate gradients settle in float32 as they do in float64"
 
 
 def test_an_unfinished_probe_is_an_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
