@@ -1,101 +1,101 @@
-"""What listening costs: one inference plain, captured by probe_kit, and by the ways people do it otherwise.
+"""What listening costs, in every family: one inference plain, captured by probe_kit, and by what rivals do.
 
-    uv run --with nnsight python benchmarks/capture.py [--repeats 15] [--device cuda] [--size mid|pi0]
+    python benchmarks/capture.py [--families pi0,openvla] [--repeats 7] [--host] [--keep DIR]
+    python benchmarks/capture.py --families pi0 --checkpoint DIR --device cuda [--dtype bfloat16] [--batch 8]
+        [--trace FILE]
 
-Same model, same batch, same process, interleaved; prints medians of wall and CPU time and their ratio to plain.
-`mid`: lerobot's pi0 with 12 layers of width 512 and 256 image tokens. `pi0`: the released size, random weights.
+Each family at 110 to 160 million random parameters, or at the size of a checkpoint, whose weights need not be
+there: the same model, observation and process for all ways, in turns. A ratio is that of one turn to the plain
+inference of the same turn; medians are printed, of processor time on a CPU (whatever else the machine does) and of
+wall time on a GPU. No way may change the numbers that come out, which is checked bit for bit first.
 
-* pooled: every residual site, four views per stream, reduced on the device as it fires.
+* pooled: every residual site, all views, reduced on the device as it fires.
 * tokens: a copy of every token of every residual site.
-* raw hooks: forward hooks on every layer, `.detach().cpu()` of each output.
-* output_hidden_states: transformers' own switch on both stacks. Its last entry is normed, and what it returns is
-  dropped by lerobot, so this is the cost of collecting alone.
-* nnsight: the output of every layer at every iteration, saved in a trace (132 tensors; pooled reads 143).
+* pooled to host, tokens to host (`--host`): as a run stores them, with bits and copies into an episode's buffers;
+  on a GPU the next inference begins before they have arrived.
+* output_hidden_states: transformers' own switch on the same stacks, where the family's network heeds it. It keeps
+  references, copies nothing, and its last entry is normed.
+* raw hooks: forward hooks on every layer, `.detach().cpu().clone()` of each output.
+
+`--trace` saves a profiler trace of one inference with `tokens to host` and counts what waited for the device.
+`--keep` keeps a family's line in DIR, so that the same command goes on where it was stopped.
 """
 
 import argparse
-import importlib.util
 import statistics
+import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.pi0.configuration_pi0 import PI0Config
-from torch import Tensor, nn
+from capture_subjects import RECIPES, Subject, hidden_states, subject
+from numpy.typing import NDArray
+from torch import Tensor
 
-from probe_kit.hooks.capture_context import capture
-from probe_kit.hooks.families.lerobot_flow import IMAGES, MASK, STATE, TOKENS
-from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.roles import Roles, pool
+from probe_kit.extract.play.capturing import Capturer, stored_streams
+from probe_kit.extract.play.staging import EpisodeBuffers
+from probe_kit.hooks import capture, pool
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.views import view_names
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 
-MID = Pi0Size(
-    vlm=GemmaSize(512, 12, 2048, 8, 1, 64),
-    expert=GemmaSize(256, 12, 1024, 8, 1, 64),
-    vision=SiglipSize(128, 2, 4, 256, 14),
-    vocab_size=1024,
-)
+WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "aten::item")
+Output = NDArray[np.float32]
 
 
 class Benchmark:
-    """One model, one batch, and every way to run it."""
+    """Every way to run one inference."""
 
-    def __init__(self, size: Pi0Size | None, device: str) -> None:
-        from pathlib import Path
+    def __init__(self, subject: Subject, device: str) -> None:
+        self.subject, self.model, self.plain = subject, subject.model, subject.infer
+        self.streams = stored_streams(self.model, subject.roles)
+        self.rows = len(next(iter(subject.roles.values())))
+        self._pinned = device.startswith("cuda")
+        self._hosts: dict[bool, tuple[Capturer, list[dict[int, EpisodeBuffers]]]] = {}
 
-        config = PI0Config(
-            input_features={
-                f"{IMAGES}base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)),
-                STATE: PolicyFeature(FeatureType.STATE, (8,)),
-            },
-            output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-            device="cpu",
-            dtype="float32" if device == "cpu" else "bfloat16",
-        )
-        network = build_pi0(config, size)
-        initialise(network, seed=0)
-        config.device = device
-        self.policy = Pi0(network.to(device), Path())
-        generator = torch.Generator().manual_seed(0)
-        self.batch = {
-            f"{IMAGES}base": torch.rand((1, 3, 224, 224), generator=generator).to(device),
-            STATE: torch.zeros(1, 8, device=device),
-            TOKENS: torch.randint(4, 1000, (1, 48), generator=generator).to(device),
-            MASK: torch.ones(1, 48, dtype=torch.bool, device=device),
-        }
-        self.noise = self.policy.noise([0])
-        self.roles = {
-            "backbone": Roles.from_labels([*["image.base"] * 256, *["language"] * 48]),
-            "expert": Roles.from_labels(["state", *["action"] * config.chunk_size]),
-        }
+    def ways(self, host: bool) -> dict[str, Callable[[], Output]]:
+        """By name, as far as the family has them; the plain one first."""
+        found: dict[str, Callable[[], Output]] = {
+            "plain": self.plain, "pooled": self.pooled, "tokens": self.tokens,
+        }  # fmt: skip
+        if host:
+            found |= {"pooled to host": self.pooled_to_host, "tokens to host": self.tokens_to_host}
+        with hidden_states(self.subject) as counts:
+            self.plain()
+        if counts and min(counts) > 0:
+            found["output_hidden_states"] = self.output_hidden_states
+        return found | ({"raw hooks": self.raw_hooks} if self.subject.layers else {})
 
-    def plain(self) -> Tensor:
-        """The inference alone."""
-        return self.policy.infer(self.batch, self.noise)
-
-    def pooled(self) -> Tensor:
+    def pooled(self) -> Output:
         """Every site reduced to its views on the device."""
-        with capture(self.policy, self.policy.sites(), reduce=self._reduce):
+        with capture(self.model, self.model.sites(), reduce=self._reduce):
             return self.plain()
 
-    def tokens(self) -> Tensor:
+    def tokens(self) -> Output:
         """Every token of every site."""
-        with capture(self.policy, self.policy.sites()):
+        with capture(self.model, self.model.sites()):
             return self.plain()
 
-    def raw_hooks(self) -> Tensor:
+    def pooled_to_host(self) -> Output:
+        """As a run stores views."""
+        return self._to_host(with_tokens=False)
+
+    def tokens_to_host(self) -> Output:
+        """As a run stores tokens."""
+        return self._to_host(with_tokens=True)
+
+    def output_hidden_states(self) -> Output:
+        """transformers collects."""
+        with hidden_states(self.subject):
+            return self.plain()
+
+    def raw_hooks(self) -> Output:
         """What one writes in five minutes."""
         kept: list[Tensor] = []
-        layers = [layer for stack in self.policy.stacks.values() for layer in stack.layers]
         handles = [
-            layer.register_forward_hook(lambda _m, _i, output: kept.append(output.detach().cpu().clone()))
-            for layer in layers
+            layer.register_forward_hook(lambda _m, _i, output: kept.append(_first(output).detach().cpu().clone()))
+            for layer in self.subject.layers
         ]
         try:
             return self.plain()
@@ -103,87 +103,105 @@ class Benchmark:
             for handle in handles:
                 handle.remove()
 
-    def output_hidden_states(self) -> Tensor:
-        """transformers collects; lerobot drops the result."""
-        joint = self.policy.network.model.paligemma_with_expert
-        with _switched(joint.paligemma.model.language_model.config), _switched(joint.gemma_expert.model.config):
-            return self.plain()
-
-    def nnsight(self) -> Tensor:
-        """A trace that saves every layer's first output."""
-        from nnsight import NNsight
-
-        if not hasattr(self, "_traced"):
-            self._traced = NNsight(_Callable(self.policy))
-        with self._traced.trace(self.batch, self.noise) as tracer:
-            joint = self._traced.network.model.paligemma_with_expert
-            kept = [layer.output for layer in joint.paligemma.model.language_model.layers]
-            for _ in tracer.iter[:10]:
-                for layer in joint.gemma_expert.model.layers:
-                    kept.append(layer.output)  # noqa: PERF401 - nnsight reads this source
-            saved = kept.save()
-            actions = self._traced.output.save()
-        assert len(saved) == 12 + 10 * 12
-        return actions
+    def _to_host(self, with_tokens: bool) -> Output:
+        if with_tokens not in self._hosts:
+            sets = [
+                {row: EpisodeBuffers(self.streams, 1, with_tokens, self._pinned) for row in range(self.rows)}
+                for _ in range(2)
+            ]
+            self._hosts[with_tokens] = Capturer(self.model, self.streams, with_tokens, "numbers"), sets
+        capturer, sets = self._hosts[with_tokens]
+        sets.reverse()
+        for own in sets[0].values():
+            own.wait()  # from the inference before last
+            own.roles = []
+        return capturer.run(self.plain, lambda numbers: numbers, self.subject.roles, sets[0])
 
     def _reduce(self, site: Site, activation: Tensor) -> Tensor:
-        roles = self.roles[site.stream]
-        return pool(activation, roles, view_names(self.policy.role_names[site.stream]))
+        views = view_names(self.model.role_names[site.stream])
+        own = self.subject.roles[site.stream]
+        return torch.stack([pool(row, roles, views) for row, roles in zip(activation, own, strict=True)])
 
 
-class _Callable(nn.Module):
-    """nnsight traces `forward`; the policy acts through another method."""
-
-    def __init__(self, policy: Pi0) -> None:
-        super().__init__()
-        self.network, self._policy = policy.network, [policy]
-
-    def forward(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        return self._policy[0].infer(batch, noise)
+def _first(output: Tensor | tuple[Tensor, ...]) -> Tensor:
+    return output[0] if isinstance(output, tuple) else output
 
 
-@contextmanager
-def _switched(config: Any) -> Iterator[None]:
-    config.output_hidden_states = True
-    try:
-        yield
-    finally:
-        config.output_hidden_states = False
-
-
-def measure(run: Callable[[], Tensor], device: str) -> tuple[float, float]:
-    """Wall and CPU milliseconds of one call."""
-    wall, cpu = time.perf_counter(), time.process_time()
+def measure(run: Callable[[], Output], device: str) -> float:
+    """Seconds of one call: of the processor, or by the clock where a GPU works."""
+    on_cpu = device == "cpu"
+    clock = time.process_time if on_cpu else time.perf_counter
+    start = clock()
     run()
-    if device != "cpu":
+    if not on_cpu:
         torch.cuda.synchronize()
-    return 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
+    return clock() - start
+
+
+def line(family: str, options: argparse.Namespace, folder: Path) -> str:
+    """What listening to one family costs."""
+    made = subject(family, folder, options.device, options.dtype, options.batch, options.checkpoint)
+    benchmark = Benchmark(made, options.device)
+    ways, reference = benchmark.ways(options.host), benchmark.plain()
+    for name, way in ways.items():
+        assert np.array_equal(way(), reference), f"{family}: {name} changed what comes out"
+    ratios: dict[str, list[float]] = {name: [] for name in ways}
+    plain = []
+    for turn in range(options.repeats):
+        order = list(ways)[turn % len(ways) :] + list(ways)[: turn % len(ways)]
+        times = {name: measure(ways[name], options.device) for name in order}
+        plain.append(times["plain"])
+        for name, seconds in times.items():
+            ratios[name].append(seconds / times["plain"])
+    if options.trace:
+        trace(benchmark.tokens_to_host, options.trace)
+    card, sites = made.model.card, len(made.model.sites())
+    tokens = ", ".join(f"{len(rows[0])} {name}" for name, rows in made.roles.items())
+    found = "  ".join(
+        f"{name} {statistics.median(of):.3f} ({min(of):.2f}–{max(of):.2f})"
+        for name, of in ratios.items()
+        if name != "plain"
+    )
+    return (
+        f"{family}: {card.parameters / 1e6:.0f} M {card.dtype} on {card.device}, {sites} sites, tokens {tokens}, "
+        f"plain {1e3 * statistics.median(plain):.0f} ms × {options.repeats}: {found}"
+    )
+
+
+def trace(run: Callable[[], Output], path: str) -> None:
+    """Save a profiler trace and print what waited for the device in it."""
+    with torch.profiler.profile(record_shapes=False) as profile:
+        run()
+    profile.export_chrome_trace(path)
+    counts = {event.key: event.count for event in profile.key_averages() if event.key in WAITS}
+    print(f"trace: {path}; waiting in one inference with capture: {counts or 'nothing'}")
 
 
 def main() -> None:
-    """Interleave all variants, so that a busy moment hits them alike."""
+    """One family after another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--families", default=",".join(RECIPES))
+    parser.add_argument("--checkpoint", help="its config gives the size; for one family")
+    parser.add_argument("--dtype", help="default float32 on a CPU, bfloat16 elsewhere")
+    parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--size", choices=["mid", "pi0"], default="mid")
+    parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--host", action="store_true", help="also as a run stores them")
+    parser.add_argument("--trace")
+    parser.add_argument("--keep", type=Path, help="a folder for the lines of finished families")
     options = parser.parse_args()
+    options.dtype = options.dtype or ("float32" if options.device == "cpu" else "bfloat16")
     torch.set_num_threads(options.threads)
-    benchmark = Benchmark(MID if options.size == "mid" else None, options.device)
-    names = ["plain", "pooled", "tokens", "raw_hooks", "output_hidden_states"]
-    names += ["nnsight"] if importlib.util.find_spec("nnsight") else []
-    reference = benchmark.plain()
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
-    for name in names:
-        assert torch.equal(getattr(benchmark, name)(), reference), f"{name} changed the actions"
-    for _ in range(options.repeats):
-        for name in names:
-            times[name].append(measure(getattr(benchmark, name), options.device))
-    base = [statistics.median(column) for column in zip(*times["plain"], strict=True)]
-    print(f"{'variant':22}{'wall ms':>10}{'CPU ms':>10}{'wall x':>9}{'CPU x':>9}")
-    for name in names:
-        wall, cpu = (statistics.median(column) for column in zip(*times[name], strict=True))
-        print(f"{name:22}{wall:10.1f}{cpu:10.1f}{wall / base[0]:9.3f}{cpu / base[1]:9.3f}")
+    for family in options.families.split(","):
+        kept = options.keep / f"{family}.txt" if options.keep else None
+        if kept is None or not kept.exists():
+            with tempfile.TemporaryDirectory() as folder:
+                found = line(family, options, Path(folder))
+            if kept is not None:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                kept.write_text(found, encoding="utf-8")
+        print(kept.read_text(encoding="utf-8") if kept else found, flush=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ the real one with a pi0 of 66 million random parameters on the CPU.
 
 import argparse
 import json
+import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -67,14 +68,31 @@ def bench_codecs(suite: Suite, folder: Path, width: int) -> None:
     plan = make_plan(suite, [stream], 0, 1, True)
     rollouts = [synthetic(plan, stream, number, True) for number in range(4)]
     raw = 4 * LAYERS * TOKENS * width * 2 / 1e6
+    disk = disk_rate(folder / "plain", rollouts)
     print(
-        f"\ntokens, {raw:.0f} MB in 4 episodes\ncodec   ratio   write MB/s (per CPU-s)   read a layer ms/episode"
+        f"\ntokens, {raw:.0f} MB in 4 episodes; the disk takes the same bytes as plain files, flushed, at "
+        f"{disk:.0f} MB/s\ncodec   ratio   write MB/s (per CPU-s)   of the disk's   read a layer ms/episode"
     )
     for codec in CODECS:
-        bench_codec(codec, plan, rollouts, folder / codec, raw)
+        bench_codec(codec, plan, rollouts, folder / codec, raw, disk)
 
 
-def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw: float) -> None:
+def disk_rate(folder: Path, rollouts: list[Rollout]) -> float:
+    """MB per second of the same tokens in one plain file per episode, each flushed to the disk."""
+    folder.mkdir()
+    arrays = [rollout.buffers.tokens["backbone"][0, :, :TOKENS] for rollout in rollouts]
+
+    def write() -> None:
+        for number, array in enumerate(arrays):
+            with (folder / f"{number}.bin").open("wb") as file:
+                file.write(np.ascontiguousarray(array))
+                os.fsync(file.fileno())
+
+    wall, _ = seconds(write)
+    return sum(array.nbytes for array in arrays) / 1e6 / wall
+
+
+def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw: float, disk: float) -> None:
     """One line of the table of codecs."""
     writer = RunWriter(
         locate(path), plan, {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic"}
@@ -83,7 +101,8 @@ def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw
     size = sum(p.stat().st_size for p in (path / "data.zarr/backbone/tokens").rglob("*") if p.is_file())
     run = open_run(path, allow_partial=True)
     read, _ = seconds(lambda: run.tokens(SITE))
-    print(f"{codec:6} {raw * 1e6 / size:6.2f} {raw / wall:12.0f} ({raw / cpu:.0f}) {1e3 * read / 4:18.1f}")
+    rates = f"{raw / wall:12.0f} ({raw / cpu:.0f}) {raw / wall / disk:15.2f} x"
+    print(f"{codec:6} {raw * 1e6 / size:6.2f} {rates} {1e3 * read / 4:18.1f}")
 
 
 def bench_columns(suite: Suite, folder: Path, episodes: int, width: int) -> None:

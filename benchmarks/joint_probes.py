@@ -7,9 +7,13 @@ whole grid of C and one outer one at the C that was chosen; both are scaled to a
 that a busy machine distorts little. Work is counted as products only: for k problems of M samples and D features,
 a gradient or a step of conjugate gradients is 4·M·D·k for the samples and 4·D²·k for the axes; once per site
 2·M·D² each for moments and turning. The machine's rate is that of square products in the same process.
+`--part together` and `--part alone` do half of it each, so that a large site can be timed in two processes; alone
+is then given the chosen `--strength` and compares no decisions. Peak memory is that of the whole process, with the
+making of samples.
 """
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -101,9 +105,9 @@ class Counted(JointProblems):
 
 
 def alone_seconds(
-    samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold], found: list[FittedFold]
-) -> tuple[float, float]:
-    """Processor time of every training set on its own, scaled from two; how far the first fold's decisions are."""
+    samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold], strengths: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
+    """Processor time of every training set on its own, scaled from two, and the first outer fold's decisions."""
     inner, outer = folds[0].inner[0], folds[0].outer
 
     def one_inner() -> None:
@@ -115,9 +119,8 @@ def alone_seconds(
 
     seconds = OUTER_FOLDS * INNER_FOLDS * processor_seconds(one_inner)
     kept: list[FittedFold] = []
-    once = processor_seconds(lambda: kept.append(probe._fit_fold(samples, labels, outer, found[0].strengths)))
-    scale = np.abs(kept[0].decisions).max()
-    return seconds + OUTER_FOLDS * once, float(np.abs(kept[0].decisions - found[0].decisions).max() / scale)
+    once = processor_seconds(lambda: kept.append(probe._fit_fold(samples, labels, outer, strengths)))
+    return seconds + OUTER_FOLDS * once, kept[0].decisions
 
 
 def main() -> None:
@@ -128,41 +131,59 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=2048)
     parser.add_argument("--relabellings", type=int, default=0)
     parser.add_argument("--signal", type=float, default=0.3, help="0: none, and C is small")
-    parser.add_argument("--skip-alone", action="store_true", help="time the shared products only")
+    parser.add_argument("--part", choices=("together", "alone", "both"), default="both")
+    parser.add_argument("--strength", type=float, default=10.0, help="C of the outer fold with --part alone")
     arguments = parser.parse_args()
     console = Console(width=115, highlight=False)
-    probed = "probe_kit.train.joint_probe.JointProblems"
     samples = samples_of(arguments.episodes, arguments.tokens, arguments.width, arguments.signal)
     real = np.tile([True, False], arguments.episodes // 2)
     items = np.repeat(np.arange(arguments.episodes // 2), 2)
     labels = np.column_stack([real, flip_items(real, items, arguments.relabellings, seed=0)])
     folds = nested_folds(real, items, seed=0)
+    console.print(
+        f"{arguments.episodes} × {arguments.tokens} samples × {arguments.width}, {labels.shape[1]} columns"
+    )
     with threadpool_limits(1):
-        single, double = rate(np.float32), rate(np.float64)
-        sites: list[JointSite] = []
-        once = processor_seconds(lambda: sites.append(JointSite.of(samples, folds)))
-        found: list[FittedFold] = []
-        with patch(probed, Counted):  # every product is made, and counted
-            solving = processor_seconds(
-                lambda: found.extend(cross_validate_jointly(sites[0], samples, labels, folds))
-            )
-        count, width = samples.features.shape
-        moments = 4 * count * width**2 / 1e9
-        work = Counted.work
-        bound = (moments + work.single) / single + work.double / double
-        console.print(
-            f"{arguments.episodes} × {arguments.tokens} samples × {width}, {labels.shape[1]} label columns"
-        )
-        console.print(f"{labels_at_once(sites[0], folds)} columns at once; alike: {sites[0].alike}")
-        console.print(f"chosen C: {[float(fold.strengths[0]) for fold in found]}")
-        console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64")
-        console.print(f"products: {moments + work.single:.0f} GFLOP in float32, {work.double:.0f} in float64")
-        console.print(
-            f"together: {once:.1f} s once and {solving:.1f} s; {bound / (once + solving):.0%} of the rate"
-        )
-        if not arguments.skip_alone:
-            alone, apart = alone_seconds(samples, labels, folds, found)
-            console.print(f"alone: {alone:.1f} s, scaled; {alone / (once + solving):.1f} times; apart {apart:.0e}")
+        if arguments.part == "alone":
+            seconds, _ = alone_seconds(samples, labels, folds, np.full(labels.shape[1], arguments.strength))
+            console.print(f"alone: {seconds:.1f} s, scaled; peak memory {peak_memory():.2f} GB")
+            return
+        seconds, found = together(samples, labels, folds, console)
+        if arguments.part == "both":
+            alone, decisions = alone_seconds(samples, labels, folds, found[0].strengths)
+            apart = np.abs(decisions - found[0].decisions).max() / np.abs(decisions).max()
+            console.print(f"alone: {alone:.1f} s, scaled; {alone / seconds:.1f} times; apart {apart:.0e}")
+
+
+def together(
+    samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold], console: Console
+) -> tuple[float, list[FittedFold]]:
+    """Processor time of a whole site in shared products, and what is found; prints where it goes."""
+    single, double = rate(np.float32), rate(np.float64)
+    sites: list[JointSite] = []
+    before = peak_memory()
+    once = processor_seconds(lambda: sites.append(JointSite.of(samples, folds)))
+    console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64; {once:.1f} s once")
+    found: list[FittedFold] = []
+    with patch("probe_kit.train.joint_probe.JointProblems", Counted):  # every product is made, and counted
+        solving = processor_seconds(lambda: found.extend(cross_validate_jointly(sites[0], samples, labels, folds)))
+    count, width = samples.features.shape
+    moments = 4 * count * width**2 / 1e9
+    work = Counted.work
+    bound = (moments + work.single) / single + work.double / double
+    console.print(f"{labels_at_once(sites[0], folds)} columns at once; alike: {sites[0].alike}")
+    console.print(f"chosen C: {[float(fold.strengths[0]) for fold in found]}")
+    console.print(f"products: {moments + work.single:.0f} GFLOP in float32, {work.double:.0f} in float64")
+    console.print(
+        f"together: {once:.1f} s once and {solving:.1f} s; {bound / (once + solving):.0%} of the rate; "
+        f"peak memory {peak_memory():.2f} GB, {before:.2f} before"
+    )
+    return once + solving, found
+
+
+def peak_memory() -> float:
+    """GB of this process so far, at most."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 if __name__ == "__main__":

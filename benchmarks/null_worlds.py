@@ -1,7 +1,7 @@
 """How often silence is called signal: p-values and controls in worlds where nothing is known.
 
     python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda]
-        [--worlds …]
+        [--worlds …] [--keep DIR]
 
 Probes: two sites of six features, 39 relabellings refitted; groups of two twins in both layouts. Exactness is a
 matter of relabellings and folds, so a linear discriminant with the classes' prior, which names the larger class
@@ -9,13 +9,17 @@ where it sees nothing, stands for the logistic probe; `--probe nested` fits that
 *Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the answer in a
 direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The rival flips
 items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, against a
-binding control and a twin that are as accurate.
+binding control and a twin that are as accurate. `--keep` keeps the draws of worlds, so that the same command
+goes on where it was stopped.
 """
 
 import argparse
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+from kept_draws import kept_draws
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -147,6 +151,7 @@ def main() -> None:
     parser.add_argument("--rival-draws", type=int, default=500)
     parser.add_argument("--probe", choices=("lda", "nested"), default="lda")
     parser.add_argument("--worlds", default="", help="beginnings of names, separated by semicolons; default all")
+    parser.add_argument("--keep", type=Path, help="a folder that keeps draws, to go on after a stop")
     arguments = parser.parse_args()
     console = Console(width=110)
     with threadpool_limits(1):
@@ -160,7 +165,8 @@ def main() -> None:
         names = tuple(arguments.worlds.split(";"))
         for world in (world for world in WORLDS if world.name.startswith(names)):
             nested, seeds = arguments.probe == "nested", range(arguments.draws)
-            found = np.array([p_values(world, seed, False, nested) for seed in seeds]) <= LEVEL
+            name = f"{arguments.probe} {world.name}"
+            found = kept_draws(arguments.keep, name, seeds, partial(p_values, world, nested=nested)) <= LEVEL
             rivals = seeds[: arguments.rival_draws]
             rival = np.mean([p_values(world, seed, True, nested)[0] <= LEVEL for seed in rivals] or [np.nan])
             hits = found.sum(axis=0)

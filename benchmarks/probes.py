@@ -31,13 +31,13 @@ SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold
 Matrix = NDArray[np.float64]
 
 
-def features(n_episodes: int) -> NDArray[np.float32]:
-    """(n_episodes, 2048) features without signal."""
+def features(n_episodes: int, width: int = WIDTH) -> NDArray[np.float32]:
+    """(n_episodes, width) features without signal."""
     generator = np.random.default_rng(0)
-    directions = np.logspace(1, -1, 64)[:, None] * generator.standard_normal((64, WIDTH))
+    directions = np.logspace(1, -1, 64)[:, None] * generator.standard_normal((64, width))
     of_item = generator.standard_normal((n_episodes // 2, 64)).repeat(2, axis=0)
     mixture = (of_item + 0.5 * generator.standard_normal((n_episodes, 64))) @ directions
-    values = mixture + 0.5 * generator.standard_normal((n_episodes, WIDTH))
+    values = mixture + 0.5 * generator.standard_normal((n_episodes, width))
     values[:, :5] *= 1000
     return values.astype(np.float32)
 

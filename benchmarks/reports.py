@@ -84,8 +84,10 @@ const [entry] = performance.getEntriesByType("navigation");
 document.title = "times " + JSON.stringify([entry.loadEventEnd, document.querySelectorAll("#grid .card").length,
   document.getElementsByTagName("*").length]);
 }))</script>"""
-_FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
-          "--disable-component-update", "--disable-sync", "--window-size=1400,1000")  # fmt: skip
+_FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--window-size=1400,1000",
+)  # fmt: skip
 
 
 def opened(page: Path) -> tuple[float, int, int, float]:

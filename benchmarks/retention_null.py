@@ -1,28 +1,34 @@
 """What retention says where the truth is known: bias, coverage, and how often silence is called signal.
 
     python benchmarks/retention_null.py [--draws 500] [--rival-draws 100] [--first-seed 0]
+    python benchmarks/retention_null.py --probe-draws 2000 --keep DIR
 
 Cells: correctness of 300 episodes (150 items) at 19 backbone and 180 expert sites, neighbours correlated 0.9,
 items 0.3, streams 0.25. The rivals are percentile bootstraps over items that choose sites anew in each of 100
 resamples, by the same estimate on the first of those draws. In one of them the copies of an item stay in one half,
 as they must; in the other they are items of their own and can be on both sides of a choice. Probes: real nested
-probes on features without signal, all 99 relabellings refitted.
+probes on features without signal, all 99 relabellings refitted; with `--probe-draws` they alone are run, and
+`--keep` lets the same command go on where it was stopped.
 """
 
 import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from kept_draws import kept_draws
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.special import ndtri
+from scipy.stats import binomtest
 
 from probe_kit.retention.crossfit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimates import Estimate, average, retention_draws
 from probe_kit.retention.measure import retention_interval
 from probe_kit.statistics.fieller import Interval
-from probe_kit.train.permutation import family_p, flip_items
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.permutation import family_p, flip_items, site_p
 from probe_kit.train.probe import nested_folds, probe_site
 from probe_kit.train.samples import Samples
 from probe_kit.train.scores import correctness
@@ -192,19 +198,28 @@ def median_width(intervals: list[Interval]) -> float:
     return float(np.median([interval.high - interval.low for interval in intervals]))
 
 
-def false_alarms(draws: int) -> float:
-    """Share of data sets without signal whose best of four backbone sites gets a family-wise p below 0.05."""
+def false_alarm(seed: int) -> tuple[float, float]:
+    """p of the first of four backbone sites without signal, and the least family-wise p of all four."""
     items, labels = np.repeat(np.arange(24), 2), np.tile([True, False], 24)
-    alarms = 0
-    for seed in range(draws):
-        generator = np.random.default_rng(seed)
-        layers = correlated(generator, 4, 48 * 12).reshape(4, 48, 12)
-        relabellings = flip_items(labels, items, 99, seed)
-        folds = nested_folds(labels, items, seed)
-        probes = [probe_site(Samples.pooled(layer), labels, relabellings, folds) for layer in layers]
-        accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
-        alarms += bool((family_p(accuracy, np.stack([probe.null for probe in probes])) < 0.05).any())
-    return alarms / draws
+    layers = correlated(np.random.default_rng(seed), 4, 48 * 12).reshape(4, 48, 12)
+    relabellings = flip_items(labels, items, 99, seed)
+    folds = nested_folds(labels, items, seed)
+    probes = [probe_site(Samples.pooled(layer), labels, relabellings, folds) for layer in layers]
+    accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
+    null = np.stack([probe.null for probe in probes])
+    return float(site_p(accuracy, null)[0]), float(family_p(accuracy, null).min())
+
+
+def false_alarms(draws: int, keep: Path | None) -> str:
+    """How often real probes on features without signal get p below 0.05, at one site and family-wise."""
+    p = kept_draws(keep, "retention_null probes", range(draws), false_alarm)
+    alarms = (p < SIGNIFICANCE).sum(axis=0)
+    above = min(binomtest(int(n), draws, SIGNIFICANCE, alternative="greater").pvalue for n in alarms)
+    site, family = alarms / draws
+    return (
+        f"no signal, real probes, {draws} draws: one site {site:.1%}, family-wise error {family:.1%}, so n/a in "
+        f"{1 - family:.1%}; more than 5 %? p = {above:.3f}"
+    )
 
 
 def table_of(studies: list[Study], draws: int) -> Table:
@@ -255,7 +270,12 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=500)
     parser.add_argument("--rival-draws", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=0, help="of the draws; others are other data")
+    parser.add_argument("--probe-draws", type=int, help="only the real probes, so many draws")
+    parser.add_argument("--keep", type=Path, help="a folder that keeps draws of probes, to go on after a stop")
     arguments = parser.parse_args()
+    if arguments.probe_draws is not None:
+        print(false_alarms(arguments.probe_draws, arguments.keep))
+        return
     draws = arguments.draws
     worlds = [World("dead", 0.0, 0.35, 0.0)]
     worlds += [
@@ -280,8 +300,7 @@ def main() -> None:
     )
     mean, difference = joined_coverage(draws)
     console.print(f"bootstrap over four categories: mean covers {mean:.1%}, difference of groups {difference:.1%}")
-    alarms = false_alarms(draws)
-    console.print(f"no signal, real probes: family-wise error {alarms:.1%}, so n/a in {1 - alarms:.1%} of draws")
+    console.print(false_alarms(draws, arguments.keep), highlight=False)
 
 
 if __name__ == "__main__":

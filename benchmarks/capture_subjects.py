@@ -1,0 +1,316 @@
+"""Models to listen to: every family at about a tenth of a billion random parameters, or at a checkpoint's size.
+
+The files around the weights are those that the tests write, in the layout of the released ones; their sizes are
+raised here, and the weights drawn. So no family, and no trained weights, are needed for it.
+"""
+
+import json
+import sys
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from probe_kit.env import SceneSpec
+from probe_kit.extract.play.examples import example_observations
+from probe_kit.hooks import Model, Policy, Reader, load_model
+from probe_kit.hooks.model import Question
+from probe_kit.hooks.roles import Roles
+
+# The tests' folder is no installed package, and an installed one may have its name.
+sys.modules["tests"] = types.ModuleType("tests")
+sys.modules["tests"].__path__ = [str(Path(__file__).parents[1] / "tests")]
+
+from tests import (  # noqa: E402
+    internvla_checkpoints,
+    magma_checkpoints,
+    pi0_checkpoints,
+    prismatic_checkpoints,
+    smolvla_checkpoints,
+    spatialvla_checkpoints,
+    vlm_checkpoints,
+    xiaomi_checkpoints,
+)
+
+WIDTH, DEPTH, INNER, HEADS, KEYS, HEAD = 768, 12, 3072, 12, 4, 64
+TOWER, TOWER_DEPTH, TOWER_INNER, TOWER_HEADS = 384, 6, 1536, 6
+INSTRUCTION = "Put the cube on the red shape"
+
+Values = dict[str, Any]
+_TEXT: Values = {
+    "hidden_size": WIDTH, "intermediate_size": INNER, "num_hidden_layers": DEPTH, "num_attention_heads": HEADS,
+    "num_key_value_heads": KEYS,
+}  # fmt: skip
+_HEADED: Values = {**_TEXT, "head_dim": HEAD}
+_QWEN_TOWER: Values = {
+    "depth": TOWER_DEPTH, "hidden_size": TOWER, "intermediate_size": TOWER_INNER, "num_heads": TOWER_HEADS,
+    "out_hidden_size": WIDTH,
+}  # fmt: skip
+_TOWER: Values = {
+    "hidden_size": TOWER, "intermediate_size": TOWER_INNER, "num_hidden_layers": TOWER_DEPTH,
+    "num_attention_heads": TOWER_HEADS,
+}  # fmt: skip
+_ROPE: Values = {"rope_scaling": {"mrope_section": [16, 8, 8]}}
+_TIMM: Values = {"depth": TOWER_DEPTH, "embed_dim": TOWER, "num_heads": TOWER_HEADS}
+_GEMMA: Values = {"depth": DEPTH, "num_heads": HEADS, "num_kv_heads": 1, "head_dim": HEAD}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a family's files are written, and what in them is made larger, by file.
+
+    options: of `load_model`.
+    """
+
+    write: Callable[[Path], Path]
+    larger: Mapping[str, Values]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+RECIPES = {
+    "pi0": Recipe(
+        pi0_checkpoints.write_intact,
+        {
+            "config.json": {"resize_imgs_with_padding": [224, 224], "chunk_size": 50, "n_action_steps": 50},
+            "dims.json": {
+                "vlm": {**_GEMMA, "width": WIDTH, "mlp_dim": INNER},
+                "expert": {**_GEMMA, "width": 384, "mlp_dim": 1536},
+                "vision": {
+                    "hidden": TOWER, "layers": TOWER_DEPTH, "heads": TOWER_HEADS, "inter": TOWER_INNER,
+                    "patch": 14,
+                },
+            },
+        },
+    ),
+    "smolvla": Recipe(
+        smolvla_checkpoints.write_smolvla,
+        {
+            "config.json": {
+                "resize_imgs_with_padding": [256, 256], "chunk_size": 50, "n_action_steps": 50, "num_steps": 10,
+                "num_vlm_layers": DEPTH,
+            },
+            "vlm/config.json": {
+                "text_config": _HEADED, "scale_factor": 2,
+                "vision_config": {**_TOWER, "patch_size": 16, "image_size": 256},
+            },
+            "vlm/processor_config.json": {"image_seq_len": 64},
+        },
+    ),
+    "openvla": Recipe(
+        prismatic_checkpoints.write_checkpoint,
+        {"config.json": {"text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
+                         "image_sizes": [224, 224], "timm_model_overrides": [_TIMM, _TIMM]}},
+        {"tokenizer": "bytes"},
+    ),
+    "prismatic": Recipe(
+        prismatic_checkpoints.write_checkpoint,
+        {"config.json": {"text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
+                         "image_sizes": [224, 224], "timm_model_overrides": [_TIMM, _TIMM]}},
+        {"tokenizer": "bytes"},
+    ),
+    "spatialvla": Recipe(
+        spatialvla_checkpoints.write_checkpoint,
+        {
+            "config.json": {
+                "projection_dim": WIDTH, "text_config": {**_HEADED, "query_pre_attn_scalar": HEAD},
+                "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
+            },
+            "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
+        },
+    ),
+    "magma": Recipe(
+        lambda folder: magma_checkpoints.write_checkpoint(folder, steered=False, shards=1),
+        {
+            "config.json": {
+                "text_config": {**_TEXT, "max_position_embeddings": 4096},
+                "vision_config": {
+                    "img_size": 256, "mm_hidden_size": TOWER,
+                    "timm_overrides": {"depths": [2, 2, 6, 2], "dims": [48, 96, 192, 384]},
+                },
+            },
+            "preprocessor_config.json": {"base_img_size": 256},
+        },
+    ),
+    "xiaomi-r0": Recipe(
+        xiaomi_checkpoints.write_checkpoint,
+        {
+            "config.json": {
+                "vlm_config": {
+                    "text_config": {**_HEADED, **_ROPE},
+                    "vision_config": {**_QWEN_TOWER, "deepstack_visual_indexes": [1, 3]},
+                },
+                "dit_config": {
+                    "hidden_size": 512, "num_hidden_layers": 6, "head_dim": HEAD, "num_key_value_heads": KEYS,
+                },
+            }
+        },
+    ),
+    "internvla-m1": Recipe(
+        internvla_checkpoints.write_checkpoint,
+        {
+            "../vlm/config.json": {
+                "text_config": {**_TEXT, **_ROPE},
+                "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]},
+            },
+            "config.yaml": {
+                "framework": {
+                    "layer_qformer": {
+                        "qformer_start_layer": 9, "qformer_end_layer": 13, "num_query_tokens": 64,
+                        "input_dim": WIDTH, "ouptput_dim": TOWER,
+                    },
+                    "action_model": {"action_hidden_dim": TOWER, "future_action_window_size": 15},
+                }
+            },
+            "dims.json": {
+                "dino": {**_TIMM, "img_size": 518, "patch_size": 14, "px": 224},
+                "dit": {"depth": 8, "token_size": TOWER, "num_heads": TOWER_HEADS}, "qformer_heads": TOWER_HEADS,
+            },
+        },
+    ),
+    "paligemma": Recipe(
+        vlm_checkpoints.write_paligemma,
+        {
+            "config.json": {
+                "text_config": {**_HEADED, "num_key_value_heads": 1},
+                "projection_dim": WIDTH, "hidden_size": WIDTH,
+                "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
+            },
+            "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
+        },
+    ),
+    "qwen2.5-vl": Recipe(
+        vlm_checkpoints.write_qwen2_5_vl,
+        {"config.json": {**_TEXT, **_ROPE, "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]}}},
+    ),
+    "qwen3-vl": Recipe(
+        vlm_checkpoints.write_qwen3_vl,
+        {
+            "config.json": {
+                "text_config": {**_HEADED, **_ROPE},
+                "vision_config": {**_QWEN_TOWER, "deepstack_visual_indexes": [1, 3]},
+            }
+        },
+    ),
+    "internvl": Recipe(
+        vlm_checkpoints.write_internvl,
+        {
+            "config.json": {
+                "text_config": _HEADED, "vision_config": {**_TOWER, "image_size": [224, 224]},
+            },
+            "preprocessor_config.json": {"size": {"height": 224, "width": 224}, "max_patches": 2},
+        },
+    ),
+    "ovis2.5": Recipe(
+        vlm_checkpoints.write_ovis2_5,
+        {"config.json": {"llm_config": _HEADED, "vit_config": _TOWER}},
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model and one inference of it.
+
+    infer: one inference, by the numbers that nobody who listens may change. roles: of its batch.
+    """
+
+    model: Model
+    infer: Callable[[], NDArray[np.float32]]
+    roles: Mapping[str, Sequence[Roles]]
+
+    @property
+    def layers(self) -> list[nn.Module]:
+        """The layers of every stored stream, as somebody who hooks modules would find them."""
+        taps = [self.model.tap(site).module for site in self.model.sites() if not site.iteration]
+        names = {id(module): name for name, module in self._network.named_modules()}
+        found = {names[id(tap)].rpartition(".")[0]: None for tap in taps if id(tap) in names}
+        numbered = [name for name in found if name.rpartition(".")[2].isdigit()]
+        return [self._network.get_submodule(name) for name in numbered]
+
+    @property
+    def stacks(self) -> list[nn.Module]:
+        """Modules with `layers` and a configuration that knows `output_hidden_states`."""
+        return [
+            module
+            for module in self._network.modules()
+            if isinstance(getattr(module, "layers", None), nn.ModuleList)
+            and hasattr(getattr(module, "config", None), "output_hidden_states")
+            and any(layer is own for layer in self.layers for own in module.layers)
+        ]
+
+    @property
+    def _network(self) -> nn.Module:
+        return next(value for value in vars(self.model).values() if isinstance(value, nn.Module))
+
+
+def subject(
+    family: str, folder: Path, device: str, dtype: str | None, batch: int, checkpoint: str | None = None
+) -> Subject:
+    """A family at the size of its recipe, written to `folder`, or at that of a checkpoint; weights are random."""
+    options: Mapping[str, Any] = {}
+    if checkpoint is None:
+        recipe = RECIPES[family]
+        place, options = recipe.write(folder / "tiny"), recipe.options
+        _enlarge(place, recipe.larger)
+        checkpoint = str(place)
+    model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
+    seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
+    if isinstance(model, Policy):
+        policy = model  # named, for the closure
+        return Subject(policy, lambda: policy.listen(seen, list(range(len(seen)))), policy.roles(seen))
+    assert isinstance(model, Reader)
+    reader = model
+    questions = [Question(one, "Which of them is red?", ("a", "b")) for one in seen]
+    return Subject(reader, lambda: reader.read(questions).option_logits, reader.asked_roles(questions))
+
+
+@contextmanager
+def hidden_states(subject: Subject) -> Iterator[list[int]]:
+    """transformers' own switch on every stack; gives how many hidden states each call returned."""
+    stacks, counts = subject.stacks, []
+
+    def count(_module: nn.Module, _inputs: Any, output: Any) -> None:
+        counts.append(len(getattr(output, "hidden_states", None) or ()))
+
+    handles = [stack.register_forward_hook(count) for stack in stacks]
+    before = [stack.config.output_hidden_states for stack in stacks]
+    try:
+        for stack in stacks:
+            stack.config.output_hidden_states = True
+        yield counts
+    finally:
+        for stack, value in zip(stacks, before, strict=True):
+            stack.config.output_hidden_states = value
+        for handle in handles:
+            handle.remove()
+
+
+def _enlarge(folder: Path, larger: Mapping[str, Values]) -> None:
+    """Raise sizes in the files around the weights, and remove those weights."""
+    import yaml
+
+    for name, changes in larger.items():
+        path = folder / name
+        as_json = path.suffix == ".json"
+        text = path.read_text()
+        values = _merged(json.loads(text) if as_json else yaml.safe_load(text), changes)
+        path.write_text(json.dumps(values) if as_json else yaml.safe_dump(values))
+    for path in (*folder.rglob("*.safetensors"), *folder.rglob("*.index.json")):
+        if not path.name.startswith("policy_"):  # statistics of lerobot's processors
+            path.unlink()
+
+
+def _merged(values: Any, changes: Values) -> Any:
+    return {
+        **values,
+        **{
+            name: _merged(values.get(name, {}), change) if isinstance(change, dict) else change
+            for name, change in changes.items()
+        },
+    }

@@ -1,0 +1,148 @@
+"""A pooled site at full size: how much of the machine's own matrix rate its probes reach.
+
+    python benchmarks/pooled_probes.py [--episodes 3440] [--width 2048] [--relabellings 200] [--folds 1]
+
+One inner training set on the whole grid of C and one outer set at the C that was chosen are timed (`--folds`: as
+many of each as outer folds), in processor time and on one thread, and scaled to the 20 and 5 of a site. Work is
+counted as it is done: a product of N samples in R coordinates with k columns is 2·N·R·k, whole Hessians are
+2·N·R²·k, and coordinates 2·N·D² for moments and again for turning; the eigenvectors of D × D, about 9·D³, are
+shown apart and are no part of the share. The rate is that of square products, 2,048 wide, in the same process.
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+from probes import features, labels_of
+from rich.console import Console
+from threadpoolctl import threadpool_limits
+
+from probe_kit.train import probe
+from probe_kit.train.design import DenseDesign
+from probe_kit.train.features import Coordinates
+from probe_kit.train.nested import INNER_FOLDS, OUTER_FOLDS, nested_folds
+from probe_kit.train.permutation import flip_items
+from probe_kit.train.samples import Samples
+
+
+@dataclass
+class Work:
+    """GFLOP in products so far, by precision."""
+
+    single: float = 0.0
+    double: float = 0.0
+
+    def add(self, design: DenseDesign, columns: int, inner: int = 1) -> None:
+        """A product of the design with so many columns; inner: of so many coordinates each."""
+        count, width = design.shape
+        gigaflop = 2 * count * width * columns * inner / 1e9
+        if design.samples.dtype == np.float32:
+            self.single += gigaflop
+        else:
+            self.double += gigaflop
+
+
+def counting(work: Work) -> dict[str, Callable[..., object]]:
+    """The products of a design, counted."""
+    product, gather, moments = DenseDesign.__matmul__, DenseDesign.gather, DenseDesign.moments
+
+    def counted_product(self: DenseDesign, weights: NDArray[np.float64]) -> object:
+        work.add(self, weights.shape[-1] if weights.ndim > 1 else 1)
+        return product(self, weights)
+
+    def counted_gather(self: DenseDesign, values: NDArray[np.float64]) -> object:
+        work.add(self, values.shape[1])
+        return gather(self, values)
+
+    def counted_moments(self: DenseDesign, weights: NDArray[np.float64]) -> object:
+        work.add(self, weights.shape[1], self.shape[1])
+        return moments(self, weights)
+
+    return {"__matmul__": counted_product, "gather": counted_gather, "moments": counted_moments}
+
+
+def rate(dtype: type[np.floating]) -> float:
+    """GFLOP/s of a product of two square matrices."""
+    square = np.random.default_rng(0).standard_normal((2048, 2048)).astype(dtype)
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        square @ square
+        times.append(time.process_time() - start)
+    return 2 * 2048**3 / min(times) / 1e9
+
+
+def main() -> None:
+    """Time some folds of a site and print the share."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=3440)
+    parser.add_argument("--width", type=int, default=2048)
+    parser.add_argument("--relabellings", type=int, default=200)
+    parser.add_argument("--folds", type=int, default=1)
+    parser.add_argument("--sites", type=int, default=1, help="of the model, for the scaled time")
+    asked = parser.parse_args()
+    console = Console(width=115, highlight=False)
+    samples = Samples.pooled(features(asked.episodes, asked.width))
+    real, items = labels_of(asked.episodes)
+    labels = np.column_stack([real, flip_items(real, items, asked.relabellings, seed=0)])
+    folds = nested_folds(real, items, seed=0)
+    spent = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}
+    fit, work, setting = Coordinates.fit.__func__, Work(), [0.0]  # type: ignore[attr-defined]
+
+    def timed_fit(cls: type[Coordinates], features: object) -> Coordinates:
+        start = time.process_time()
+        made: Coordinates = fit(cls, features)
+        spent["coordinates"] += time.process_time() - start
+        count, width = samples_shape(features)
+        setting[0] += 4 * count * width**2 / 1e9
+        return made
+
+    with (
+        threadpool_limits(1),
+        patch.multiple(DenseDesign, **counting(work)),
+        patch.object(Coordinates, "fit", classmethod(timed_fit)),
+    ):
+        single, double = rate(np.float32), rate(np.float64)
+        for fold in folds[: asked.folds]:
+            start = time.process_time()
+            strengths = probe.choose_strengths(samples, labels, fold.inner[:1])
+            spent["inner"] += time.process_time() - start
+            start = time.process_time()
+            probe._fit_fold(samples, labels, fold.outer, strengths)
+            spent["outer"] += time.process_time() - start
+    seconds = spent["inner"] + spent["outer"]
+    bound = work.single / single + (work.double + setting[0]) / double
+    whole = (OUTER_FOLDS * INNER_FOLDS * spent["inner"] + OUTER_FOLDS * spent["outer"]) / asked.folds
+    console.print(f"N = {asked.episodes:,}, D = {asked.width:,}, {labels.shape[1]} label columns")
+    console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64")
+    console.print(
+        f"inner {spent['inner']:.1f} s, outer {spent['outer']:.1f} s, "
+        f"of both coordinates {spent['coordinates']:.1f} s"
+    )
+    console.print(
+        f"products: {work.single:.0f} GFLOP in float32, {work.double:.0f} in float64; "
+        f"coordinates {setting[0]:.0f} and eigenvectors about {2 * asked.folds * 9 * asked.width**3 / 1e9:.0f}"
+    )
+    console.print(
+        f"{bound / seconds:.0%} of the rate (without eigenvectors, as if float32 paid nothing: "
+        f"{(work.single + work.double + setting[0]) / double / seconds:.0%})"
+    )
+    console.print(
+        f"a site, scaled: {whole:.0f} s; {asked.sites} sites: {asked.sites * whole / 3600:.1f} CPU-hours"
+    )
+    console.print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+
+
+def samples_shape(features: object) -> tuple[int, int]:
+    """(N, D) of what coordinates are fitted to."""
+    shape = getattr(features, "shape", (0, 0))
+    return int(shape[0]), int(shape[1])
+
+
+if __name__ == "__main__":
+    main()
