@@ -151,25 +151,26 @@ def _positions(mask: NDArray[np.bool_], device: str) -> Where:
 
 @dataclass
 class _Norms:
-    """Per fire the norms of tokens (T',) before, and of how far they moved; summed up after the inference."""
+    """Per fire the tokens (T', D) before and after; measured and summed up behind the inference, all at once."""
 
     before: "list[Tensor]" = field(default_factory=list)
-    moved: "list[Tensor]" = field(default_factory=list)
+    after: "list[Tensor]" = field(default_factory=list)
 
     def into(self, ledger: Ledger) -> None:
-        """Add them up. One transfer for all fires: a GPU waits at each."""
+        """Add them up. One transfer for all fires of one shape: a GPU waits at each."""
         import torch
 
-        if not self.before:
-            return
-        before, moved = torch.stack(self.before), torch.stack(self.moved)
-        rows = torch.stack([before.mean(dim=1), moved.mean(dim=1), moved.amax(dim=1)]).tolist()
-        for norm, mean, largest in zip(*rows, strict=True):
-            ledger.fires += 1
-            ledger.still += int(largest == 0)
-            ledger.norm += norm
-            ledger.moved += mean
-            ledger.largest = max(ledger.largest, largest)
+        for shape in dict.fromkeys(tokens.shape for tokens in self.before):
+            own = [at for at, tokens in enumerate(self.before) if tokens.shape == shape]
+            before, after = (torch.stack([some[at] for at in own]).float() for some in (self.before, self.after))
+            norms, moved = (torch.linalg.vector_norm(some, dim=-1) for some in (before, after - before))
+            rows = torch.stack([norms.mean(dim=1), moved.mean(dim=1), moved.amax(dim=1)]).tolist()
+            for norm, mean, largest in zip(*rows, strict=True):
+                ledger.fires += 1
+                ledger.still += int(largest == 0)
+                ledger.norm += norm
+                ledger.moved += mean
+                ledger.largest = max(ledger.largest, largest)
 
 
 @dataclass(frozen=True)
@@ -181,17 +182,18 @@ class _Changer:
     norms: _Norms
 
     def __call__(self, activation: "Tensor") -> "Tensor":
-        import torch
-
         if activation.shape[0] != 1 or activation.shape[1] != self.tokens:
             raise CaptureError(
                 f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.tokens} tokens"
             )
         passing = activation[0]
-        before = passing[self.where].float()
-        after = self.change(self.site, before, self.where).to(activation.dtype)
-        # Before anything is written: neighbours are seen through a view.
-        self.norms.before.append(torch.linalg.vector_norm(before, dim=-1))
-        self.norms.moved.append(torch.linalg.vector_norm(after.float() - before, dim=-1))
-        passing[self.where] = after
-        return activation
+        before = passing[self.where]
+        after = self.change(self.site, before.float(), self.where).to(activation.dtype)
+        self.norms.before.append(before)
+        self.norms.after.append(after)
+        if after.shape[0] == self.tokens:
+            return after[None]
+        # Not in place: neighbours are seen through a view, and what was there is measured later.
+        changed = passing.clone()
+        changed[self.where] = after
+        return changed[None]
