@@ -11,7 +11,7 @@ from probe_kit.hooks import Site
 from probe_kit.intervene import Effects, Interchange, Source, Steer, intervene_on, load_effects, stored_passing
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.directions import axes_of
-from probe_kit.intervene.patching import Replaced, ReplacedAlong
+from probe_kit.intervene.patching import Ledger, Replaced, ReplacedAlong, _Norms
 from probe_kit.intervene.places import places, token_mask
 
 if TYPE_CHECKING:
@@ -130,6 +130,22 @@ def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     rank_one = ReplacedAlong(donor, 5, basis[:1])(site, taken, where)  # type: ignore[arg-type]
     np.testing.assert_allclose(rank_one.numpy() @ basis[0], whole.numpy() @ basis[0], atol=1e-5)
     np.testing.assert_allclose(rank_one.numpy() @ basis[1], taken.numpy() @ basis[1], atol=1e-5)
+
+
+def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
+    """Two fires of one shape, one of another; the second moves nothing. By hand."""
+    import torch
+
+    norms, ledger = _Norms(), Ledger()
+    one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
+    for before, after in ((one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (one, one), (other, -other)):
+        norms.before.append(before)
+        norms.after.append(after)
+    norms.into(ledger)
+    assert (ledger.fires, ledger.still) == (3, 1)
+    assert (ledger.norm, ledger.moved, ledger.largest) == (3.0 + 3.0 + 2.0, 3.0 + 0.0 + 4.0, 4.0)
+    _Norms().into(empty := Ledger())
+    assert empty == Ledger()
 
 
 # -- where ---------------------------------------------------------------------------------------------------
