@@ -196,6 +196,20 @@ def shown(effect: float | None) -> str:
     return "n/a" if effect is None else f"{effect:.3f}"
 
 
+def properties(trial: Trial, runs: Sequence[tuple[Organism, Run]], loop: int) -> Iterator[Property]:
+    """All of them, as they are found. runs: of every organism. loop: items that are played again."""
+    yield from maps(trial, trial.run.streams["backbone"].layers - 1)
+    yield from verdicts(runs)  # behind the map: nothing is called used that passes nowhere
+    yield from memories(trial)
+    best = last_located(trial)
+    if best is None:
+        yield Property("what is used passes by one role at one place", False, "nowhere in every category")
+        return
+    yield from directions(trial, *best)
+    if loop:
+        yield from loops(trial, "|".join(best), loop)
+
+
 def main() -> int:
     """Make what is missing, and say of every property whether it holds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -217,19 +231,14 @@ def main() -> int:
         tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "encoded, unused")
     )
     trial = Trial(run, Source(suite.folder), used, unused)
-    properties = list(maps(trial, run.streams["backbone"].layers - 1))
-    properties += memories(trial)
-    if (best := last_located(trial)) is not None:
-        properties += directions(trial, *best)
-        if arguments.loop:
-            properties += loops(trial, "|".join(best), arguments.loop)
-    properties = [*verdicts(runs), *properties]
     weights = str(run.weights_sha256)[:12]
     print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")
-    print(*properties, sep="\n")
-    failed = sum(not one.holds for one in properties)
-    print(f"{len(properties) - failed} of {len(properties)} hold")
-    return 1 if failed else 0
+    found = []
+    for one in properties(trial, runs, arguments.loop):
+        print(one, flush=True)
+        found.append(one.holds)
+    print(f"{sum(found)} of {len(found)} hold")
+    return 0 if all(found) else 1
 
 
 if __name__ == "__main__":
