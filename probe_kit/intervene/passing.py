@@ -225,7 +225,13 @@ def _stored(run: RunReader, kind: Literal["interchange", "steer"]) -> dict[str, 
     for one in stored_interventions(run, kind):
         toward = str(one.settings["toward"]) if kind == "steer" else "exchanged"
         rows = passing(one.answers(), run.suite, toward, one.key)
-        found |= {str(name): [row for row in rows if row.category == name] for name in one.settings["categories"]}
+        # Along a direction says what carries an answer, not where it passes: it takes no map's place.
+        kept = found if one.settings.get("direction", "none") != "none" and kind == "interchange" else {}
+        found |= {
+            str(name): [row for row in rows if row.category == name]
+            for name in one.settings["categories"]
+            if name not in kept
+        }
     return found
 
 

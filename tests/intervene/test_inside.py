@@ -62,6 +62,16 @@ def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: Effects) -
     assert {row.place for row in stored_passing(copy)["color"]} == {"backbone.00", "backbone.03", "expert.02@0-1"}
 
 
+def test_an_interchange_along_a_direction_takes_no_maps_place(
+    copy: Run, source: Source, twin: "Policy", whole: Effects
+) -> None:
+    asked = Interchange(
+        categories=("color",), items=1, sites=("backbone.02",), roles=("image",), direction="mean-difference"
+    )
+    assert intervene_on(copy, asked, source, load=lambda *_: twin).key != whole.key
+    assert {row.key for row in stored_passing(copy)["color"]} == {whole.key}
+
+
 def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
     copy: Run, source: Source, twin: "Policy"
 ) -> None:
