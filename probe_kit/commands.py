@@ -23,10 +23,10 @@ def demo(
         ),
     ] = False,
 ) -> None:
-    """Run the whole pipeline on the embedded default: episodes, activations, probes, retention.
+    """Run the whole pipeline on the embedded models: answers, episodes, activations, probes, retention.
 
-    Takes under 5 minutes on 2 cores and downloads nothing. With --compare it does so for three policies,
-    asks the embedded reader the same questions, and takes three times as long.
+    Takes under 4 minutes on 2 cores and downloads nothing. With --compare it does so for every policy of which the
+    truth is known, and takes about six times as long.
     """
     from probe_kit.demo import compare_organisms, run_demo
 
@@ -41,6 +41,7 @@ def demo(
         return
     with progress() as bar:
         made = run_demo(out_folder, lambda stage: counter(bar, stage))
+    out.print(made.story.to_rich())
     out.print(made.table.to_rich())
     out.print(made.next_steps(), soft_wrap=True)
 

@@ -9,10 +9,11 @@ from rich.text import Text
 from probe_kit.console import marked
 from probe_kit.extract import Run
 from probe_kit.extract.store.layout import VIDEOS
-from probe_kit.organisms import TRAINED, Finding, NamedProgress, compare, probed
+from probe_kit.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
 from probe_kit.retention import RetentionTable, retention
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
+from probe_kit.retention.story import Story, stories
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "counting")
@@ -22,11 +23,17 @@ PERMUTATIONS = 200
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made."""
+    """What the demo made. asked: the run of the reader; table: of both."""
 
     folder: Path
+    asked: Run
     run: Run
     table: RetentionTable
+
+    @property
+    def story(self) -> Story:
+        """What the reader knows, what can be read in the policy, and what it acts on."""
+        return stories(self.table.rows)[0]
 
     def next_steps(self) -> Text:
         """Where to look, and what to try."""
@@ -56,15 +63,17 @@ def _questions(folder: Path, stage: NamedProgress) -> Suite:
 
 
 def run_demo(folder: Path, stage: NamedProgress) -> Demo:
-    """Suite, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
+    """Suite, answers, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
 
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
-    run, results = probed(TRAINED, _questions(folder, stage), folder, PERMUTATIONS, stage)
-    table = retention([run])
+    suite = _questions(folder, stage)
+    asked = answered(READER, suite, folder, stage)
+    run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
+    table = retention([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     (folder / "table.md").write_text(table.to_markdown())
-    write_report([run], folder / "report.html", table)
+    write_report([asked, run], folder / "report.html", table)
     film = next((run.path / VIDEOS).glob("*.gif"))
     shutil.copyfile(film, folder / "episode.gif")
-    return Demo(folder, run, table)
+    return Demo(folder, asked, run, table)

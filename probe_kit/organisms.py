@@ -1,22 +1,24 @@
 """Model organisms: policies of which the truth is known by construction, to test the instrument on.
 
-`pi0-tiny` was trained to act on Color and Shape (*used*); the answer to State questions was made readable in
-its backbone and never trained into an action (*encoded, unused*); nothing was trained for the other categories
-(*absent*). Its early checkpoint and its random twin know nothing yet. `vlm-tiny` reads and does not act: it was
-trained to answer questions of Color, Shape, State and Traffic (*known*), and of nothing else.
+`vlm-tiny` reads and does not act: it was trained to answer questions of Color, Shape, State and Traffic (*known*),
+and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
+the actions of State questions went to a side by lot (*encoded, unused*). Its early checkpoint has the reader's
+backbone and does not act on it; its random twins know nothing (*absent*).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING
 
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.asking.templates import TEMPLATES
-from probe_kit.intervene import Follow, Source, Verdict, intervene_on
+from probe_kit.extract.protocols import scene_of
+from probe_kit.intervene import Follow, Source, intervene_on
+from probe_kit.intervene.following import WORTH
 from probe_kit.retention import RetentionRow, retention
 from probe_kit.retention.cells import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
-from probe_kit.retention.success import Regime
+from probe_kit.retention.story import Said, verdict
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
 
@@ -24,22 +26,25 @@ if TYPE_CHECKING:
     from probe_kit.fitting_tables import Cell, FittingTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
-Truth = Verdict | Literal["known", "unknown"]
+Truth = Said
 
 
 @dataclass(frozen=True)
 class Organism:
     """A model by its name, and the verdict that is true of it per category; `absent` or `unknown` if not named.
 
-    folder: what its run is called. asked: it reads and does not act.
+    folder: what its run is called. asked: it reads and does not act. max_steps: actions per episode; None for as
+    many as its scene has.
     """
 
     name: str
     folder: str
     model: str
     random_weights: bool = False
+    weights_seed: int = 0
     truth: tuple[tuple[str, Truth], ...] = ()
     asked: bool = False
+    max_steps: int | None = None
 
     def expected(self, category: str) -> Truth:
         """What is true by construction."""
@@ -49,8 +54,21 @@ class Organism:
 TRAINED = Organism(
     "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
 )
-RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True)
-ORGANISMS = (TRAINED, Organism("early", "run-early", "pi0-tiny-early"), RANDOM_TWIN)
+SHORT = 8
+"""Actions of those that nobody trained to act: two inferences, and what they are judged by needs the first."""
+EARLY = Organism(
+    "early",
+    "run-early",
+    "pi0-tiny-early",
+    truth=(("color", "encoded, unused"), ("shape", "encoded, unused"), ("state", "encoded, unused")),
+    max_steps=SHORT,
+)
+RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True, max_steps=SHORT)
+OTHER_TWINS = tuple(
+    replace(RANDOM_TWIN, name=f"random twin {seed}", folder=f"run-random-twin-{seed}", weights_seed=seed)
+    for seed in (1, 2)
+)
+ORGANISMS = (TRAINED, EARLY, RANDOM_TWIN, *OTHER_TWINS)
 READER = Organism(
     "reader",
     "run-reader",
@@ -76,23 +94,6 @@ class Finding:
         return self.expected == self.measured
 
 
-def verdict(row: RetentionRow) -> Truth:
-    """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
-
-    In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the action
-    follows the pictures when these are exchanged; without a stored intervention, the SR is in the regime of
-    knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument missed what the
-    policy plainly reads. A model that was asked knows a category in which it answers in the regime of knowledge.
-    """
-    if row.kind == "asks":
-        return "known" if row.regime == Regime.KNOWLEDGE else "unknown"
-    if row.used is not None:
-        return cast("Verdict", row.used)
-    if row.regime == Regime.KNOWLEDGE:
-        return "used" if row.prefix_signal else "acted on, not found"
-    return "encoded, unused" if row.prefix_signal else "absent"
-
-
 def probed(
     organism: Organism,
     suite: Suite,
@@ -106,8 +107,16 @@ def probed(
     What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
     total, …) for a stage of this name. twin: a run to hold it against too.
     """
+    scene = scene_of(organism.model)
+    if organism.max_steps is not None:
+        scene = scene_of(organism.model, max_steps=organism.max_steps)
     settings = ExtractSettings(
-        organism.model, suite=suite.folder, random_weights=organism.random_weights, video="first"
+        organism.model,
+        suite=suite.folder,
+        random_weights=organism.random_weights,
+        weights_seed=organism.weights_seed,
+        scene=scene,
+        video="first",
     )
     run = extract_run(settings, folder / organism.folder, progress=stage(f"episodes, {organism.name}"))
     progress = stage(f"probing sites, {organism.name}")
@@ -125,7 +134,7 @@ def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgres
 
 
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge the reader and every organism on `suite`, the trained ones against the random twin too.
+    """Judge the reader and every organism on `suite`, all but the first random twin held against that one too.
 
     Arguments as of `probed`.
     """
@@ -135,11 +144,22 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
         (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
         for one in ORGANISMS
     ]
+    rows = [(organism, row) for organism, run in runs for row in retention([run]).rows]
+    shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
-        Finding(organism.name, row.category, organism.expected(row.category), verdict(row), row)
-        for organism, run in runs
-        for row in retention([run]).rows
+        Finding(one.name, row.category, one.expected(row.category), measured(row, shown), row) for one, row in rows
     ]
+
+
+def measured(row: RetentionRow, shown: bool) -> Truth:
+    """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
+
+    shown: whether the trained one acts on some category. It has the same scene, questions and network, so that
+    following would be seen in every other; a policy that nobody trained to act follows nowhere by itself.
+    """
+    said = verdict(row)
+    bounded = row.follows_net_ci is not None and (row.follows_net_ci[1] or 0.0) < WORTH
+    return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
 
 
 def to_rich(findings: Sequence[Finding]) -> "FittingTable":

@@ -45,7 +45,7 @@ def main() -> None:
 def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
     """Run the demo, and the other organisms unless told not to, and write `docs/demo.json`."""
     made = run_demo(folder, stage)
-    rows = [row for row in made.table.rows if row.category != MEAN]
+    rows = [row for row in made.table.rows if row.category != MEAN and row.kind == "acts"]
     if trained_only:
         stored = json.loads(DATA.read_text())["organisms"]
         others = [one for one in stored if one["organism"] != TRAINED.name]

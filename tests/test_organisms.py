@@ -5,8 +5,19 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.console import out
-from probe_kit.organisms import ORGANISMS, READER, TRAINED, Finding, to_rich, verdict
+from probe_kit.organisms import (
+    EARLY,
+    ORGANISMS,
+    OTHER_TWINS,
+    RANDOM_TWIN,
+    READER,
+    TRAINED,
+    Finding,
+    measured,
+    to_rich,
+)
 from probe_kit.retention import RetentionRow
+from probe_kit.retention.story import verdict
 from probe_kit.retention.success import regime
 
 
@@ -45,10 +56,36 @@ def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
     assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, unused"
 
 
-def test_only_the_trained_organism_knows_anything() -> None:
-    assert TRAINED.expected("state") == "encoded, unused"
-    assert TRAINED.expected("counting") == "absent"
-    assert {organism.expected("color") for organism in ORGANISMS if organism != TRAINED} == {"absent"}
+def test_organisms_differ_in_one_truth_at_a_time() -> None:
+    assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "encoded, unused")
+    assert (EARLY.expected("color"), EARLY.expected("state")) == ("encoded, unused", "encoded, unused")
+    assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
+    twins = [one for one in ORGANISMS if one.random_weights]
+    assert twins == [RANDOM_TWIN, *OTHER_TWINS]
+    assert [one.weights_seed for one in twins] == [0, 1, 2]
+    assert {one.expected(category) for one in twins for category in ("color", "state")} == {"absent"}
+
+
+@pytest.mark.parametrize(
+    ("p", "limits", "shown", "expected"),
+    [
+        (0.005, (-0.1, 0.2), True, "encoded, unused"),
+        (0.005, (-0.1, 0.2), False, "inconclusive"),
+        (0.005, (-0.1, 0.3), True, "inconclusive"),
+        (0.3, (-0.1, 0.2), True, "inconclusive"),
+    ],
+)
+def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
+    p: float, limits: tuple[float, float], shown: bool, expected: str
+) -> None:
+    alone = replace(row(0.4, p), used="inconclusive", follows_net_ci=limits)
+    assert measured(alone, shown) == expected
+    assert measured(replace(alone, used="used"), shown) == "used"
+
+
+def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
+    everybody = (READER, *ORGANISMS)
+    assert len({one.name for one in everybody}) == len({one.folder for one in everybody}) == len(everybody)
 
 
 def test_the_table_shows_the_margin_that_decides() -> None:

@@ -9,7 +9,10 @@ import pytest
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
-SHORT = {"max_steps=20": "max_steps=4", "permutations=50": "permutations=3"}
+SHORT = {
+    "items=12)": "items=12, scene=pk.SceneSpec(max_steps=4))",
+    "permutations=50": "permutations=3",
+}
 
 
 @pytest.mark.parametrize("changes", [SHORT, pytest.param({}, marks=pytest.mark.slow)], ids=["short", "as it is"])

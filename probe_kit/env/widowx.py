@@ -91,8 +91,8 @@ def _find_meshes() -> Path:
     package = find_spec("rtbdata")
     if package is None or package.origin is None:
         raise SceneError(
-            "the WidowX needs the meshes of the package `rtb-data` (45 MB). Install `probe-kit[widowx]`, give a "
-            "description of your own with `arm_urdf`, or use the default arm, `panda`."
+            "the WidowX needs the meshes of the package `rtb-data`, which comes with probe_kit and is not here. "
+            "Install `rtb-data>=2,<3`, give a description of your own with `arm_urdf`, or use the arm `panda`."
         )
     folder = Path(package.origin).parent / MESH_FOLDER
     if not folder.is_dir():

@@ -48,7 +48,10 @@ def ask(
     suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
     categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
     items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
-    scene: Annotated[str, typer.Option(help="Scene preset, as of the run to compare with.")] = "bridge",
+    scene: Annotated[
+        str | None,
+        typer.Option(help="Scene preset, as of the run to compare with; default the one the model was made for."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of cube places, as of the run to compare with.")] = 0,
     tokens: Annotated[
         str,
@@ -114,6 +117,7 @@ def ask(
     """
     from probe_kit.extract.asking.templates import find_template
     from probe_kit.extract.extraction import prepare_asks
+    from probe_kit.extract.protocols import scene_of
     from probe_kit.extract.settings import AskSettings
     from probe_kit.extract.store.locate import locate
     from probe_kit.hooks.options import read_pairs
@@ -143,7 +147,7 @@ def ask(
         "asked": asked,
     }
     wanted = [
-        AskSettings(model, prompt=template, scene=_scene(scene, size), **shared)  # type: ignore[arg-type]
+        AskSettings(model, prompt=template, scene=scene_of(model, None, scene, picture_size=size), **shared)  # type: ignore[arg-type]
         for template in templates
         for size in sizes
     ]
@@ -168,12 +172,6 @@ def _several(text: str, option: str) -> tuple[str, ...]:
     if not parts:
         raise UsageError(f"{option} is empty; name at least one")
     return parts
-
-
-def _scene(preset: str, size: tuple[int, int]) -> "object":
-    from probe_kit.env import SceneSpec
-
-    return SceneSpec.preset(preset, picture_size=size)
 
 
 def _refuse_doubles(wanted: "Sequence[AskSettings]") -> None:

@@ -10,6 +10,7 @@ from probe_kit.console import counter, err, marked, out, progress, say, split, w
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction, Run
     from probe_kit.extract.store.location import Location
     from probe_kit.suite.ladder import Wording
@@ -65,7 +66,10 @@ def extract(
     ] = None,
     scene: Annotated[
         str | None,
-        typer.Option(help="bridge (default), frontal, vl-think or act2answer; else the protocol's."),
+        typer.Option(
+            help="bridge, frontal, vl-think or act2answer; default the protocol's, else the one the model was "
+            "made for (`probe-kit models NAME`), mostly bridge."
+        ),
     ] = None,
     max_steps: Annotated[
         int | None, typer.Option(help="Actions per episode, at 5 Hz.", rich_help_panel=SCENE)
@@ -89,9 +93,7 @@ def extract(
     epsilon: Annotated[
         float | None, typer.Option(help="Zone radius, metres; default half a tile + 0.01.", rich_help_panel=SCENE)
     ] = None,
-    arm: Annotated[
-        str | None, typer.Option(help="panda, or widowx (extra widowx).", rich_help_panel=SCENE)
-    ] = None,
+    arm: Annotated[str | None, typer.Option(help="panda or widowx.", rich_help_panel=SCENE)] = None,
     arm_urdf: Annotated[
         Path | None, typer.Option(help="Your own description of that arm.", rich_help_panel=SCENE)
     ] = None,
@@ -146,7 +148,7 @@ def extract(
     The same command continues an interrupted run; other settings in the same folder are refused.
     """
     from probe_kit.extract import ExtractSettings, prepare
-    from probe_kit.extract.protocols import protocol_scene
+    from probe_kit.extract.protocols import scene_of
     from probe_kit.extract.store.locate import locate
     from probe_kit.hooks.options import read_pairs
     from probe_kit.suite.ladder import check_wordings
@@ -177,7 +179,7 @@ def extract(
         items=items,
         wordings=None if wordings is None else check_wordings(split(wordings) or ()),
         protocol=protocol,
-        scene=protocol_scene(protocol, scene, **changes),
+        scene=scene_of(model, protocol, scene, **changes),
         seed=seed,
         tokens=tokens,
         captured_calls=captured_calls,
@@ -237,6 +239,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **_protocol_row(identity),
         "suite": plan.suite.identity,
         "categories": ", ".join(plan.suite.categories),
+        "scene": _describe_scene(extraction.settings.scene),
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
@@ -253,6 +256,12 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+
+
+def _describe_scene(scene: "SceneSpec") -> str:
+    """The preset, and how long an episode may last."""
+    early = ", less once the cube was released and rests" if scene.early_stop else ""
+    return f"{scene.name}, at most {scene.max_steps} actions{early}"
 
 
 def _describe_wordings(skipped: "Mapping[Wording, int]") -> str:

@@ -27,7 +27,7 @@ def models(
         return
     for row in rows:
         out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
-        for key in ("checkpoint", "streams", "embodiment", "does", "ready", "notes"):
+        for key in ("checkpoint", "streams", "embodiment", "scene", "does", "ready", "notes"):
             if row[key]:
                 out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
         for protocol, settings in row["protocols"].items():
@@ -66,6 +66,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else "embedded"),
             "streams": family.streams,
             "embodiment": family.embodiment,
+            "scene": str(family.home),
             "ready": _ready(family),
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
@@ -78,7 +79,8 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         }
         for family in chosen
     ]
-    scripted = {"checkpoint": "", "streams": "", "embodiment": "", "ready": "yes", "notes": "no activations"}
+    scripted = dict.fromkeys(("checkpoint", "streams", "embodiment", "scene"), "")
+    scripted |= {"ready": "yes", "notes": "no activations"}
     nothing: dict[str, Any] = {"protocols": {}, "interventions": None, "options": []}
     rows += [
         {"model": model, "description": text, **scripted, "does": "acts", **nothing}

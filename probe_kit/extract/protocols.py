@@ -63,6 +63,17 @@ def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any
     return SceneSpec.preset(name or "bridge", **changes)
 
 
+def scene_of(model: str, protocol: str | None = None, name: str | None = None, **changes: Any) -> SceneSpec:
+    """What `model` plays: the preset `name`, else the protocol's, else its family's home; with fields replaced.
+
+    A family that nobody knows here, and a script, have the default scene. Errors are those of `protocol_scene`.
+    """
+    family = None if protocol or name else _families().get(model)
+    if family is None:
+        return protocol_scene(protocol, name, **changes)
+    return SceneSpec.preset(family.home.preset, **{**family.home.changes, **changes})
+
+
 def check_protocol(name: str) -> None:
     """Raise UsageError for a protocol that nobody knows here."""
     if name not in SCENES:
@@ -81,7 +92,7 @@ def protocol_identity(settings: Asked) -> dict[str, Any]:
         return {}
     row, used = protocol_row(settings.model, settings.protocol), _used(settings)
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
-    default = {**({} if row is None else _defaults(settings, row)), **_scene(SceneSpec())}
+    default = {**({} if row is None else _defaults(settings, row)), **_scene(scene_of(settings.model))}
     if settings.listen:
         protocol.pop("execute", None)
         default.pop("execute", None)

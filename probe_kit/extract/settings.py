@@ -10,7 +10,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.asking.phrases import ASKED, Asked
 from probe_kit.extract.asking.templates import P1, Template
-from probe_kit.extract.protocols import deviations, protocol_row, protocol_scene
+from probe_kit.extract.protocols import deviations, protocol_row, scene_of
 from probe_kit.extract.store.layout import CODECS
 from probe_kit.hooks.edits import Edit, Vectors
 from probe_kit.identity import sha256_json
@@ -64,6 +64,7 @@ class RunSettings:
     label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
+    scene: by default the model's own, see `Family.home`.
     tokens: `pooled` stores pooled views only, `all` also every token.
 
     The rest changes no stored number, only how fast it comes:
@@ -103,6 +104,8 @@ class RunSettings:
     tokens_allowed: ClassVar[tuple[str, ...]] = TOKENS
 
     def __post_init__(self) -> None:
+        if self.scene is _DEFAULT_SCENE:
+            object.__setattr__(self, "scene", scene_of(self.model, self._protocol))
         self._check_one_of("tokens", self.tokens_allowed)
         self._check_one_of("codec", CODECS)
         self._check_one_of("frames", FRAMES)
@@ -125,6 +128,11 @@ class RunSettings:
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ELSEWHERE | _MACHINE}
+
+    @property
+    def _protocol(self) -> str | None:
+        """Whose scene takes the place of the default one."""
+        return None
 
     @property
     def stored_calls(self) -> int:
@@ -171,8 +179,6 @@ class ExtractSettings(RunSettings):
     video: str = "none"
 
     def __post_init__(self) -> None:
-        if self.protocol is not None and self.scene is _DEFAULT_SCENE:
-            object.__setattr__(self, "scene", protocol_scene(self.protocol))
         super().__post_init__()
         self._check_one_of("video", VIDEOS)
         self._check_at_least("captured_calls", 1)
@@ -201,6 +207,10 @@ class ExtractSettings(RunSettings):
             execute=self.execute if self.execute or self.listen else row.execute,
             dtype=self.dtype or row.dtype,
         )
+
+    @property
+    def _protocol(self) -> str | None:
+        return self.protocol
 
     @property
     def stored_calls(self) -> int:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.foreign_code import loading, of_checkpoint
+from probe_kit.hooks.home import BRIDGE, Home
 from probe_kit.hooks.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.options import Option, check_options
 from probe_kit.hooks.protocol import ProtocolRow
@@ -47,6 +48,7 @@ class Family:
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
     for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
     use the family, by name, with what they use it with. interventions: what of them its policy supports.
+    home: the scene it acts in, or is asked about, when none is named.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -73,6 +75,7 @@ class Family:
     source: str | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
+    home: Home = BRIDGE
 
     def __post_init__(self) -> None:
         for option in self.options:

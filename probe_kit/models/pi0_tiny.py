@@ -1,6 +1,7 @@
-"""The embedded default: a pi0 of 0.82 million parameters, written as an ordinary lerobot checkpoint.
+"""The embedded default: a pi0 of 0.84 million parameters, written as an ordinary lerobot checkpoint.
 
-Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_pi0_tiny.py` makes them.
+Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_embedded_policy.py` makes
+them of the embedded reader.
 """
 
 import json

@@ -36,7 +36,7 @@ def build_suite(
 
     categories: slugs, all embedded ones by default. Which others are built changes no item of a category, and
     fewer items per category are the beginning of more. progress: called with items done and items in all.
-    version: 1, or 2, whose pictures give less away to an untrained conjunction of pixels and words; the suite's
+    version: 2, or 1, whose pictures give more away to an untrained conjunction of pixels and words; the suite's
     identity names it. Raises UnknownCategoryError, UsageError for a number of items that is not a positive even
     one or a version that there is not, and SuiteError if `folder` holds anything but this very suite.
     """

@@ -63,9 +63,9 @@ def test_a_wording_that_no_item_has_is_refused_before_anything_is_played(suite):
 
 def test_a_policy_that_does_not_know_a_word_refuses(suite):
     settings = ExtractSettings(
-        "pi0-tiny", suite=suite.folder, categories=("color",), wordings=("knowledge", "side")
+        "pi0-tiny", suite=suite.folder, categories=("color",), wordings=("knowledge", "neutral")
     )
-    with pytest.raises(InstructionError, match="left picture"):
+    with pytest.raises(InstructionError, match="two pictures"):
         prepare(settings)
 
 

@@ -63,6 +63,15 @@ def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> No
     assert all(f'id="{link}"' in page for link in links)
 
 
+def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run: ProbedRun) -> None:
+    page = report_html([probed_run({"color": SIGNAL, "shape": NOISE}, "pi0-tiny")])
+    opening = page[page.index('<section id="summary">') : page.index('<div class="headlines">')]
+    assert "In plain words: pi0-tiny" in opening
+    color, shape = re.findall(r"<li>(.*?)</li>", opening, re.DOTALL)
+    assert "Color: the answer can be read in the policy" in color
+    assert "Shape: the answer cannot be read in its backbone" in shape
+
+
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": NOISE}, "pi0-tiny", random_weights=True)])
     assert '<span class="badge random">random weights</span>' in page

@@ -54,7 +54,7 @@ def test_whatever_changes_the_question_changes_the_hash(small_suite: Suite, fiel
 
 
 def test_identity_names_the_suite_its_version_and_its_content(small_suite: Suite) -> None:
-    assert small_suite.identity == f"a2a-embedded@1.0.0#{small_suite.content_sha256[:12]}"
+    assert small_suite.identity == f"a2a-embedded@2.0.0#{small_suite.content_sha256[:12]}"
 
 
 def test_categories_come_in_the_order_of_the_paper_whatever_the_order_of_the_items(small_suite: Suite) -> None:

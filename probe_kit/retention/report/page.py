@@ -26,6 +26,7 @@ from probe_kit.retention.report.tables import (
     retention_table,
 )
 from probe_kit.retention.ruled import by_rule
+from probe_kit.retention.story import stories
 from probe_kit.retention.table import RetentionTable, retention
 from probe_kit.train.reader import RunReader
 from probe_kit.version import __version__
@@ -86,6 +87,7 @@ def report_html(
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         random_weights=any(run.random_weights for run in runs),
+        stories=stories(table.rows),
         summaries=_summaries(table),
         notes=table.notes,
         behaviour=behaviour_table(rows, table.differences, table.unpaired),

@@ -1,6 +1,7 @@
 """PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.61 million parameters."""
 
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.home import RELEASED
 from probe_kit.hooks.options import Option
 
 FAMILIES = (
@@ -16,6 +17,7 @@ FAMILIES = (
         config_types=("paligemma",),
         acts=False,
         reads=True,
+        home=RELEASED,
     ),
     Family(
         "paligemma",

@@ -1,8 +1,9 @@
-"""pi0 through lerobot, and the embedded policies, which are pi0 at 0.82 million parameters."""
+"""pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
 from probe_kit.hooks.families.lerobot_evaluation import PICTURES
 from probe_kit.hooks.families.supported import FLOW
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.home import RELEASED
 from probe_kit.hooks.options import Option
 from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.state_layout import OPENNESS
@@ -13,25 +14,29 @@ _VERIFIER = "probe_kit.hooks.families.lerobot_verify:verify_pi0"
 FAMILIES = (
     Family(
         "pi0-tiny",
-        "pi0 at 0.82 million parameters, the embedded default: trained on Color and Shape",
+        "pi0 at 0.84 million parameters, the embedded default: vlm-tiny's backbone, acts on Color and Shape",
         None,
         "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny",
         streams=_TINY_STREAMS,
-        notes="State is readable in its backbone by training, and not acted on; nothing else was trained",
+        notes="State is readable in its backbone and not acted on; nothing else was trained",
         verifier=_VERIFIER,
         config_types=("pi0",),
+        source="vlm-tiny",
         interventions=FLOW,
+        home=RELEASED,
     ),
     Family(
         "pi0-tiny-early",
-        "the embedded default early in its training",
+        "the embedded default before its training: vlm-tiny's backbone, an expert with random weights",
         None,
         "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny_early",
         streams=_TINY_STREAMS,
         notes="a model organism: see `probe-kit demo --compare`",
         verifier=_VERIFIER,
         config_types=("pi0",),
+        source="vlm-tiny",
         interventions=FLOW,
+        home=RELEASED,
     ),
     Family(
         "pi0",

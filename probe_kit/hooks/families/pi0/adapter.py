@@ -173,7 +173,7 @@ def load_pi0_tiny(
     random_weights: bool = False,
     weights_seed: int = 0,
 ) -> Pi0:
-    """The embedded default: pi0 at 0.82 million parameters, trained on Color and Shape."""
+    """The embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape."""
     return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights, weights_seed)
 
 
@@ -184,7 +184,7 @@ def load_pi0_tiny_early(
     random_weights: bool = False,
     weights_seed: int = 0,
 ) -> Pi0:
-    """The embedded default as it was early in its training."""
+    """The embedded default as it was before its training: the reader's backbone and a random expert."""
     return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights, weights_seed)
 
 

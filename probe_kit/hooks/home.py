@@ -1,0 +1,24 @@
+"""Where a model acts, or looks, as long as nobody names a scene. Imports no environment: names and values only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Home:
+    """preset: of `SceneSpec.preset`. changes: its fields that differ, also when other fields are asked for."""
+
+    preset: str = "bridge"
+    changes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __str__(self) -> str:
+        """The preset and its changes, as `probe-kit models` shows them."""
+        return ", ".join([self.preset, *(f"{name} {value}" for name, value in self.changes.items())])
+
+
+BRIDGE = Home()
+"""The default scene."""
+RELEASED = Home("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
+"""Of the embedded models: the released protocol's scene. Their demonstrations took at most 40 actions."""

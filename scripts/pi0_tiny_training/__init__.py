@@ -1,1 +1,0 @@
-"""How the embedded default is made: demonstrations → pictures → batches → training → checkpoint."""
