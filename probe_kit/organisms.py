@@ -2,8 +2,9 @@
 
 `vlm-tiny` reads and does not act: it was trained to answer questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
-the actions of State questions went to a side by lot (*encoded, unused*). Its early checkpoint has the reader's
-backbone and does not act on it; its random twins know nothing (*absent*).
+the actions of State questions went to a side by lot (*encoded, unused*). `pi0-tiny-state` differs in that they
+followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; random twins
+know nothing (*absent*).
 """
 
 from collections.abc import Callable, Sequence
@@ -54,6 +55,12 @@ class Organism:
 TRAINED = Organism(
     "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
 )
+STATE_USED = Organism(
+    "State used",
+    "run-state-used",
+    "pi0-tiny-state",
+    truth=(("color", "used"), ("shape", "used"), ("state", "used")),
+)
 SHORT = 8
 """Actions of those that nobody trained to act: two inferences, and what they are judged by needs the first."""
 EARLY = Organism(
@@ -68,7 +75,7 @@ OTHER_TWINS = tuple(
     replace(RANDOM_TWIN, name=f"random twin {seed}", folder=f"run-random-twin-{seed}", weights_seed=seed)
     for seed in (1, 2)
 )
-ORGANISMS = (TRAINED, EARLY, RANDOM_TWIN, *OTHER_TWINS)
+ORGANISMS = (TRAINED, STATE_USED, EARLY, RANDOM_TWIN, *OTHER_TWINS)
 READER = Organism(
     "reader",
     "run-reader",

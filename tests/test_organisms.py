@@ -11,6 +11,7 @@ from probe_kit.organisms import (
     OTHER_TWINS,
     RANDOM_TWIN,
     READER,
+    STATE_USED,
     TRAINED,
     Finding,
     measured,
@@ -59,6 +60,7 @@ def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
 def test_organisms_differ_in_one_truth_at_a_time() -> None:
     assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "encoded, unused")
     assert (EARLY.expected("color"), EARLY.expected("state")) == ("encoded, unused", "encoded, unused")
+    assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
     assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
     twins = [one for one in ORGANISMS if one.random_weights]
     assert twins == [RANDOM_TWIN, *OTHER_TWINS]

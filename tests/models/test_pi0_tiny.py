@@ -17,7 +17,7 @@ from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.pi0_tiny import ACTION_DIMS
 from probe_kit.suite import build_suite
 
-NAMES = ("pi0-tiny", "pi0-tiny-early")
+NAMES = ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state")
 READER = "vlm-tiny"
 
 

@@ -188,6 +188,17 @@ def load_pi0_tiny_early(
     return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights, weights_seed)
 
 
+def load_pi0_tiny_state(
+    checkpoint: str | None = None,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
+) -> Pi0:
+    """The embedded default but for one thing: it was trained to act on State too."""
+    return _load_embedded("pi0-tiny-state", checkpoint, device, dtype, random_weights, weights_seed)
+
+
 def _load_embedded(
     name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool, weights_seed: int
 ) -> Pi0:
