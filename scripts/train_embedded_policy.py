@@ -2,11 +2,16 @@
 
 Records demonstrations in the released protocol's scene, draws pictures, gives `vlm-tiny`'s backbone an action
 expert, and trains both to act. Writes `OUT/pi0-tiny`; `OUT/pi0-tiny-state`, which differs in one thing, that
-its actions follow State too; and `OUT/pi0-tiny-early`. Called again it continues where it was stopped.
+its actions follow State too; and `OUT/pi0-tiny-early`, which has the reader's backbone and has not learnt to act.
+Called again it continues where it was stopped.
 `OUT/time.json` says how much processor time each part took. Nothing of the evaluation split is used: other
 pictures, drawn from another seed.
 """
 
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import batched
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -14,26 +19,27 @@ import torch
 import typer
 from acting_training.acting import LEFT_OPEN, UNDERSTANDING, Actor, Followed, acting
 from acting_training.checkpoint import measured_statistics, start_of_policy
-from acting_training.demonstrations import Demonstrations, record, training_scene
+from acting_training.demonstrations import record, training_scene
 from acting_training.frames import Frames
 from vlm_tiny_training.batches import Pairs
 from vlm_tiny_training.painting import calibrate
-from vlm_tiny_training.pictures import PictureBank, read_banks
+from vlm_tiny_training.pictures import read_banks
 from vlm_tiny_training.spent import timed
 from vlm_tiny_training.training import Trainer, draw_losses, follow
 
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.pi0_tiny import write_checkpoint
+from probe_kit.models.pi0_tiny import Statistics, write_checkpoint
 
-SHARES = {"color": 0.28, "shape": 0.42, LEFT_OPEN: 0.30}
+SHARES = {"color": 0.36, "shape": 0.42, LEFT_OPEN: 0.22}
 """Of each category in a batch."""
 TABLE = "table"
 PICTURE_SEED = 715_517
-COUPLES = {1: 1200, 2: 2400}
-"""By version of the suite's pictures."""
+COUPLES = {1: 1200, 2: 9000}
+COUPLES_LEFT_OPEN = {1: 1200, 2: 2400}
+"""By version of the suite's pictures; the actions of the second follow from few."""
 DEMONSTRATIONS = range(90)
 BATCH = 32
-EARLY_STEP = 100
+COMMON = "common"
 BRANCHES: dict[str, Followed] = {"pi0-tiny": "by lot", "pi0-tiny-state": "always"}
 
 
@@ -41,7 +47,7 @@ def main(
     out: Annotated[Path, typer.Argument(help="Folder for data, training state and checkpoints.")],
     seed: Annotated[int, typer.Option(help="Seed of weights, batches and flow noise.")] = 0,
     threads: Annotated[int, typer.Option(help="Of torch.")] = 1,
-    processes: Annotated[int, typer.Option(help="That record and draw.")] = 1,
+    processes: Annotated[int, typer.Option(help="That record, draw, and train a branch each.")] = 1,
 ) -> None:
     """Record, draw, train, write."""
     torch.set_num_threads(threads)
@@ -49,13 +55,33 @@ def main(
     with timed(out, "data"):
         surface = calibrate(training_scene())
         demonstrations = record(out / "demonstrations.npz", DEMONSTRATIONS, processes, print)
-        banks = read_banks(out, tuple(SHARES), PICTURE_SEED, COUPLES, {TABLE: surface}, processes, print)
-    frames = Frames(TABLE, surface, demonstrations)
+        surfaces, acted = {TABLE: surface}, tuple(category for category in SHARES if category != LEFT_OPEN)
+        banks = read_banks(out, acted, PICTURE_SEED, COUPLES, surfaces, processes, print)
+        banks += read_banks(out, (LEFT_OPEN,), PICTURE_SEED, COUPLES_LEFT_OPEN, surfaces, processes, print)
+    frames, statistics = Frames(TABLE, surface, demonstrations), measured_statistics(demonstrations)
+    start = start_of_policy(out / "start", seed, statistics)
+    _write(out / "pi0-tiny-early", start, statistics, f"not yet, seed {seed}", torch.float16)
+
+    def train(name: str, followed: Followed) -> None:
+        torch.set_num_threads(threads)
+        _train(out, name, followed, seed, Pairs(banks, SHARES), frames, statistics)
+
     with timed(out, "common part"):
-        _train(out, "common", "not at all", seed, banks, frames, demonstrations)
-    for name, followed in BRANCHES.items():
-        with timed(out, name):
-            _train(out, name, followed, seed, banks, frames, demonstrations)
+        _at_once(processes, train, {COMMON: "not at all"})
+    with timed(out, "branches"):
+        _at_once(processes, train, BRANCHES)
+
+
+def _at_once(processes: int, train: Callable[[str, Followed], None], parts: Mapping[str, Followed]) -> None:
+    """Train the parts in processes of their own, forked from one that never trained: torch asks for that."""
+    for group in batched(parts.items(), processes):
+        running = [get_context("fork").Process(target=train, args=part) for part in group]
+        for one in running:
+            one.start()
+        for one in running:
+            one.join()
+        if any(one.exitcode for one in running):
+            raise typer.Exit(1)
 
 
 def _train(
@@ -63,34 +89,28 @@ def _train(
     name: str,
     followed: Followed,
     seed: int,
-    banks: list[PictureBank],
+    pairs: Pairs,
     frames: Frames,
-    demonstrations: Demonstrations,
+    statistics: Statistics,
 ) -> None:
     """The common part, from the reader; or a branch, from the common part."""
-    statistics = measured_statistics(demonstrations)
-    policy = start_of_policy(out / "start", seed, statistics)
-    actor = Actor(policy, Pairs(banks, SHARES), frames)
-    common = out / "common.pt"
-    branches = name != "common"
+    policy = Pi0.load(str(out / "start"))
+    actor = Actor(policy, pairs, frames)
+    branches = name != COMMON
     if branches:
-        actor.network.load_state_dict(torch.load(common, weights_only=True)["network"])
+        common = torch.load(out / f"{COMMON}.pt", weights_only=True)
+        actor.network.load_state_dict(common["network"])
     stages = acting(followed) if branches else UNDERSTANDING
     trainer = Trainer(actor, stages, seed + int(branches), out / f"{name}.pt", BATCH)
-
-    def early() -> None:
-        _write(out / "pi0-tiny-early", policy, demonstrations, f"{trainer.step} steps, seed {seed}", torch.float16)
-
-    follow(trainer, out / f"{name}.csv", print, {} if branches else {EARLY_STEP: early})
+    follow(trainer, out / f"{name}.csv", partial(print, flush=True))
     draw_losses(out / f"{name}.csv", out / f"{name}.png", BATCH)
     if branches:
-        _write(out / name, policy, demonstrations, f"{followed}, {trainer.step} steps, seed {seed}", torch.float32)
+        dtype = torch.float32 if name == "pi0-tiny" else torch.float16
+        _write(out / name, policy, statistics, f"{followed}, {trainer.step} steps, seed {seed}", dtype)
 
 
-def _write(folder: Path, policy: Pi0, demonstrations: Demonstrations, note: str, dtype: torch.dtype) -> None:
-    write_checkpoint(
-        folder, policy.network, measured_statistics(demonstrations), f"vlm-tiny, trained to act: {note}", dtype
-    )
+def _write(folder: Path, policy: Pi0, statistics: Statistics, note: str, dtype: torch.dtype) -> None:
+    write_checkpoint(folder, policy.network, statistics, f"vlm-tiny, trained to act: {note}", dtype)
 
 
 if __name__ == "__main__":

@@ -44,13 +44,13 @@ class Acts:
     followed: Followed
 
 
-UNDERSTANDING = (Stage(2000, 1.5e-3, Acts(0.4, 0.6, "not at all"), last_rate=6e-4),)
+UNDERSTANDING = (Stage(6000, 1.5e-3, Acts(0.5, 0.5, "not at all"), last_rate=5e-4),)
 """What every organism has in common."""
 
 
 def acting(followed: Followed) -> tuple[Stage[Acts], ...]:
-    """What comes after it."""
-    return (Stage(3000, 1e-3, Acts(0.4, 0.2, followed), last_rate=1e-5),)
+    """What comes after it. No action leads to another side than the hand is on its way to: decisions hold."""
+    return (Stage(6000, 8e-4, Acts(0.65, 0.0, followed), last_rate=1e-5),)
 
 
 class Actor:

@@ -23,6 +23,8 @@ KICK, KICK_SHARE = 0.02, 0.2
 DETOUR, DETOUR_SHARE = (0.03, 0.06, 0.03), 0.5
 """Standard deviation, metres, of where an episode is led astray to before it begins, and how often."""
 START_JITTER = 0.001
+PRESSED = 0.006
+"""Metres below the goal to which a disturbance may press the cube; never deeper into the tile."""
 LONGEST = 40
 LIFTED = 4
 """Actions with the hand open after which an episode ends."""
@@ -99,12 +101,12 @@ class Recorder:
         detour: NDArray[np.float64],
         rng: np.random.Generator,
     ) -> NDArray[np.float64]:
-        """The action with noise that dies out where it is short, and now and then a kick; never into the tile."""
+        """The action with noise that dies out where it is short, and now and then a kick."""
         noise = NOISE * min(1.0, float(np.linalg.norm(action[:3])) / FULL_NOISE_FROM) * rng.standard_normal(3)
         if not opened and rng.random() < KICK_SHARE:
             noise += KICK * rng.standard_normal(3)
         shift = action[:3] + noise + detour
-        shift[2] = max(shift[2], way.goal[2] - position[2])
+        shift[2] = max(shift[2], way.goal[2] - PRESSED - position[2])
         return np.concatenate([shift, action[3:]])
 
     def _seen(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:

@@ -16,8 +16,8 @@ from probe_kit.suite.generators.couples import draw_couples
 from probe_kit.suite.pictures import pixels_sha256
 from vlm_tiny_training.painting import Surface
 
-EVALUATION_SEEDS = (0, 1, 2)
-"""Suites are drawn from seed 0 by default; verdicts are tested on the others too."""
+EVALUATION_SEEDS = (0, 1, 2, 11, 12)
+"""Suites are drawn from seed 0 by default; verdicts are tested on the next two too, and rates on the last."""
 EVALUATION_COUPLES = 75
 """The embedded suite has 150 items per category, two to a couple."""
 Painted = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]

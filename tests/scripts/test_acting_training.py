@@ -1,11 +1,12 @@
 """The parts of the policy's training that could go wrong without a sign."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from acting_training.acting import LEFT_OPEN, Actor, Acts, Followed
+from acting_training.acting import LEFT_OPEN, Actor, Acts, Followed, acting
 from acting_training.carrying import OPENED, Carrying
 from acting_training.checkpoint import measured_statistics, start_of_policy
 from acting_training.demonstrations import Demonstrations, Recorder
@@ -99,6 +100,19 @@ def test_the_category_that_is_left_open_is_followed_as_said(
         pairs = Pairs(banks, {category: 1.0})
         shares = [Actor._side(rng, goes, pairs.draw(rng), setting) == goes for goes in [0, 1] * 100]
         assert low <= np.mean(shares) <= high
+
+
+def test_branches_differ_only_in_what_is_followed() -> None:
+    by_lot, always = acting("by lot"), acting("always")
+    assert by_lot != always
+    assert [replace(one, setting=replace(one.setting, followed="always")) for one in by_lot] == list(always)
+
+
+def test_in_a_branch_actions_go_on_to_where_the_hand_is_on_its_way(actor: Actor, banks: list[PictureBank]) -> None:
+    """Hands that changed their mind on the way let half of the lost cubes fall between the tiles."""
+    rng, pairs = np.random.default_rng(0), Pairs(banks, {"color": 1.0})
+    for stage in acting("always"):
+        assert {actor._goes(rng, 1, pairs.draw(rng), stage.setting) for _ in range(50)} == {1}
 
 
 def test_actions_turn_where_they_are_understood_and_never_by_lot(actor: Actor, banks: list[PictureBank]) -> None:
