@@ -24,7 +24,7 @@ CATEGORIES = ("color", "shape", "state", "traffic", "counting")
 RULES = ("disc", "released-on-tile")
 HEADING = (
     "run", "rule", "category", "N", "SR % [95 %]", "original / swapped", "wrong", "oob or unreadable",
-    "Δ by items", "truth", "measured",
+    "Δ by items", "measured",
 )  # fmt: skip
 
 
@@ -93,7 +93,6 @@ def _cells(row: RetentionRow) -> tuple[str, ...]:
         _percent(row.p_wrong),
         _percent(row.p_oob),
         _percent(row.delta_regime),
-        (TRAINED if acts else READER).expected(row.category),
         str(row.regime) if acts else verdict(row),
     )
 
