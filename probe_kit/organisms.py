@@ -130,7 +130,8 @@ def probed(
     results = train_probes(
         run, permutations=permutations, controls=("binding",), suite=suite.folder, twin=twin, progress=progress
     )
-    intervene_on(run, Follow(), Source(suite.folder), progress=stage(f"exchanging pictures, {organism.name}"))
+    source = Source(suite.folder, weights_seed=organism.weights_seed)
+    intervene_on(run, Follow(), source, progress=stage(f"exchanging pictures, {organism.name}"))
     return run, results
 
 

@@ -124,17 +124,17 @@ def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_pat
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]
-    command += ["--suite", str(small_suite.folder), "--items", "6", "--max-steps", "20"]
+    command += ["--suite", str(small_suite.folder), "--items", "6", "--max-steps", "30"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while len(list(run.glob("commits/*.json"))) < 3 and time.monotonic() < deadline:
-        time.sleep(0.02)
+    while not any(run.glob("commits/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, messages = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, messages
     assert "the same command continues" in messages
     kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert 3 <= len(kept) < 24
+    assert 1 <= len(kept) < 24
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0
     now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
     assert len(now) == 24

@@ -41,7 +41,7 @@ def test_every_link_that_should_be_seen_has_a_mesh(robot):
 
 def test_missing_meshes_are_announced_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setattr(widowx, "find_spec", lambda _: None)
-    with pytest.raises(SceneError, match=r"probe-kit\[widowx\]"):
+    with pytest.raises(SceneError, match=r"Install `rtb-data"):
         write_urdf(tmp_path)
 
 

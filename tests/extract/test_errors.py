@@ -63,7 +63,7 @@ def test_an_arm_without_its_extra_is_said_before_anything_is_played(
 ) -> None:
     monkeypatch.setattr("probe_kit.env.widowx.find_spec", lambda _name: None)
     settings = ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(arm="widowx"), env_workers=0)
-    with pytest.raises(SceneError, match=r"probe-kit\[widowx\]") as caught:
+    with pytest.raises(SceneError, match=r"Install `rtb-data") as caught:
         extract_run(settings, tmp_path / "run")
     assert caught.value.exit_code == 2
     assert not (tmp_path / "run").exists()
