@@ -2,8 +2,6 @@
 
 import json
 import re
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -20,8 +18,6 @@ NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
     "06-vlm-against-vla", "07-from-readable-to-used",
 )  # fmt: skip
-BESIDE_EACH_OTHER = ((*NAMES[:3], NAMES[6]), NAMES[3:6])
-"""The first three and the last share a run; the others need none of them."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
 
 PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^color|^sheet);?$", re.MULTILINE)
@@ -37,6 +33,13 @@ SHORT = {
 """Episodes that end after one inference, and few relabellings."""
 
 
+def shortened(source: str) -> str:
+    """A cell with short episodes, which are played in the kernel itself: starting simulators would take longer."""
+    for long, short in SHORT.items():
+        source = source.replace(long, short)
+    return source if "env_workers" in source else source.replace(SCENE, f"{SCENE}env_workers=0, ")
+
+
 @pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.slow)])
 def made(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
@@ -50,20 +53,13 @@ def made(
             return FOLDER / f"{name}.ipynb"
         notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
         for cell in notebook.cells:
-            for long, short in SHORT.items():
-                cell.source = cell.source.replace(long, short)
+            cell.source = shortened(cell.source)
         path = folder / f"{name}.ipynb"
         nbformat.write(notebook, path)
         return path
 
-    def run(names: Sequence[str]) -> list[NotebookNode]:
-        with kernel(folder) as manager:
-            return [executed(source(name), folder, manager) for name in names]
-
-    with ThreadPoolExecutor(2) as pool:
-        fresh = [notebook for ran in pool.map(run, BESIDE_EACH_OTHER) for notebook in ran]
-    names = [name for group in BESIDE_EACH_OTHER for name in group]
-    return folder, dict(zip(names, fresh, strict=True))
+    with kernel(folder) as manager:
+        return folder, {name: executed(source(name), folder, manager) for name in NAMES}
 
 
 def test_the_short_notebooks_are_shorter() -> None:
