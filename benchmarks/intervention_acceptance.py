@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import Run, extract_run
 from probe_kit.intervene import (
     ClosedLoop,
     Effects,
@@ -26,8 +26,7 @@ from probe_kit.intervene import (
     intervene_on,
 )
 from probe_kit.intervene.conditions import Intervention
-from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, verdict
-from probe_kit.retention import retention
+from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, settings_of, source_of
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import train_probes
 
@@ -63,23 +62,19 @@ class Trial:
 
 def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, twin: Run | None) -> Run:
     """The organism's episodes, probes and `follow`."""
-    settings = ExtractSettings(
-        organism.model, suite=suite.folder, random_weights=organism.random_weights, frames="none", env_workers=0
-    )
+    settings = replace(settings_of(organism, suite), video="none", frames="none", env_workers=0)
     if steps is not None:
         settings = replace(settings, scene=replace(settings.scene, max_steps=steps))
     run = extract_run(settings, folder / organism.folder)
     train_probes(run, permutations=100, controls=("binding",), suite=suite.folder, twin=twin)
-    intervene_on(run, Follow(), Source(suite.folder))
+    intervene_on(run, Follow(), source_of(organism, suite))
     return run
 
 
 def verdicts(runs: Sequence[tuple[Organism, Run]]) -> Iterator[Property]:
     """Every organism and category."""
-    for organism, run in runs:
-        for row in retention([run]).rows:
-            expected, found = organism.expected(row.category), verdict(row)
-            yield Property(f"verdict of {organism.name}, {row.category}", expected == found, found)
+    for one in findings(runs):
+        yield Property(f"verdict of {one.organism}, {one.category}", one.agrees, one.measured)
 
 
 def maps(trial: Trial, last: int) -> Iterator[Property]:

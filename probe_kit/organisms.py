@@ -101,6 +101,26 @@ class Finding:
         return self.expected == self.measured
 
 
+def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
+    """How an organism that acts plays `suite`."""
+    scene = scene_of(organism.model)
+    if organism.max_steps is not None:
+        scene = scene_of(organism.model, max_steps=organism.max_steps)
+    return ExtractSettings(
+        organism.model,
+        suite=suite.folder,
+        random_weights=organism.random_weights,
+        weights_seed=organism.weights_seed,
+        scene=scene,
+        video="first",
+    )
+
+
+def source_of(organism: Organism, suite: Suite) -> Source:
+    """Where interventions find the organism and its pictures again; of a random twin, the one of its own seed."""
+    return Source(suite.folder, weights_seed=organism.weights_seed)
+
+
 def probed(
     organism: Organism,
     suite: Suite,
@@ -114,24 +134,15 @@ def probed(
     What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
     total, …) for a stage of this name. twin: a run to hold it against too.
     """
-    scene = scene_of(organism.model)
-    if organism.max_steps is not None:
-        scene = scene_of(organism.model, max_steps=organism.max_steps)
-    settings = ExtractSettings(
-        organism.model,
-        suite=suite.folder,
-        random_weights=organism.random_weights,
-        weights_seed=organism.weights_seed,
-        scene=scene,
-        video="first",
+    run = extract_run(
+        settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
     )
-    run = extract_run(settings, folder / organism.folder, progress=stage(f"episodes, {organism.name}"))
     progress = stage(f"probing sites, {organism.name}")
     results = train_probes(
         run, permutations=permutations, controls=("binding",), suite=suite.folder, twin=twin, progress=progress
     )
-    source = Source(suite.folder, weights_seed=organism.weights_seed)
-    intervene_on(run, Follow(), source, progress=stage(f"exchanging pictures, {organism.name}"))
+    progress = stage(f"exchanging pictures, {organism.name}")
+    intervene_on(run, Follow(), source_of(organism, suite), progress=progress)
     return run, results
 
 
@@ -152,6 +163,11 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
         (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
         for one in ORGANISMS
     ]
+    return findings(runs)
+
+
+def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
+    """What the instrument says of every organism's run, and the truth, a category each."""
     rows = [(organism, row) for organism, run in runs for row in retention([run]).rows]
     shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [

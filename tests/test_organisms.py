@@ -1,10 +1,14 @@
 """The verdict over a row, and the truths the organisms were made to have."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from probe_kit.console import out
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract import extract_run
+from probe_kit.intervene import Follow, Words, intervene_on
 from probe_kit.organisms import (
     EARLY,
     ORGANISMS,
@@ -15,11 +19,14 @@ from probe_kit.organisms import (
     TRAINED,
     Finding,
     measured,
+    settings_of,
+    source_of,
     to_rich,
 )
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.story import verdict
 from probe_kit.retention.success import regime
+from probe_kit.suite import Suite
 
 
 def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
@@ -83,6 +90,16 @@ def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothin
     alone = replace(row(0.4, p), used="inconclusive", follows_net_ci=limits)
     assert measured(alone, shown) == expected
     assert measured(replace(alone, used="used"), shown) == "used"
+
+
+def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
+    """Its pictures are exchanged before its own weights; those of another seed are refused."""
+    twin = replace(OTHER_TWINS[0], max_steps=1)
+    settings = replace(settings_of(twin, small_suite), categories=("color",), items=2, video="none", env_workers=0)
+    run = extract_run(settings, tmp_path / "run")
+    assert len(intervene_on(run, Follow(), source_of(twin, small_suite)).table) == 1
+    with pytest.raises(SettingsMismatchError, match="weights"):
+        intervene_on(run, Words(), source_of(RANDOM_TWIN, small_suite))
 
 
 def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
