@@ -125,7 +125,12 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     run = tmp_path / "run"
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]
     command += ["--suite", str(small_suite.folder), "--items", "6", "--max-steps", "30"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # A shell's background ignores it, and a child would inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 60
     while not any(run.glob("commits/*.json")) and time.monotonic() < deadline:
         time.sleep(0.01)
