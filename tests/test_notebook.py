@@ -43,7 +43,7 @@ FIGURES = {
     "layer_curve, after pyplot came in": "pk.layer_curve(results)",
 }
 OBJECTS = ("run", "results", "table", "policy", "tape")
-FITTING = "fitted = pk.train_probes(run, ['shape'], permutations=5, seed=11)"
+FITTING = "fitted = pk.train_probes(run, ['shape'], permutations=0, seed=11)"
 
 
 @pytest.fixture(scope="module")
