@@ -54,7 +54,6 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         if config.option.dist == "no":
             config.option.dist = "loadfile"
-            config.option.loadscopereorder = False  # files of many tests are not the long ones
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
