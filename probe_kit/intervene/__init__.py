@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from probe_kit.intervene.erased import Erasing
     from probe_kit.intervene.follow import Follow
     from probe_kit.intervene.following import Following, stored_following
+    from probe_kit.intervene.inside import stored_passing
     from probe_kit.intervene.interchange import Interchange
     from probe_kit.intervene.intervening import intervene_on
-    from probe_kit.intervene.passing import Passing, stored_passing
+    from probe_kit.intervene.passing import Passing
     from probe_kit.intervene.sensitivity import Sensitivity
     from probe_kit.intervene.steer import Steer
     from probe_kit.intervene.stored import Answers, stored_interventions
@@ -65,7 +66,7 @@ __getattr__ = lazy_names(
     {
         "Sensitivity": "sensitivity",
         "Words": "words",
-        "stored_passing": "passing",
+        "stored_passing": "inside",
         "Passing": "passing",
         "Steer": "steer",
         "Interchange": "interchange",

@@ -17,8 +17,9 @@ from probe_kit.hooks.sites import Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
 from probe_kit.intervene.directions import MEAN_DIFFERENCE, axes_of
+from probe_kit.intervene.inside import BACKBONE, stored_passing
 from probe_kit.intervene.interchange import NONE, TakenOver, needed
-from probe_kit.intervene.passing import Passing, stored_passing
+from probe_kit.intervene.passing import Passing
 from probe_kit.intervene.patching import Kept, Ledger, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
 from probe_kit.intervene.settings import CHUNK
@@ -136,10 +137,11 @@ class DoseZero:
 
 
 def best_cells(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """`PLACE|ROLE`, of each category the last place that the newest interchange located, in its narrowest role.
+    """`PLACE|ROLE`, of each category the last place of the backbone that was located, in its narrowest role.
 
-    The last one is behind everything else through which the answer passes; of its roles the one with the largest
-    effect, and all tokens only where no single role carries half of it. Raises UsageError if none was located.
+    The last one is behind everything else through which the answer passes; where none of the backbone was located,
+    the last of what acts or of the memory. Of its roles the one with the largest effect, and all tokens only where
+    no single role carries half of it. Raises UsageError if none was located.
     """
     stored = stored_passing(run)
     found = [_best(stored.get(category, [])) for category in categories]
@@ -156,6 +158,7 @@ def _best(rows: Sequence[Passing]) -> str | None:
     located = [row for row in rows if row.is_located and not row.direction]
     if not located:
         return None
-    last = [row for row in located if row.place == located[-1].place]
+    deepest = ([row for row in located if row.place.startswith(f"{BACKBONE}.")] or located)[-1]
+    last = [row for row in located if row.place == deepest.place]
     best = max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
     return f"{best.place}{CELL}{best.role}"

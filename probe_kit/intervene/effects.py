@@ -1,7 +1,7 @@
 """What an intervention did: a table, the verdicts, and the ways to write them down."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -12,7 +12,8 @@ from probe_kit.intervene.carried_out import CarriedOut, carried_out
 from probe_kit.intervene.erased import Erasing, erased
 from probe_kit.intervene.following import Following, following, stored_following
 from probe_kit.intervene.frames import frame_of
-from probe_kit.intervene.passing import Passing, passing, stored_places
+from probe_kit.intervene.inside import stored_carriers, stored_places
+from probe_kit.intervene.passing import Passing, passing
 from probe_kit.intervene.sensitivity import sensitivity
 from probe_kit.intervene.settings import SHADOW
 from probe_kit.intervene.stored import (
@@ -252,6 +253,8 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 
 def effects_of(run: RunReader, stored: Stored) -> Effects:
     """Read one stored intervention."""
+    answers = stored.answers()
+    own = following(answers, run.suite, stored.key) if stored.settings["kind"] == FOLLOW else []
     return Effects(
         key=stored.key,
         label=run.label,
@@ -259,19 +262,23 @@ def effects_of(run: RunReader, stored: Stored) -> Effects:
         random_weights=run.random_weights,
         settings=dict(stored.settings),
         certificate=stored.certificate(),
-        answers=stored.answers(),
+        answers=answers,
         attention=Weighed.of(stored),
-        verdicts=verdicts_of(run),
+        verdicts=verdicts_of(run, own),
     )
 
 
-def verdicts_of(run: RunReader) -> dict[str, Judgement]:
-    """By category, from all interventions and the newest probes that are stored with a run."""
+def verdicts_of(run: RunReader, shown: Sequence[Following] = ()) -> dict[str, Judgement]:
+    """By category, from all interventions and the newest probes that are stored with a run.
+
+    shown: what an exchange of pictures did that is to be judged, whatever else is stored of these categories.
+    """
     try:
         results = load_results(run)
     except NoProbesError:
         results = None
-    return judgements(stored_following(run), encoded_in(results), stored_places(run))
+    found = {**stored_following(run), **{row.category: row for row in shown}}
+    return judgements(found, encoded_in(results), stored_places(run), stored_carriers(run))
 
 
 def effects_csv(

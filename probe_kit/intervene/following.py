@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.intervene.stored import EXCHANGED, PLAIN, Answers, stored_interventions
+from probe_kit.intervene.standing import foremost
+from probe_kit.intervene.stored import EXCHANGED, PLAIN, Answers
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -94,11 +95,13 @@ def net_interval(net: NDArray[np.float64], answers: Answers, suite: str) -> tupl
 
 
 def stored_following(run: RunReader) -> dict[str, Following]:
-    """By category, the newest that is stored with the run for the episodes it has now; empty if there is none.
+    """By category, what the exchange of pictures did, of those that are stored for the episodes the run has now.
 
-    Raises RunDamagedError if any stored intervention was changed.
+    Of several the one that says most, see `standing`; empty if there is none. Raises RunDamagedError if any stored
+    intervention was changed.
     """
-    found: dict[str, Following] = {}
-    for one in stored_interventions(run, "follow"):
-        found |= {own.category: own for own in following(one.answers(), run.suite, one.key)}
-    return found
+    return {
+        category: row
+        for category, told in foremost(run, "follow").items()
+        for row in following(told.answers, run.suite, told.stored.key)
+    }

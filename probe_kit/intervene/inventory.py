@@ -7,8 +7,11 @@ from typing import Any
 from probe_kit.extract.store.bundles import PARTIAL, Bundle, read_bundles
 from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.location import Location
+from probe_kit.intervene.inside import keys_inside
 from probe_kit.intervene.settings import FORMAT
-from probe_kit.intervene.stored import stored_interventions
+from probe_kit.intervene.standing import foremost
+from probe_kit.intervene.stored import ATTENTION, stored_interventions
+from probe_kit.intervene.weighed import foremost_attention
 from probe_kit.train.reader import RunReader
 
 COMMON = frozenset(
@@ -17,13 +20,17 @@ COMMON = frozenset(
 """What every intervention is asked; the rest of its settings is its kind's own."""
 
 
+TABLED = frozenset({"follow", "interchange", "steer", ATTENTION})
+"""Kinds that verdicts, tables or figures read."""
+
+
 @dataclass(frozen=True)
 class StoredIntervention:
     """One stored intervention, or what is known of one written by another version.
 
-    state: `used` for the newest of its kind and categories, which tables and figures read; `other`; `other
-    episodes` if the run has others by now; `other version` if this version cannot read it. asked: what its kind
-    was asked besides, as stored.
+    state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
+    that it says, of more episodes or newly; `other episodes` if the run has others by now; `other version` if this
+    version cannot read it. asked: what its kind was asked besides, as stored.
     """
 
     key: str
@@ -45,7 +52,7 @@ class StoredIntervention:
         parts += [f"{self.items} items each"] * (self.items is not None)
         parts += [f"wording {self.wording}"] * bool(self.wording)
         if self.state == "other":
-            own.append("superseded by a later one in tables")
+            own.append("another one stands in its place in tables")
         if self.state == "other episodes":
             own.append("of other episodes than the run has now")
         return "; ".join([" ".join(parts[:2]), *parts[2:], *own, self._when])
@@ -60,7 +67,7 @@ def listed_interventions(run: Any) -> list[StoredIntervention]:
     wordings = getattr(run, "wordings", ())
     readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
     current = {one.key for reader in readers for one in stored_interventions(reader)}
-    used = {key for reader in readers for key in _newest(reader)}
+    used = {key for reader in readers for key in _used(reader)}
     found = [_listed(bundle, current, used) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
     return sorted(found, key=lambda one: (one.created, one.key))
 
@@ -72,14 +79,11 @@ def unfinished_interventions(location: Location) -> dict[str, int]:
     return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
 
 
-def _newest(run: RunReader) -> set[str]:
-    """Keys of the newest of every kind and category."""
-    newest = {
-        (str(one.settings["kind"]), str(category)): one.key
-        for one in stored_interventions(run)
-        for category in one.settings["categories"]
-    }
-    return set(newest.values())
+def _used(run: RunReader) -> set[str]:
+    """Keys of what is read, and of the kinds of which nothing takes another's place."""
+    found = {told.stored.key for told in foremost(run, "follow").values()} | keys_inside(run)
+    found |= {told.stored.key for told, _ in foremost_attention(run).values()}
+    return found | {one.key for one in stored_interventions(run) if one.settings["kind"] not in TABLED}
 
 
 def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredIntervention:

@@ -7,7 +7,7 @@ away from it as well.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from probe_kit.identity import derive_seed
 from probe_kit.intervene.following import following, net_interval
 from probe_kit.intervene.patching import LEDGER
-from probe_kit.intervene.stored import EXCHANGED, PLAIN, UNCHANGED, Answers, stored_interventions
+from probe_kit.intervene.stored import EXCHANGED, PLAIN, UNCHANGED, Answers
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.reader import RunReader
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
@@ -208,38 +207,3 @@ def _shares(answers: Answers, rows: Sequence[int], suite: str) -> NDArray[np.flo
 
 def _mean(values: NDArray[np.float64]) -> float:
     return float(values.mean()) if values.size else 0.0
-
-
-def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
-    """By category, what the newest interchange of it found; empty if there is none. Raises RunDamagedError."""
-    return _stored(run, "interchange")
-
-
-def stored_steering(run: RunReader) -> dict[str, list[Passing]]:
-    """By category, what the newest steering of it did, controls included; empty if there is none."""
-    return _stored(run, "steer")
-
-
-def _stored(run: RunReader, kind: Literal["interchange", "steer"]) -> dict[str, list[Passing]]:
-    found: dict[str, list[Passing]] = {}
-    for one in stored_interventions(run, kind):
-        toward = str(one.settings["toward"]) if kind == "steer" else "exchanged"
-        rows = passing(one.answers(), run.suite, toward, one.key)
-        # Along a direction says what carries an answer, not where it passes: it takes no map's place.
-        kept = found if one.settings.get("direction", "none") != "none" and kind == "interchange" else {}
-        found |= {
-            str(name): [row for row in rows if row.category == name]
-            for name in one.settings["categories"]
-            if name not in kept
-        }
-    return found
-
-
-def located_in(rows: Sequence[Passing]) -> tuple[str, ...]:
-    """The places, each once, that carry half of the effect or more when their tokens are taken over whole."""
-    return tuple(dict.fromkeys(row.place for row in rows if row.is_located and not row.direction))
-
-
-def stored_places(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """By category, `located_in` of what is stored."""
-    return {category: located_in(rows) for category, rows in stored_passing(run).items()}

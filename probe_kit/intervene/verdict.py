@@ -34,20 +34,25 @@ class Judgement:
 
 
 def judge(
-    encoded: bool | None, found: Following, control: str | None, located: Sequence[str] | None = None
+    encoded: bool | None,
+    found: Following,
+    control: str | None,
+    located: Sequence[str] | None = None,
+    carried: Sequence[str] = (),
 ) -> Judgement:
     """What probes and the exchange of pictures say together.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
     without probes. control: another category of the run that follows, which shows that following would have been
     seen; None if there is none, and then nothing is called encoded and unused. located: places that carry half of
-    the effect, if an interchange looked for them; where it did and found none, nothing is called used.
+    the effect, if an interchange searched for them; where it did and found none, nothing is called used. carried:
+    places and the directions along which half of it passes there.
     """
     if found.is_following:
         if encoded and located is not None:
             if not located:
                 return Judgement("inconclusive", "it follows, and no place that was tried carries half of that")
-            return Judgement("used", where(located))
+            return Judgement("used", where(located, carried))
         return Judgement(_by(encoded, "used", "acted on, not found", "follows"))
     if found.is_against:
         return Judgement(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
@@ -62,8 +67,8 @@ def judge(
     return Judgement(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
 
 
-def where(located: Sequence[str]) -> str:
-    """Where the answer passes, and, of keys and values that what acts reads, where it is read.
+def where(located: Sequence[str], carried: Sequence[str] = ()) -> str:
+    """Where the answer passes, of keys and values that what acts reads where it is read, and along what.
 
     An exchange in the backbone says that something behind it depends on that place; one in the memory, which only
     what acts looks at, that it is read there.
@@ -71,6 +76,7 @@ def where(located: Sequence[str]) -> str:
     read = [place for place in located if place.partition(".")[0] == MEMORY_STREAM]
     passes = [place for place in located if place not in read]
     parts = [f"passes at {', '.join(passes)}"] * bool(passes) + [f"read at {', '.join(read)}"] * bool(read)
+    parts += [f"carried by {', '.join(carried)}"] * bool(carried)
     return "; ".join(parts)
 
 
@@ -88,13 +94,14 @@ def judgements(
     found: Mapping[str, Following],
     encoded: Mapping[str, bool | None],
     located: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    carried: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> dict[str, Judgement]:
     """Of every category that was intervened on.
 
-    encoded, located: by category; one that is not there was not probed, or not looked for inside.
+    encoded, located, carried: by category; one that is not there was not probed, or not looked for inside.
     """
     return {
-        name: judge(encoded.get(name), one, control_for(name, found), located.get(name))
+        name: judge(encoded.get(name), one, control_for(name, found), located.get(name), carried.get(name, ()))
         for name, one in found.items()
     }
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.intervene.places import ALL, TILE_ROLES
-from probe_kit.intervene.stored import ATTENTION, WEIGHED, Stored, stored_interventions
+from probe_kit.intervene.standing import Told, told_of
+from probe_kit.intervene.stored import ATTENTION, WEIGHED, Stored
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.train.reader import RunReader
 
@@ -167,11 +168,21 @@ class Attending:
 
 
 def stored_attention(run: RunReader) -> dict[str, Weighed]:
-    """By category, the newest that is stored; empty if there is none. Raises RunDamagedError."""
-    found: dict[str, Weighed] = {}
-    for one in stored_interventions(run, ATTENTION):
-        weighed = Weighed.of(one)
-        found |= {} if weighed is None else dict(weighed.by_category())
+    """By category, the one of most episodes, and of these of most roles; empty if there is none.
+
+    Raises RunDamagedError.
+    """
+    return {category: weighed for category, (_, weighed) in foremost_attention(run).items()}
+
+
+def foremost_attention(run: RunReader) -> dict[str, tuple[Told, Weighed]]:
+    """`stored_attention`, and of which stored intervention each is."""
+    found: dict[str, tuple[Told, Weighed]] = {}
+    for told in told_of(run, ATTENTION):
+        every, before = Weighed.from_bytes(told.stored.bundle.read(WEIGHED)), found.get(told.category)
+        weighed = every.only(every.categories == told.category)
+        if before is None or (before[0].rank, len(before[1].roles)) <= (told.rank, len(weighed.roles)):
+            found[told.category] = told, weighed
     return found
 
 

@@ -13,17 +13,22 @@ from probe_kit.retention.rows import RetentionRow
 
 
 def with_following(
-    row: RetentionRow, found: Mapping[str, Following], located: Mapping[str, Sequence[str]]
+    row: RetentionRow,
+    found: Mapping[str, Following],
+    located: Mapping[str, Sequence[str]],
+    carried: Mapping[str, Sequence[str]],
 ) -> RetentionRow:
     """The row with what was found of its category, judged by its own probes.
 
-    found: by category; may be empty. located: places that carry it, by category, of those that were looked into.
+    found: by category; may be empty. located: places that carry it, by category, of those that were searched.
+    carried: directions that do.
     """
     own = found.get(row.category)
     if own is None:
         return row
     encoded = row.prefix_signal if row.prefix_beats else None
-    judged = judge(encoded, own, control_for(row.category, found), located.get(row.category))
+    category, control = row.category, control_for(row.category, found)
+    judged = judge(encoded, own, control, located.get(category), carried.get(category, ()))
     part = Followed(
         follows=own.follows,
         against=own.against,

@@ -9,7 +9,7 @@ from probe_kit.env.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.sites import first_of
 from probe_kit.intervene.following import stored_following
-from probe_kit.intervene.passing import stored_places
+from probe_kit.intervene.inside import stored_carriers, stored_places
 from probe_kit.retention.asked import ask_of
 from probe_kit.retention.estimates import UNBOUNDED, Estimate, Estimates, Limits, probe_estimates, sr_estimate
 from probe_kit.retention.followed import with_following
@@ -66,13 +66,13 @@ def run_rows(
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged, found = Judged.of(run, settings.rule, settings.last_steps), stored_following(run)
-    located = stored_places(run) if found else {}
+    located, carried = (stored_places(run), stored_carriers(run)) if found else ({}, {})
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
-    return [replace(one, row=with_following(one.row, found, located)) for one in drawn]
+    return [replace(one, row=with_following(one.row, found, located, carried)) for one in drawn]
 
 
 def _row(

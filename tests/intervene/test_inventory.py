@@ -37,17 +37,17 @@ def shown(run: Run, *options: str) -> str:
 def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> None:
     (first,) = listed_interventions(run)
     assert (first.kind, first.state, first.categories) == ("follow", "used", ("color",))
-    fewer, erased = store(run, Follow(items=2)), store(run, Erase(sites=("backbone.01",), controls=2))
+    more, erased = store(run, Follow(items=12)), store(run, Erase(sites=("backbone.01",), controls=2))
     assert [(one.key, one.state) for one in listed_interventions(run)] == [
-        (first.key, "other"), (fewer, "used"), (erased, "used"),
+        (first.key, "other"), (more, "used"), (erased, "used"),
     ]  # fmt: skip
     text = shown(run)
-    assert f"intervention {fewer}" in text
-    assert "follow of color; 2 items each; made" in text
+    assert f"intervention {more}" in text
+    assert "follow of color; 12 items each; another one stands in its place in tables; made" not in text
     assert "erase of color; controls 2; method leace; roles image; seed 0; sites backbone.01; made" in text
-    assert "superseded" in text
+    assert "another one stands in its place" in text
     listed = json.loads(shown(run, "--json"))["interventions"]
-    assert [one["key"] for one in listed] == [first.key, fewer, erased]
+    assert [one["key"] for one in listed] == [first.key, more, erased]
     assert listed[2]["asked"]["method"] == "leace"
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from probe_kit.intervene import Answers, Judgement, Passing, judge
 from probe_kit.intervene.following import following
-from probe_kit.intervene.passing import Named, located_in, passing
+from probe_kit.intervene.inside import located_in
+from probe_kit.intervene.passing import Named, passing
 from tests.intervene.answers import answers_of, follower, habit
 
 SUITE = "suite@1#0123456789ab"

@@ -20,17 +20,17 @@ mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
 
 
-def store(run: ArrayRun, kind: str, answers: Answers) -> None:
+def store(run: ArrayRun, kind: str, answers: Answers, **asked: str) -> None:
     categories = list(dict.fromkeys(answers.categories.tolist()))
     settings = {
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": categories,
+        "categories": categories, **asked,
     }  # fmt: skip
     check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
     save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
 
 
-def inside(answers: Answers, **shares: float) -> Answers:
+def inside(answers: Answers, condition: str = "|all", **shares: float) -> Answers:
     """shares: by place (`__` for `.`), how many of the episodes go where the exchange brings them."""
     count = answers.episodes.size
     rows = [
@@ -38,7 +38,7 @@ def inside(answers: Answers, **shares: float) -> Answers:
         for share in shares.values()
     ]
     lateral = np.vstack([answers.lateral, *rows])
-    names = tuple(f"{name.replace('__', '.')}|all" for name in shares)
+    names = tuple(f"{name.replace('__', '.')}{condition}" for name in shares)
     return replace(
         answers,
         conditions=(*answers.conditions, *names),
@@ -94,3 +94,32 @@ def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -
     rows = {row.category: row for row in retention([run]).rows}
     assert rows["color"].used == "inconclusive"
     assert rows["shape"].used == "encoded, unused"
+
+
+@pytest.mark.parametrize("is_memory_last", [False, True])
+def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_last: bool) -> None:
+    """Whichever was stored last took the other's place in verdict and figure."""
+    answers = answers_of({"color": follower(48)})
+    both = {
+        "backbone.*": inside(answers, backbone__00=1.0, backbone__01=0.0),
+        "memory.*": inside(answers, memory__00=1.0, memory__01=0.0),
+    }
+    for sites in sorted(both, reverse=not is_memory_last):
+        store(run, "interchange", both[sites], sites=sites)
+    (row,) = (row for row in retention([run]).rows if row.category == "color")
+    assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at memory.00")
+    display = CausalCurveDisplay.from_run(run, load_results(run), "color")
+    assert display.read is not None
+    assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])
+
+
+def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
+    """It turned *used* into *inconclusive*, and stopped the report for want of a map to draw."""
+    answers = answers_of({"color": follower(48)})
+    along = inside(answers, "|image|mean-difference", backbone__01=0.0)
+    store(run, "interchange", along, direction="mean-difference")
+    (row,) = (row for row in retention([run]).rows if row.category == "color")
+    assert (row.used, row.used_note) == ("used", "")
+    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+    with pytest.raises(NoInterventionsError, match="--kind interchange"):
+        causal_curve(run, load_results(run))

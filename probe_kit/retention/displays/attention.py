@@ -1,7 +1,7 @@
 """What is weighed: by block, how much attention what acts pays to the pictures, the words and itself."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +10,8 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.places import ALL, TILE_ROLES
 from probe_kit.intervene.weighed import CORRECT, OTHER, Axis, Weighed, stored_attention
 from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
-    axes_for,
-    caption,
-    layer_axis,
-    legend_above,
-    panels,
-    plain,
-    series,
-    spell,
-)
+from probe_kit.retention.displays.panelled import Panelled, in_panels
+from probe_kit.retention.displays.style import layer_axis, series, spell
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:
@@ -32,7 +23,7 @@ _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", "ow
 
 
 @dataclass
-class AttentionDisplay(Shown):
+class AttentionDisplay(Panelled):
     """By block of the backbone, the share of attention in percent that lies on one role's tokens.
 
     blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
@@ -40,6 +31,7 @@ class AttentionDisplay(Shown):
     iterations and inferences. It describes: what is weighed need not be used, and enters no verdict.
     """
 
+    measure: ClassVar[str] = "% of attention (describes, no cause)"
     category: str
     blocks: NDArray[np.int64]
     roles: tuple[str, ...]
@@ -81,9 +73,13 @@ class AttentionDisplay(Shown):
             certificate=certificate,
         )
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
+    @property
+    def title(self) -> str:
+        """The category."""
+        return spell(self.category)
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for every role, with what iterations and heads there are around it."""
         for position, role in enumerate(self.roles):
             line, x = series(position), self.blocks + 0.06 * (position - len(self.roles) / 2)
             reach = np.nanmin(self.iterations[position], axis=1), np.nanmax(self.iterations[position], axis=1)
@@ -96,17 +92,9 @@ class AttentionDisplay(Shown):
                 x, self.mean[position], color=line.colour, ls=line.dash, marker=line.marker, ms=5, mfc="white",
                 lw=1.4, label=_LABELS.get(role, role),
             )  # fmt: skip
-        plain(axes)
         layer_axis(axes, int(self.blocks.max()) + 1, label=False)
         axes.set_xlabel("block whose keys are read", fontsize=8.5)
         axes.set_ylim(bottom=0)
-        axes.set_title(spell(self.category), fontsize=10, loc="left")
-        if figure is not None:
-            axes.set_ylabel("% of attention", fontsize=9)
-            legend_above(figure, axes.get_legend_handles_labels()[0])
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
 
 
 def attention_curve(run: RunReader) -> "Figure":
@@ -117,10 +105,4 @@ def attention_curve(run: RunReader) -> "Figure":
     ]
     if not displays:
         AttentionDisplay.from_run(run, "any")
-    figure, grid = panels(len(displays))
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    figure.supylabel("% of attention (describes, no cause)", fontsize=9)
-    caption(figure, displays[0].certificate)
-    legend_above(figure, grid[0].get_legend_handles_labels()[0])
-    return figure
+    return in_panels(displays)

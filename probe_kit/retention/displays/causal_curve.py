@@ -2,26 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.passing import Passing, stored_passing
+from probe_kit.hooks.sites import MEMORY_STREAM
+from probe_kit.intervene.inside import BACKBONE, stored_passing
+from probe_kit.intervene.passing import Passing
+from probe_kit.intervene.places import ALL
 from probe_kit.retention.displays.certificate import Certificate
+from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.selection import curve_of, scores_of
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
-    axes_for,
-    caption,
-    layer_axis,
-    legend_above,
-    panels,
-    plain,
-    series,
-    spell,
-)
+from probe_kit.retention.displays.style import layer_axis, series, spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults
@@ -41,7 +35,7 @@ class Points:
 
 
 @dataclass
-class CausalCurveDisplay(Shown):
+class CausalCurveDisplay(Panelled):
     """By backbone layer: held-out accuracy of probes, and how many episodes turn when its tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
@@ -49,6 +43,7 @@ class CausalCurveDisplay(Shown):
     part reads of each block; None where nobody looked. Filled: significant, family-wise.
     """
 
+    measure: ClassVar[str] = "% of episodes"
     category: str
     chance: float
     readable: Points
@@ -63,16 +58,22 @@ class CausalCurveDisplay(Shown):
 
         Raises NoInterventionsError if none is stored of the category, UnknownCategoryError, UnknownSiteError.
         """
-        rows = [row for row in stored_passing(run).get(category, []) if not row.direction]
+        return cls._of(run, results, category, view, shown_passing(run).get(category, []))
+
+    @classmethod
+    def _of(cls, run: RunReader, results: ProbeResults, category: str, view: str, rows: Sequence[Passing]) -> Self:
         if not rows:
             raise NoInterventionsError(
-                f"{run.location} has no stored interchange of {category!r}. Run `probe-kit intervene "
-                f"{run.location} --kind interchange`"
+                f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
+                f"memory. Run `probe-kit intervene {run.location} --kind interchange`"
             )
         scores = scores_of(results, category, view)
-        scores = scores[scores["stream"] == "backbone"].sort_values("layer")
-        streams = {row.place.partition(".")[0] for row in rows}
-        roles = dict.fromkeys(row.role for row in rows if row.place.startswith("backbone."))
+        scores = scores[scores["stream"] == BACKBONE].sort_values("layer")
+        by_role: dict[str, list[Passing]] = {}
+        for row in rows:
+            if _stream(row) == BACKBONE:
+                by_role.setdefault(row.role, []).append(row)
+        read = [row for row in rows if _stream(row) == MEMORY_STREAM]
         return cls(
             category=category,
             chance=curve_of(results, category, view).chance,
@@ -80,14 +81,18 @@ class CausalCurveDisplay(Shown):
                 scores["layer"].to_numpy(int), 100 * scores["accuracy"].to_numpy(float),
                 (scores["p_fwe"] < SIGNIFICANCE).to_numpy(bool),
             ),
-            passes={role: _points([row for row in rows if row.role == role], "backbone") for role in roles},
-            read=_points([row for row in rows if row.role == "all"], "memory") if "memory" in streams else None,
+            passes={role: _points(own) for role, own in by_role.items()},
+            read=_points(read) if read else None,
             certificate=Certificate.of_results(results, view),
         )  # fmt: skip
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
+    @property
+    def title(self) -> str:
+        """The category."""
+        return spell(self.category)
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for probes, one for every role, one for the memory."""
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
         lines = {
             "readable (probe)": self.readable,
@@ -96,53 +101,47 @@ class CausalCurveDisplay(Shown):
         if self.read is not None:
             lines["read (keys and values)"] = self.read
         for position, (label, points) in enumerate(lines.items()):
-            _draw(axes, points, label, position)
-        plain(axes)
+            x = points.layers.astype(np.float64) + 0.05 * (position - 2)
+            draw_series(axes, series(position), x, points.percent, points.significant, label)
         layer_axis(axes, int(self.readable.layers.max()) + 1)
         axes.set_ylim(-12, 108)
-        axes.set_title(spell(self.category), fontsize=10, loc="left")
-        if figure is not None:
-            axes.set_ylabel("% of episodes", fontsize=9)
-            legend_above(figure, axes.get_legend_handles_labels()[0])
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
+
+
+def shown_passing(run: RunReader) -> dict[str, list[Passing]]:
+    """By category, what a figure by layers shows of the maps: the backbone at every role, the memory as a whole.
+
+    Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
+    """
+    found = {
+        category: [
+            row
+            for row in rows
+            if "@" not in row.place
+            and (_stream(row) == BACKBONE or (_stream(row) == MEMORY_STREAM and row.role == ALL))
+        ]
+        for category, rows in stored_passing(run).items()
+    }
+    return {category: rows for category, rows in found.items() if rows}
 
 
 def causal_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
     """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
-    categories = [name for name in results.settings.categories if name in stored_passing(run)]
-    displays = [CausalCurveDisplay.from_run(run, results, name, view) for name in categories or ["any"]]
-    figure, grid = panels(len(displays))
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    figure.supylabel("% of episodes", fontsize=9)
-    caption(figure, displays[0].certificate)
-    legend_above(figure, grid[0].get_legend_handles_labels()[0])
-    return figure
+    found = shown_passing(run)
+    names = [name for name in results.settings.categories if name in found] or ["any"]
+    return in_panels([CausalCurveDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
 
 
-def _points(rows: Sequence[Passing], stream: str) -> Points:
-    own = [row for row in rows if row.place.startswith(f"{stream}.") and "@" not in row.place]
-    own = sorted(own, key=lambda row: _layer(row))
+def _points(rows: Sequence[Passing]) -> Points:
     return Points(
-        np.array([_layer(row) for row in own], np.int64),
-        np.array([100 * row.net for row in own]),
-        np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in own], bool),
+        np.array([_layer(row) for row in rows], np.int64),
+        np.array([100 * row.net for row in rows]),
+        np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in rows], bool),
     )
+
+
+def _stream(row: Passing) -> str:
+    return row.place.partition(".")[0]
 
 
 def _layer(row: Passing) -> int:
     return int(row.place.partition(".")[2])
-
-
-def _draw(axes: "Axes", points: Points, label: str, position: int) -> None:
-    line, sidestep = series(position), 0.05 * (position - 2)
-    x = points.layers + sidestep
-    axes.plot(x, points.percent, color=line.colour, ls=line.dash, lw=1.6, label=label)
-    for filled in (True, False):
-        chosen = points.significant == filled
-        axes.plot(
-            x[chosen], points.percent[chosen], ls="none", marker=line.marker, ms=5, mec=line.colour,
-            mfc=line.colour if filled else "white",
-        )  # fmt: skip

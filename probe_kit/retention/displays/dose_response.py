@@ -2,25 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.passing import Passing, stored_steering
+from probe_kit.intervene.inside import stored_steering
+from probe_kit.intervene.passing import Passing
 from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
-    GREY,
-    axes_for,
-    caption,
-    legend_above,
-    panels,
-    plain,
-    series,
-    spell,
-)
+from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
+from probe_kit.retention.displays.style import GREY, series, spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 
@@ -32,7 +24,7 @@ Percent = NDArray[np.float64]
 
 
 @dataclass
-class DoseResponseDisplay(Shown):
+class DoseResponseDisplay(Panelled):
     """By dose, the share of episodes that turn to the side they are pushed to, minus those that turn from it.
 
     doses: (K,) in half gaps between the class means, ascending, 0 among them. net, left, right: (K,) percent, of
@@ -42,6 +34,7 @@ class DoseResponseDisplay(Shown):
     significant: (K,) beyond the controls, family-wise.
     """
 
+    measure: ClassVar[str] = "% of episodes that turn"
     category: str
     place: str
     doses: NDArray[np.float64]
@@ -56,11 +49,11 @@ class DoseResponseDisplay(Shown):
 
     @classmethod
     def from_run(cls, run: RunReader, category: str, place: str | None = None) -> Self:
-        """From the newest steering that is stored of a category. place: one of several, as `backbone.02 image`.
+        """From the steering that is stored of a category. place: one of several, as `backbone.02 image`.
 
         Raises NoInterventionsError if there is none.
         """
-        found = _by_place(stored_steering(run).get(category, []))
+        found = stored_steering(run).get(category, {})
         if not found or (place is not None and place not in found):
             there = f"; it has it at {', '.join(found)}" if found else ""
             raise NoInterventionsError(
@@ -91,9 +84,13 @@ class DoseResponseDisplay(Shown):
             certificate=certificate,
         )
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
+    @property
+    def title(self) -> str:
+        """The category, and where."""
+        return f"{spell(self.category)}, {self.place}"
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for all episodes and one for either side, over the band of the controls."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
         if self.controls.size:
             # Nothing was added at dose 0, by a control either.
@@ -104,49 +101,21 @@ class DoseResponseDisplay(Shown):
             )  # fmt: skip
         lines = {"all episodes": self.net, "pushed to the left": self.left, "pushed to the right": self.right}
         for position, (label, percent) in enumerate(lines.items()):
-            line = series(position)
-            axes.plot(self.doses, percent, color=line.colour, ls=line.dash, lw=1.6, label=label)
             filled = self.significant if position == 0 else np.zeros(self.doses.size, bool)
-            for is_filled in (True, False):
-                axes.plot(
-                    self.doses[filled == is_filled], percent[filled == is_filled], ls="none", marker=line.marker,
-                    ms=5, mec=line.colour, mfc=line.colour if is_filled else "white",
-                )  # fmt: skip
-        plain(axes)
+            draw_series(axes, series(position), self.doses, percent, filled, label)
         axes.set_xticks(self.doses, [f"{dose:g}\n{ratio:.1f}×" for dose, ratio in zip(
             self.doses, self.norm_ratio, strict=True)])  # fmt: skip
         axes.set_ylim(-108, 108)
         axes.set_xlabel("half gaps between the class means; below: in norms of the tokens", fontsize=7.5)
-        axes.set_title(f"{spell(self.category)}, {self.place}", fontsize=9, loc="left")
-        if figure is not None:
-            axes.set_ylabel("% of episodes that turn", fontsize=9)
-            legend_above(figure, axes.get_legend_handles_labels()[0])
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
 
 
 def dose_response(run: RunReader) -> "Figure":
-    """A panel per category and place of the newest steering. Raises NoInterventionsError if none is stored."""
+    """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
     displays = [
         DoseResponseDisplay._of(rows, category, place, Certificate.of_run(run))
         for category, every in stored_steering(run).items()
-        for place, rows in _by_place(every).items()
+        for place, rows in every.items()
     ]
     if not displays:
         DoseResponseDisplay.from_run(run, "any")
-    figure, grid = panels(len(displays), height=2.7, share=False)
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    figure.supylabel("% of episodes that turn", fontsize=9)
-    caption(figure, displays[0].certificate)
-    legend_above(figure, grid[0].get_legend_handles_labels()[0])
-    return figure
-
-
-def _by_place(rows: Sequence[Passing]) -> dict[str, list[Passing]]:
-    """Rows by place and role, in words."""
-    found: dict[str, list[Passing]] = {}
-    for row in rows:
-        found.setdefault(f"{row.place} {row.role}", []).append(row)
-    return found
+    return in_panels(displays, height=2.7, share=False)

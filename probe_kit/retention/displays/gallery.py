@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from probe_kit.env.events import EVENTS
 from probe_kit.errors import UsageError
-from probe_kit.intervene.passing import stored_passing, stored_steering
+from probe_kit.intervene.inside import stored_steering
 from probe_kit.intervene.weighed import stored_attention
 from probe_kit.retention.call_curves import CallCurves, event_calls
 from probe_kit.retention.cells import model_name
 from probe_kit.retention.displays.attention import attention_curve
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
-from probe_kit.retention.displays.causal_curve import causal_curve
+from probe_kit.retention.displays.causal_curve import causal_curve, shown_passing
 from probe_kit.retention.displays.dose_response import dose_response
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -308,7 +308,7 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
 
 def _of_causes(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
     """Only where an interchange is stored with the run."""
-    if not set(stored_passing(run)) & set(results.settings.categories):
+    if not set(shown_passing(run)) & set(results.settings.categories):
         return []
     view = results.settings.views[0]
     return [
