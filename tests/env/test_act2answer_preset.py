@@ -166,6 +166,29 @@ def test_pushed_tiles_and_a_rammed_table_leave_no_trace_in_the_next_episode(env)
     assert episode_digest.released_digest(env, seed=3, look=True) == reference, "looking moves the pictures alone"
 
 
+@pytest.mark.parametrize("start_jitter", [0.0, 0.003])
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_hand_that_closed_before_holds_the_cube_as_one_that_closes_now(arm, start_jitter, make_env):
+    """Closing is simulated once per place of the cube; random actions behind it tell any difference."""
+    env = make_env("act2answer", arm=arm, start_jitter=start_jitter)
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 7)) * [0.03, 0.03, 0.03, 0.1, 0.1, 0.1, 1]
+
+    def moved(seed):
+        env.reset(seed=seed)
+        places = [env.scene.cube_state().position]
+        for action in actions:
+            env.advance(action)
+            places += [env.scene.cube_state().position, env.scene.arm.joints()]
+        return np.concatenate(places).tobytes()
+
+    first, other = moved(0), moved(1)
+    assert moved(1) == other
+    assert moved(0) == first
+    env.scene._reload()
+    assert moved(0) == first
+    assert moved(0) == first
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_the_expert_puts_the_cube_on_the_tile_from_the_same_pose_with_either_arm(mirrored, arm_env):
     for seed, layout in enumerate(("original", "swapped")):
