@@ -47,7 +47,9 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-@pytest.mark.parametrize("point", ["before-put", "after-put", "before-commit", "after-commit"])
+@pytest.mark.parametrize(
+    "point", ["before-put", pytest.param("after-put", marks=pytest.mark.slow), "before-commit", "after-commit"]
+)
 def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     point: str, suite: Suite, whole: Path, tmp_path: Path
 ) -> None:

@@ -71,7 +71,8 @@ def test_a_run_in_a_bucket_has_the_same_bytes_as_one_in_a_folder(
     assert objects(f"{bucket}/prefix/run") == objects(tmp_path / "run")
 
 
-@pytest.mark.parametrize("point", ["before-commit", pytest.param("after-commit", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("point", ["before-commit", "after-commit"])
 def test_killed_and_resumed_in_a_bucket_equals_never_killed(
     point: str, suite: Suite, whole: Path, bucket: str
 ) -> None:

@@ -81,7 +81,12 @@ def outcome_table() -> Callable[..., pd.DataFrame]:
 
 @pytest.fixture
 def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
-    """Makes a run with stored probes.
+    """Makes a run with stored probes; see `runs_in`."""
+    return runs_in(tmp_path)
+
+
+def runs_in(folder: Path) -> Callable[..., ArrayRun]:
+    """Makes runs with stored probes in `folder`.
 
     accuracies: per category, the backbone's per layer and the expert's per iteration and layer.
     """
@@ -98,7 +103,7 @@ def probed_run(tmp_path: Path) -> Callable[..., ArrayRun]:
         episodes = pd.concat(tables.values(), ignore_index=True)
         blank = np.zeros((len(episodes), 1))
         features = {(Site("backbone", 0), "mean"): blank, (Site(action_stream, 0, "residual", 0), "mean"): blank}
-        run = ArrayRun(tmp_path / model, model, suite, episodes, features, random_weights)
+        run = ArrayRun(folder / model, model, suite, episodes, features, random_weights)
         settings = ProbeSettings(
             model=model,
             random_weights=random_weights,

@@ -26,6 +26,7 @@ from probe_kit.retention.displays import (
 from probe_kit.retention.displays.style import FILLED, OPEN
 from probe_kit.retention.heat import HEAT
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
+from tests.retention.conftest import runs_in
 
 ProbedRun = Callable[..., ArrayRun]
 STEPS = [[0.5, 0.55, 0.6], [0.5, 0.6, 0.7], [0.6, 0.7, 0.9], [0.6, 0.9, 0.9]]
@@ -51,14 +52,20 @@ def in_two_views(run: ArrayRun) -> ArrayRun:
     return run
 
 
+Drawn = tuple[RetentionTable, dict[str, Figure]]
+
+
 @pytest.fixture(
+    scope="module",
     params=[
         "one category",
         "two categories and two models",
         pytest.param("twelve categories and two models", marks=pytest.mark.slow),
-    ]
+    ],
 )
-def exhibited(request: pytest.FixtureRequest, probed_run: ProbedRun) -> tuple[list[ArrayRun], RetentionTable]:
+def drawn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """A table and, by name, every figure that it and its runs allow."""
+    probed_run = runs_in(tmp_path_factory.mktemp("exhibited"))
     if request.param == "one category":
         runs = [in_two_views(probed_run({"color": SIGNAL}, "pi0"))]
     else:
@@ -68,29 +75,28 @@ def exhibited(request: pytest.FixtureRequest, probed_run: ProbedRun) -> tuple[li
             in_two_views(probed_run(names, "pi0-with-a-rather-long-name", random_weights=True)),
             in_two_views(probed_run(names, "smolvla", suite="another-suite-with-a-name@1.0.0#ba9876543210")),
         ]
-    return runs, retention(runs)
+    table = retention(runs)
+    return table, {exhibit.name: exhibit.draw() for exhibit in gallery(runs, table)}
 
 
-def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(
-    exhibited: tuple[list[ArrayRun], RetentionTable],
-) -> None:
-    for exhibit in gallery(*exhibited):
-        with exhibit.drawn() as figure:
-            figure.draw_without_rendering()
-            drawn, width, height = figure.get_tightbbox(), figure.get_figwidth(), figure.get_figheight()
-            assert min(drawn.x0, drawn.y0) > -0.02, f"{exhibit.name} is clipped left or below"
-            assert drawn.x1 < width + 0.02, f"{exhibit.name} is clipped right"
-            assert drawn.y1 < height + 0.02, f"{exhibit.name} is clipped above"
-            assert drawn.width > 0.9 * width, f"{exhibit.name} leaves its sides empty"
-            frame = figure.bbox.padded(1.5)
-            for legend in [*figure.legends, *(axes.get_legend() for axes in figure.axes)]:
-                if legend is not None:
-                    box = legend.get_window_extent()
-                    assert frame.x0 <= box.x0 < box.x1 <= frame.x1, f"{exhibit.name}: legend"
-                    assert frame.y0 <= box.y0 < box.y1 <= frame.y1, f"{exhibit.name}: legend"
-            assert "\n" not in figure.get_supxlabel(), exhibit.name
-            suites = {row.suite for row in exhibited[1].rows}
-            assert any(suite in figure.caption for suite in suites), exhibit.name  # type: ignore[attr-defined]
+def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Drawn) -> None:
+    table, figures = drawn
+    for name, figure in figures.items():
+        figure.draw_without_rendering()
+        inked, width, height = figure.get_tightbbox(), figure.get_figwidth(), figure.get_figheight()
+        assert min(inked.x0, inked.y0) > -0.02, f"{name} is clipped left or below"
+        assert inked.x1 < width + 0.02, f"{name} is clipped right"
+        assert inked.y1 < height + 0.02, f"{name} is clipped above"
+        assert inked.width > 0.9 * width, f"{name} leaves its sides empty"
+        frame = figure.bbox.padded(1.5)
+        for legend in [*figure.legends, *(axes.get_legend() for axes in figure.axes)]:
+            if legend is not None:
+                box = legend.get_window_extent()
+                assert frame.x0 <= box.x0 < box.x1 <= frame.x1, f"{name}: legend"
+                assert frame.y0 <= box.y0 < box.y1 <= frame.y1, f"{name}: legend"
+        assert "\n" not in figure.get_supxlabel(), name
+        suites = {row.suite for row in table.rows}
+        assert any(suite in figure.caption for suite in suites), name  # type: ignore[attr-defined]
 
 
 def test_saved_pixels_are_fit_for_print_and_carry_their_caption(probed_run: ProbedRun, tmp_path: Path) -> None:
@@ -185,24 +191,21 @@ def test_iterations_get_darker_one_by_one(results: ProbeResults) -> None:
     assert (np.diff(lightness) < -5).all()
 
 
-def test_filled_and_open_markers_mean_the_same_in_every_figure(
-    exhibited: tuple[list[ArrayRun], RetentionTable],
-) -> None:
+def test_filled_and_open_markers_mean_the_same_in_every_figure(drawn: Drawn) -> None:
     """Wherever a line or point has an open marker, the legend says what that is, in the same words."""
     seen = 0
-    for exhibit in gallery(*exhibited):
-        with exhibit.drawn() as figure:
-            hollow = [
-                line for axes in figure.axes for line in axes.lines
-                if line.get_marker() not in ("None", "", None) and is_white(line.get_markerfacecolor())
-                and line.get_markeredgewidth() > 0
-            ]  # fmt: skip
-            if not hollow:
-                continue
-            seen += 1
-            legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
-            words = [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
-            assert {FILLED, OPEN} <= set(words), exhibit.name
+    for name, figure in drawn[1].items():
+        hollow = [
+            line for axes in figure.axes for line in axes.lines
+            if line.get_marker() not in ("None", "", None) and is_white(line.get_markerfacecolor())
+            and line.get_markeredgewidth() > 0
+        ]  # fmt: skip
+        if not hollow:
+            continue
+        seen += 1
+        legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
+        words = [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
+        assert {FILLED, OPEN} <= set(words), name
     assert seen >= 2
 
 

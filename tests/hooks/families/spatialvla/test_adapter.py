@@ -81,6 +81,7 @@ class TestOneStepHeard(_Letters, AdapterContract):
         return seen
 
 
+@pytest.mark.slow
 class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(_Letters, AdapterContract):
     @pytest.fixture
     def policy(self, chunked: SpatialVLA) -> SpatialVLA:
