@@ -6,7 +6,7 @@ from probe_kit.env.arm_models import ARMS
 from probe_kit.errors import EpisodeOverError
 
 RANDOM_START = {"start_jitter": 0.02, "start_jitter_yaw": np.pi, "early_stop": True}
-EPISODES = [10, pytest.param(60, marks=pytest.mark.slow)]
+EPISODES = [4, pytest.param(60, marks=pytest.mark.slow)]
 
 
 @pytest.fixture

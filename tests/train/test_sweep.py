@@ -100,9 +100,9 @@ def with_tokens(run: ArrayRun, strength: float) -> ArrayRun:
 
 def test_token_views_are_probed_beside_pooled_ones_with_fewer_relabellings(planted_run: PlantedRun) -> None:
     run = with_tokens(planted_run(), strength=2.0)
-    results = train_probes(run, views=("mean", "tokens"), permutations=30, token_permutations=20)
+    results = train_probes(run, views=("mean", "tokens"), permutations=6, token_permutations=4)
     mean, tokens = results.curves["color", "mean"], results.curves["color", "tokens"]
-    assert (mean.null.shape[1], tokens.null.shape[1]) == (30, 20)
+    assert (mean.null.shape[1], tokens.null.shape[1]) == (6, 4)
     assert (tokens.correct.mean(axis=1) > 0.95).all()
     assert (mean.correct.mean(axis=1) < 0.7).all()
     assert (tokens.fold_of == mean.fold_of).all()

@@ -62,7 +62,7 @@ def test_there_are_at_least_150_items_without_repeating_a_question(category: str
 
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_a_tile_is_256_pixels_square_and_nothing_touches_its_border(category: str) -> None:
-    for tile in tiles(category, 20):
+    for tile in tiles(category, 8):
         pixels = np.asarray(tile.draw())
         assert pixels.shape == (256, 256, 3)
         border = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])

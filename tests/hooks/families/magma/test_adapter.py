@@ -54,6 +54,7 @@ class TestMagma(AdapterContract):
         return loaded
 
 
+@pytest.mark.slow
 class TestMagmaWithWholePictures(AdapterContract):
     """Pictures of another shape than a square, hence maps stitched from several crops."""
 

@@ -44,6 +44,7 @@ class TestXiaomi(AdapterContract):
         return loaded
 
 
+@pytest.mark.slow
 class TestXiaomiAsTheGoogleRobotInThreeSteps(AdapterContract):
     @pytest.fixture
     def policy(self, folder: Path) -> Xiaomi:
