@@ -68,6 +68,7 @@ class Scene:
         self.client = BulletClient()
         self.camera = Camera(spec.camera)
         self._folder = tempfile.TemporaryDirectory(prefix="probe-kit-scene-")
+        self._closed: tuple[tuple[int, float, bytes, bytes], int] | None = None
         try:
             self._build()
         except BaseException:
@@ -119,9 +120,9 @@ class Scene:
     def close_hand(self, actions: int) -> None:
         """Close the hand at the home pose for so many actions, without gravity during the first.
 
-        With gravity, a cube that waits in the air falls 12 mm before the fingers reach it. Called behind `reset`, with
-        nothing moved since. Closing around a cube in the same place is simulated once: the state that it led to is
-        restored, and is the same bit for bit.
+        With gravity, a cube that waits in the air falls 12 mm before the fingers reach it. Called behind `reset`,
+        with nothing moved since. Closing around a cube in the same place is simulated once: the state that it led
+        to is restored, and is the same bit for bit.
         """
         cube = self.cube_state()
         start = (actions, self.arm.opening(), cube.position.tobytes(), cube.quaternion.tobytes())
@@ -221,7 +222,7 @@ class Scene:
             for side in SIDES:
                 self._put(self.tiles[side], TILE_LIMBO[side], spec.tile_yaw)
         self._saved = client.saveState()
-        self._closed: tuple[tuple[int, float, bytes, bytes], int] | None = None
+        self._closed = None
         self._healthy = True
 
     def _reload(self) -> None:
