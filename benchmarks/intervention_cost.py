@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
-from probe_kit.intervene.patching import Replaced, patched
+from probe_kit.intervene.patching import Replaced, Tokens, patched
 
 INSTRUCTION = "Put the cube on the red shape"
 
@@ -41,10 +41,10 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     roles = policy.roles([seen])
 
     def changed(sites: list[Site]) -> Callable[[], object]:
-        mask = roles[sites[0].stream][0].valid
+        tokens = Tokens.of(roles[sites[0].stream][0].valid, policy.card.device)
 
         def run() -> object:
-            with patched(policy, sites, mask, Replaced(donor, mask.size)) as ledger:
+            with patched(policy, sites, tokens, Replaced(donor, tokens.count)) as ledger:
                 policy.act([seen], [0])
             assert ledger.fires == len(sites)
             return ledger

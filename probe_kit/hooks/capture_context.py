@@ -71,7 +71,8 @@ def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
 
     def write(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing)
-        new = edits[site](activation.detach().clone())
+        own = activation.detach() if activation.requires_grad else activation
+        new = edits[site](own.clone())
         if new.shape != activation.shape or new.dtype != activation.dtype:
             raise CaptureError(
                 f"the edit of {site} returned {new.dtype} {tuple(new.shape)}; "
@@ -88,9 +89,9 @@ def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
 
 def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStack) -> "list[_Listener]":
     """One listener per module; sites that differ only in the iteration share it."""
-    groups: dict[Site, list[Site]] = defaultdict(list)
+    groups: dict[tuple[str, int, str], list[Site]] = defaultdict(list)
     for site in dict.fromkeys(sites):
-        groups[Site(site.stream, site.layer, site.quantity)].append(site)
+        groups[site.stream, site.layer, site.quantity].append(site)
     listeners = [_Listener(model.tap(group[0]), group, handle) for group in groups.values()]
     for listener in listeners:
         stack.callback(listener.attach().remove)

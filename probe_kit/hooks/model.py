@@ -43,6 +43,7 @@ class Rows:
 
 
 ALL_ROWS = Rows()
+EVERY = slice(None)
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,16 @@ class Tap:
     module: nn.Module
     fires: int
     end: Literal["input", "output"] = "input"
-    tokens: slice = slice(None)
+    tokens: slice = EVERY
     rows: Rows = ALL_ROWS
     first: int = 0
     argument: str | None = None
     view: Callable[[Tensor], Tensor] | None = None
 
     def select(self, passing: Tensor) -> Tensor:
-        """The site's own (B, T, D), a view of what passes."""
-        whole = passing if self.view is None else self.view(passing)
-        return self.rows.of(whole)[:, self.tokens]
+        """The site's own (B, T, D), a view of what passes, or that itself where all of it is the site's."""
+        whole = self.rows.of(passing if self.view is None else self.view(passing))
+        return whole if self.tokens == EVERY else whole[:, self.tokens]
 
     def write(self, passing: Tensor, new: Tensor) -> None:
         """Put `new` (B, T, D) where `select` reads."""

@@ -20,7 +20,7 @@ from probe_kit.intervene.directions import MEAN_DIFFERENCE, axes_of
 from probe_kit.intervene.inside import BACKBONE, stored_passing
 from probe_kit.intervene.interchange import NONE, TakenOver, needed
 from probe_kit.intervene.passing import Passing
-from probe_kit.intervene.patching import Kept, Ledger, patched
+from probe_kit.intervene.patching import Kept, Ledger, Tokens, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
 from probe_kit.intervene.settings import CHUNK
 from probe_kit.intervene.stored import PLAIN
@@ -126,7 +126,7 @@ class DoseZero:
                     patched(
                         bench.policy,
                         [site for site in self.sites if site.stream == stream],
-                        token_mask(bench.policy, seen, stream, ALL),
+                        Tokens.of(token_mask(bench.policy, seen, stream, ALL), bench.policy.card.device),
                         Kept(),
                     )
                 )

@@ -24,7 +24,7 @@ from probe_kit.intervene.patching import Kept, Where, patched
 from probe_kit.intervene.places import Place, places, roles_of
 from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import ERASE, READABLE
-from probe_kit.intervene.tiles import TILES, role_mask
+from probe_kit.intervene.tiles import TILES, role_tokens
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
 
@@ -140,9 +140,9 @@ class Erased:
     def play(self, turn: Turn) -> Played:
         """The plain inference without it."""
         question, bench = turn.question, turn.bench
-        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
+        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
         change = Without(self.erasers[question.episode_id]) if self.erasers else Kept()
-        with patched(bench.policy, self.place.sites, mask, change) as ledger:
+        with patched(bench.policy, self.place.sites, tokens, change) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)
 
@@ -158,10 +158,10 @@ class Without:
         import torch
 
         del site, where
-        known = min(own.shape[0], self.eraser.fitted.size)
+        known = min(own.shape[1], self.eraser.fitted.size)
         after = own.clone()
-        erased = self.eraser(own[:known].double().cpu().numpy())
-        after[:known] = torch.from_numpy(erased).to(own)
+        erased = self.eraser(own[:, :known].double().cpu().numpy())
+        after[:, :known] = torch.from_numpy(erased).to(own)
         return after
 
 

@@ -16,7 +16,7 @@ from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, P
 from probe_kit.intervene.directions import Axes, axes_of
 from probe_kit.intervene.patching import Change, Replaced, ReplacedAlong, patched
 from probe_kit.intervene.places import ALL, Place, places, roles_of
-from probe_kit.intervene.tiles import TILES, role_mask
+from probe_kit.intervene.tiles import TILES, role_tokens
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Tape
@@ -117,8 +117,8 @@ class TakenOver:
     def play(self, turn: Turn) -> Played:
         """The plain inference with these tokens in it."""
         question, bench = turn.question, turn.bench
-        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
-        with patched(bench.policy, self.place.sites, mask, self._change(turn, mask.size)) as ledger:
+        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
+        with patched(bench.policy, self.place.sites, tokens, self._change(turn, tokens.count)) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)
 

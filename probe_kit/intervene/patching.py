@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, Union
+from functools import partial
+from typing import TYPE_CHECKING, Protocol, Self, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from probe_kit.errors import CaptureError
 from probe_kit.hooks.sites import Site
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from probe_kit.hooks import Policy, Tape
@@ -54,13 +56,34 @@ LEDGER = ("fires", "still", "norm", "moved", "largest")
 
 Where = Union["Tensor", slice]
 """Positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
+EVERY = slice(None)
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """Some tokens of a stream. count: how many it has. where: which of them."""
+
+    count: int
+    where: Where
+
+    @classmethod
+    def of(cls, mask: NDArray[np.bool_], device: str) -> Self:
+        """mask: (T,). device: of the stream."""
+        import torch
+
+        found = np.flatnonzero(mask)
+        if found.size == mask.size:
+            return cls(mask.size, EVERY)
+        if found.size and found.size == found[-1] + 1 - found[0]:
+            return cls(mask.size, slice(int(found[0]), int(found[-1]) + 1))
+        return cls(mask.size, torch.from_numpy(found).to(device))
 
 
 class Change(Protocol):
     """What becomes of the tokens of a site."""
 
     def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
-        """(T', D) float32 tokens in, as many out, and `own` left as it is. where: their positions."""
+        """(1, T', D) float32 tokens in, as many out, and `own` left as it is. where: their positions."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +96,12 @@ class Replaced:
     def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
         """The donor's."""
         del own
-        other = self.donor[site][0]
-        if other.shape[0] != self.tokens:
+        other = self.donor[site]
+        if other.shape[1] != self.tokens:
             raise CaptureError(
-                f"the donor's {site} has {other.shape[0]} tokens; expected {self.tokens}, as before exchanging"
+                f"the donor's {site} has {other.shape[1]} tokens; expected {self.tokens}, as before exchanging"
             )
-        return other[where].float()
+        return _at(other, where).float()
 
 
 @dataclass(frozen=True)
@@ -125,75 +148,67 @@ class Kept:
 
 
 @contextmanager
-def patched(policy: "Policy", sites: Sequence[Site], mask: NDArray[np.bool_], change: Change) -> Iterator[Ledger]:
-    """Change the tokens `mask` (T,) of some sites while the policy infers once, for one observation.
+def patched(policy: "Policy", sites: Sequence[Site], tokens: Tokens, change: Change) -> Iterator[Ledger]:
+    """Change the tokens of some sites while the policy infers once, for one observation.
 
     The ledger is complete when the context is left. Raises CaptureError for another number of tokens, and what
     `hooks.edit` raises, such as for a site that fires another number of times than its tap promises.
     """
     from probe_kit.hooks.capture_context import edit
 
-    ledger, norms = Ledger(), _Norms()
-    where = _positions(mask, policy.card.device)
-    with edit(policy, {site: _Changer(site, mask.size, where, change, norms) for site in sites}):
+    ledger, patch = Ledger(), _Patch(tokens, change)
+    with edit(policy, {site: partial(patch.changed, site) for site in sites}):
         yield ledger
-    norms.into(ledger)
+    patch.into(ledger)
 
 
-def _positions(mask: NDArray[np.bool_], device: str) -> Where:
-    import torch
-
-    found = np.flatnonzero(mask)
-    if found.size and found.size == found[-1] + 1 - found[0]:
-        return slice(int(found[0]), int(found[-1]) + 1)
-    return torch.from_numpy(found).to(device)
+def _at(activation: "Tensor", where: Where) -> "Tensor":
+    """(1, T', D) of (1, T, D), a view where they are neighbours."""
+    if where is EVERY:
+        return activation
+    return activation[:, where] if isinstance(where, slice) else activation.index_select(1, where)
 
 
 @dataclass
-class _Norms:
-    """Per fire the tokens (T', D) before and after; measured and summed up behind the inference, all at once."""
+class _Patch:
+    """Changes what passes. pairs: by shape, behind each other the tokens (1, T', D) of a fire before and after it.
 
-    before: "list[Tensor]" = field(default_factory=list)
-    after: "list[Tensor]" = field(default_factory=list)
+    They are measured behind the inference, all at once. An inference drives everything else out of the processor's
+    caches, so that every single call here costs ten times what it costs in a loop: they are few.
+    """
+
+    tokens: Tokens
+    change: Change
+    pairs: "dict[torch.Size, list[Tensor]]" = field(default_factory=dict)
+
+    def changed(self, site: Site, activation: "Tensor") -> "Tensor":
+        """(1, T, D) as it is to pass; raises CaptureError for another shape."""
+        count, where = self.tokens.count, self.tokens.where
+        if activation.shape[0] != 1 or activation.shape[1] != count:
+            raise CaptureError(f"{site} passes as {tuple(activation.shape)}; expected one row of {count} tokens")
+        before = _at(activation, where)
+        after = self.change(site, before.float(), where).to(activation.dtype)
+        self.pairs.setdefault(before.shape, []).extend((before, after))
+        if after.shape[1] == count:
+            return after
+        if not isinstance(where, slice):
+            return activation.index_copy_(1, where, after)
+        changed = activation.clone()  # `before` is a view, and is measured later
+        changed[:, where] = after
+        return changed
 
     def into(self, ledger: Ledger) -> None:
-        """Add them up. One transfer for all fires of one shape: a GPU waits at each."""
+        """Add all fires up. One transfer for those of one shape: a GPU waits at each."""
         import torch
 
-        for shape in dict.fromkeys(tokens.shape for tokens in self.before):
-            own = [at for at, tokens in enumerate(self.before) if tokens.shape == shape]
-            before, after = (torch.stack([some[at] for at in own]).float() for some in (self.before, self.after))
-            norms, moved = (torch.linalg.vector_norm(some, dim=-1) for some in (before, after - before))
-            rows = torch.stack([norms.mean(dim=1), moved.mean(dim=1), moved.amax(dim=1)]).tolist()
-            for norm, mean, largest in zip(*rows, strict=True):
+        for pairs in self.pairs.values():
+            both = torch.cat(pairs).float()
+            both[1::2].sub_(both[::2])
+            norms = torch.linalg.vector_norm(both, dim=-1).tolist()
+            for before, after in zip(norms[::2], norms[1::2], strict=True):
+                moved, largest = sum(after) / len(after), max(after)
                 ledger.fires += 1
                 ledger.still += int(largest == 0)
-                ledger.norm += norm
-                ledger.moved += mean
+                ledger.norm += sum(before) / len(before)
+                ledger.moved += moved
                 ledger.largest = max(ledger.largest, largest)
-
-
-@dataclass(frozen=True)
-class _Changer:
-    site: Site
-    tokens: int
-    where: Where
-    change: Change
-    norms: _Norms
-
-    def __call__(self, activation: "Tensor") -> "Tensor":
-        if activation.shape[0] != 1 or activation.shape[1] != self.tokens:
-            raise CaptureError(
-                f"{self.site} passes as {tuple(activation.shape)}; expected one row of {self.tokens} tokens"
-            )
-        passing = activation[0]
-        before = passing[self.where]
-        after = self.change(self.site, before.float(), self.where).to(activation.dtype)
-        self.norms.before.append(before)
-        self.norms.after.append(after)
-        if after.shape[0] == self.tokens:
-            return after[None]
-        # Not in place: neighbours are seen through a view, and what was there is measured later.
-        changed = passing.clone()
-        changed[self.where] = after
-        return changed[None]

@@ -18,7 +18,7 @@ from probe_kit.intervene.conditions import Condition, Intervention, Plain, Playe
 from probe_kit.intervene.directions import MEAN_DIFFERENCE, Axes, axes_of
 from probe_kit.intervene.patching import Moved, patched
 from probe_kit.intervene.places import Place, places
-from probe_kit.intervene.tiles import TILES, role_mask
+from probe_kit.intervene.tiles import TILES, role_tokens
 
 Toward = Literal["wrong", "correct", "left", "right"]
 DOSES = (1.0, 2.0, 4.0)
@@ -105,7 +105,7 @@ class Pushed:
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
         length = self.dose * self.axes.half_gap(question.episode_id, question.category) * side[self.toward]
         unit = self.axes.of(self.direction, question.episode_id, question.category)
-        mask = role_mask(bench.policy, question, self.place.stream, self.role, turn.memo)
-        with patched(bench.policy, self.place.sites, mask, Moved(np.float32(length) * unit)) as ledger:
+        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
+        with patched(bench.policy, self.place.sites, tokens, Moved(np.float32(length) * unit)) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError
 from probe_kit.hooks.observation import Observation
+from probe_kit.intervene.patching import Tokens
 from probe_kit.intervene.places import TILE_ROLES, token_mask
 from probe_kit.suite.items import Side
 
@@ -54,6 +55,17 @@ def role_mask(
     if not mask.any():
         raise EmptyRoleError(f"no patch of {question.episode_id} sees the {TILES[role]} tile")
     return mask
+
+
+def role_tokens(
+    policy: "Policy", question: "Question", stream: str, role: str, memo: MutableMapping[Any, Any]
+) -> Tokens:
+    """As `role_mask`, where they are; found once per question."""
+    name = stream, role, "tokens"
+    if name not in memo:
+        memo[name] = Tokens.of(role_mask(policy, question, stream, role, memo), policy.card.device)
+    found: Tokens = memo[name]
+    return found
 
 
 def tokens_seeing(

@@ -11,7 +11,7 @@ from probe_kit.hooks import Site
 from probe_kit.intervene import Effects, Interchange, Source, Steer, intervene_on, load_effects, stored_passing
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.directions import axes_of
-from probe_kit.intervene.patching import Ledger, Replaced, ReplacedAlong, _Norms
+from probe_kit.intervene.patching import EVERY, Kept, Ledger, Replaced, ReplacedAlong, Tokens, _Patch
 from probe_kit.intervene.places import places, token_mask
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     basis = np.linalg.qr(draw.normal(size=(4, 4)))[0].astype(np.float32)
     donor = {site: other[None]}
     where = torch.from_numpy(np.flatnonzero(mask))
-    taken = own[where]
+    taken = own[None, where]
     whole = Replaced(donor, 5)(site, taken, where)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(whole.numpy(), other.numpy()[mask])
+    np.testing.assert_array_equal(whole[0].numpy(), other.numpy()[mask])
     along = ReplacedAlong(donor, 5, basis)(site, taken, where)  # type: ignore[arg-type]
     np.testing.assert_allclose(along.numpy(), whole.numpy(), atol=1e-5)
     rank_one = ReplacedAlong(donor, 5, basis[:1])(site, taken, where)  # type: ignore[arg-type]
@@ -146,15 +146,14 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     """Two fires of one shape, one of another; the second moves nothing. By hand."""
     import torch
 
-    norms, ledger = _Norms(), Ledger()
+    ledger, pairs = Ledger(), dict[torch.Size, list[torch.Tensor]]()
     one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
     for before, after in ((one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (one, one), (other, -other)):
-        norms.before.append(before)
-        norms.after.append(after)
-    norms.into(ledger)
+        pairs.setdefault(before.shape, []).extend((before[None], after[None]))
+    _Patch(Tokens(2, EVERY), Kept(), pairs).into(ledger)
     assert (ledger.fires, ledger.still) == (3, 1)
     assert (ledger.norm, ledger.moved, ledger.largest) == (3.0 + 3.0 + 2.0, 3.0 + 0.0 + 4.0, 4.0)
-    _Norms().into(empty := Ledger())
+    _Patch(Tokens(2, EVERY), Kept()).into(empty := Ledger())
     assert empty == Ledger()
 
 
