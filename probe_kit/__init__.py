@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
+        Attention,
         ClosedLoop,
         Erase,
         Follow,
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Act2AnswerEnv",
+    "Attention",
     "ClosedLoop",
     "Erase",
     "ExtractSettings",
@@ -83,6 +85,7 @@ __getattr__ = lazy_names(
         "Steer": "intervene",
         "Erase": "intervene",
         "Interchange": "intervene",
+        "Attention": "intervene",
         "ClosedLoop": "intervene",
         "Act2AnswerEnv": "env",
         "ExtractSettings": "extract",

@@ -129,6 +129,19 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}
 
+    def observe_exchanged(self) -> tuple[Observation, Picture]:
+        """The observation now if the two pictures lay in each other's place, and its picture as rendered.
+
+        What the other layout of the item shows in this very state; the episode goes on as it was.
+        """
+        before = self._current_frame(), self._picture
+        try:
+            with self.scene.exchanged():
+                self._frame = None
+                return self.observe(), self.render()
+        finally:
+            self._frame, self._picture = before
+
     def outcome(self) -> Outcome:
         """The record of the episode so far. Raises EpisodeOverError if no action was carried out yet."""
         if self.trial.steps == 0:

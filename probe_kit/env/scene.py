@@ -1,7 +1,8 @@
 """The table top in the physics server: table, tiles, cube and arm, built once and restored per episode."""
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -20,7 +21,7 @@ from probe_kit.env.rotations import Array, to_vector, yaw_quaternion
 from probe_kit.env.spec import XY, XYZ, CameraSpec, LightSpec, SceneSpec
 from probe_kit.env.tiles import TextureCache, write_quad
 from probe_kit.errors import SceneError
-from probe_kit.suite.items import Side
+from probe_kit.suite.items import Side, other_side
 
 SIDES: tuple[Side, Side] = ("left", "right")
 TABLE_SIZE = (1.30, 1.40, 0.04)
@@ -87,15 +88,26 @@ class Scene:
         self.client.restoreState(self._saved)
         # The saved cube floats far above the table: one step lets contacts of the last episode expire.
         self.client.stepSimulation()
-        for side in SIDES:
-            texture = self.textures.load(pictures[side])
-            self.client.changeVisualShape(self.quads[side], -1, textureUniqueId=texture)
+        self._shown = {side: self.textures.load(pictures[side]) for side in SIDES}
+        self._show()
         if self.spec.tile_mass > 0:
             for side in SIDES:
                 self._put(self.tiles[side], self._tile_start(side), self.spec.tile_yaw)
         self._put(self.cube, cube_position, cube_yaw)
         self.arm.place(self.home_q, self.spec.home_opening)
         self.arm.command_gripper(self.spec.home_opening)
+
+    @contextmanager
+    def exchanged(self) -> Iterator[None]:
+        """With the two pictures in each other's place; nothing else differs, because pictures have no weight."""
+        before = self._shown
+        self._shown = {side: before[other_side(side)] for side in SIDES}
+        self._show()
+        try:
+            yield
+        finally:
+            self._shown = before
+            self._show()
 
     def advance(self, q_from: Array, q_to: Array, opening: float) -> bool:
         """Drive the arm from one commanded posture to the next in one action; False if the state broke."""
@@ -301,6 +313,10 @@ class Scene:
 
     def _tile_start(self, side: Side) -> XYZ:
         return (*self.spec.tile_xy(side), self.spec.tile_height / 2)
+
+    def _show(self) -> None:
+        for side, texture in self._shown.items():
+            self.client.changeVisualShape(self.quads[side], -1, textureUniqueId=texture)
 
     def _lay_pictures(self) -> None:
         """Let the pictures follow tiles that were pushed; they touch nothing, so that it changes no motion."""

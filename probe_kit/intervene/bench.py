@@ -27,7 +27,7 @@ from probe_kit.hooks.foreign_code import acting
 from probe_kit.hooks.observation import Observation
 from probe_kit.identity import derive_seed
 from probe_kit.suite.asked_both_ways import twins_of
-from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
+from probe_kit.suite.items import Episode, Item, Layout, Side
 from probe_kit.train.baselines import embedded_suite_of, suite_of
 
 if TYPE_CHECKING:
@@ -85,8 +85,7 @@ class Bench:
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
         self.items, self.twins = items, twins_of(items.values())
-        self._stage = Stage(scene, None)
-        self._beside: Stage | None = None
+        self.stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
 
@@ -94,35 +93,25 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stage.close()
-        if self._beside is not None:
-            self._beside.close()
-
-    def stages(self) -> tuple[Stage, Stage]:
-        """Its stage, and one beside it for the same state with exchanged pictures; opened when first asked for."""
-        if self._beside is None:
-            self._beside = Stage(self.scene, None)
-        return self._stage, self._beside
+        self.stage.close()
 
     def questions(self, item_id: str) -> list[Question]:
-        """The committed episodes of one item, their first frames drawn again.
+        """The committed episodes of one item, their first frames drawn again, both layouts of one state.
 
         Raises OtherFramesError if a frame is not the one that the run began with.
         """
         episodes = self.run.episodes
         rows = np.flatnonzero((episodes["item_id"] == item_id).to_numpy())
         frames: dict[Layout, Seen] = {}
-        tiles: dict[Layout, dict[Side, NDArray[np.bool_]]] = {}
         found = []
         for row in rows:
             record = episodes.iloc[int(row)]
             item = replace(self.items[item_id], instruction=str(record["instruction"]))
-            for layout in LAYOUTS:
-                if layout not in frames:
-                    frames[layout] = self._look(item, layout, int(record["scene_seed"]))
-                    tiles[layout] = self._stage.tile_masks()
             own: Layout = "original" if record["layout"] == "original" else "swapped"
             other: Layout = "swapped" if own == "original" else "original"
+            if own not in frames:
+                frames[own] = self._look(item, own, int(record["scene_seed"]))
+                frames[other], tiles = self.stage.look_exchanged(), self.stage.tile_masks()
             self._check_frame(record, frames[own])
             found.append(
                 Question(
@@ -136,15 +125,14 @@ class Bench:
                     seen=frames[own].observation,
                     exchanged=frames[other].observation,
                     seed=derive_seed(int(record["policy_seed"]), "inference", 0),
-                    tiles=tiles[own],
+                    tiles=tiles,
                     stored=self._stored(int(row)),
                 )
             )
         return found
 
     def _look(self, item: Item, layout: Layout, scene_seed: int) -> Seen:
-        """Both layouts of an item start from the same state, so that only the pictures differ."""
-        answer = self._stage.look(PlannedEpisode(0, Episode(item, layout), scene_seed, 0))
+        answer = self.stage.look(PlannedEpisode(0, Episode(item, layout), scene_seed, 0))
         assert isinstance(answer, Seen)
         return answer
 

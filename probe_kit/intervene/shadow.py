@@ -17,7 +17,7 @@ from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench, Chunk, Question
 from probe_kit.intervene.conditions import Condition, Noted, Replayed, Turn
 from probe_kit.intervene.patching import Ledger
-from probe_kit.intervene.playing import Carried, apart_from_stored, check_alike, executed, planned_of
+from probe_kit.intervene.playing import Carried, apart_from_stored, executed, planned_of
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[C
     """Every condition along every episode; the first one, which changes nothing, is carried out.
 
     `lateral` is where the hand began plus what all calls' actions would add across, in metres from the middle,
-    left positive. Raises CaptureChangedActionError if an outcome is not the stored one, OtherFramesError if the
-    state beside exchanged pictures goes its own way.
+    left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
     """
     found = Replayed.none_yet(questions, conditions)
     noted: list[Noted] = []
@@ -53,10 +52,8 @@ def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[C
 
 
 def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]) -> _Evaluated:
-    own, beside = bench.stages()
-    planned, turned = planned_of(bench, question)
-    seen: Answer = own.begin(planned, False)
-    other: Answer = beside.begin(turned, False)
+    stage, planned = bench.stage, planned_of(bench, question)
+    seen: Answer = stage.begin(planned, False)
     assert isinstance(seen, Observation)
     lateral = np.full(len(conditions), bench.across(seen.state[:2].astype(np.float64)))
     changed, past = np.zeros(len(conditions)), list[Chunk]()
@@ -64,9 +61,9 @@ def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]
     noted: list[Noted] = []
     for call in count():
         assert isinstance(seen, Observation)
-        assert isinstance(other, Observation)
+        other = stage.look_exchanged().observation
         seed = derive_seed(planned.policy_seed, "inference", call)
-        turn = Turn(bench, replace(question, seen=seen, exchanged=other, seed=seed, tiles=own.tile_masks()))
+        turn = Turn(bench, replace(question, seen=seen, exchanged=other, seed=seed, tiles=stage.tile_masks()))
         plain = conditions[0].play(turn)
         for number, condition in enumerate(conditions):
             played = condition.play(turn) if number else plain
@@ -75,9 +72,7 @@ def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]
             ledgers[number] += [] if played.ledger is None else [played.ledger]
             noted += [] if played.mass is None else [(question.row, call, played.mass)]
         past.append(plain.chunk)
-        actions = executed(bench, past)
-        seen, other = own.advance(actions), beside.advance(actions)
-        check_alike(question, seen, other)
+        seen = stage.advance(executed(bench, past))
         if isinstance(seen, Ending):
             break
     assert isinstance(seen, Ending)

@@ -55,6 +55,26 @@ def test_observations_are_in_their_space(shared_env):
     np.testing.assert_allclose(observation["agent_pos"], [*shared_env.scene_spec.home, 0, 0, 0, 0, 1], atol=1e-5)
 
 
+@pytest.mark.parametrize("changes", [{}, {"tile_mass": 0.05, "start_grasped": True, "picture_size": (128, 96)}])
+def test_exchanged_pictures_are_the_other_layouts_bit_for_bit_and_leave_no_trace(make_env, changes):
+    """At the start and after the same actions; on tiles that can be pushed as well."""
+    watched, other, alone = make_env(**changes), make_env(**changes), make_env(**changes)
+    for env, layout in ((watched, "original"), (other, "swapped"), (alone, "original")):
+        env.reset(seed=3, options={"layout": layout})
+    for action in (None, np.array([0.03, 0.04, -0.05, 0, 0, 0.1, 0]), np.array([0, 0.04, -0.05, 0, 0, 0.1, 0])):
+        if action is not None:
+            for env in (watched, other, alone):
+                env.advance(action)
+        seen, rendered = watched.observe_exchanged()
+        wanted = other.observe()
+        np.testing.assert_array_equal(seen["pixels"]["image"], wanted["pixels"]["image"])
+        np.testing.assert_array_equal(rendered, other.render())
+        np.testing.assert_array_equal(seen["agent_pos"], wanted["agent_pos"])
+        assert (rendered != watched.render()).any()
+        np.testing.assert_array_equal(watched.render(), alone.render())
+    assert watched.outcome().to_json() == alone.outcome().to_json()
+
+
 def test_step_is_advance_and_observe(make_env):
     stepped, advanced = make_env(), make_env()
     action = np.array([0.03, 0.02, -0.05, 0, 0, 0.1, 0])

@@ -1,14 +1,13 @@
 """Closed loop, on a real network and simulator: what is played is the run's, and edits act at every inference."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from probe_kit.errors import CaptureChangedActionError, OtherFramesError, UsageError
+from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
 from probe_kit.hooks.observation import Observation
 from probe_kit.intervene import (
@@ -22,7 +21,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.bench import Bench, open_bench
 from probe_kit.intervene.conditions import Plain
-from probe_kit.intervene.playing import carry_out, check_alike
+from probe_kit.intervene.playing import carry_out
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
@@ -135,7 +134,7 @@ def test_killed_and_resumed_gives_the_same_bytes(
     assert all(said["fires"] == 2 * 2 for said in edits.values())
 
 
-def test_the_other_stage_is_in_the_same_state_with_pictures_exchanged(
+def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
     run: Run, source: Source, twin: "Policy"
 ) -> None:
     seen: list[tuple[Observation, Observation]] = []
@@ -154,8 +153,6 @@ def test_the_other_stage_is_in_the_same_state_with_pictures_exchanged(
     for own, other in seen:
         np.testing.assert_array_equal(own.state, other.state)
         assert (own.image != other.image).any()
-    with pytest.raises(OtherFramesError, match="led to another state"):
-        check_alike(question, seen[0][0], replace(seen[0][1], state=seen[1][1].state))
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,10 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import Run, open_run, verify_run
+from probe_kit.extract.play.stage import Seen, Stage
 from probe_kit.intervene import Effects, Follow, Source, intervene_on, load_effects, stored_interventions
 from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.playing import planned_of
 from probe_kit.retention import retention
 
 if TYPE_CHECKING:
@@ -51,9 +53,16 @@ def test_plain_inferences_are_the_runs_bit_for_bit(effects: Effects) -> None:
 
 
 def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, bench: Bench) -> None:
-    """State and noise stay; and what one layout sees exchanged is what the other one sees."""
+    """State and noise stay; and what one layout sees exchanged is what the other one sees, set up by itself."""
     item = str(copy.episodes["item_id"][0])
     original, swapped = bench.questions(item)
+    planned = replace(planned_of(bench, swapped), scene_seed=planned_of(bench, original).scene_seed)
+    alone = Stage(bench.scene, None)
+    looked = alone.look(planned)
+    alone.close()
+    assert isinstance(looked, Seen)
+    np.testing.assert_array_equal(original.exchanged.image, looked.observation.image)
+    assert looked.facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
     np.testing.assert_array_equal(original.exchanged.image, swapped.seen.image)
     np.testing.assert_array_equal(swapped.exchanged.image, original.seen.image)
     assert (original.seen.image != original.exchanged.image).any()

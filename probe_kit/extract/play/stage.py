@@ -1,6 +1,6 @@
 """A stage: one environment and the episode on it, driven one chunk of actions at a time."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, Protocol
@@ -97,6 +97,11 @@ class Stage:
         except ProbeKitError as error:
             raise self._named(error) from None
 
+    def look_exchanged(self) -> Seen:
+        """What the item's other layout shows in the state that this episode is in; facts: its hash alone."""
+        observation, frame = self._env.observe_exchanged()
+        return Seen(self._observed(observation), {"first_frame_sha256": frame_sha256(frame)})
+
     def _set_up(self, planned: PlannedEpisode) -> None:
         options = {"item": planned.episode.item, "layout": planned.episode.layout}
         _, start = self._env.reset(seed=planned.scene_seed, options=options)
@@ -151,7 +156,10 @@ class Stage:
         return None if self._first is None else (self._first, shrink(self._env.render()))
 
     def _see(self) -> Observation:
-        seen, instruction = self._env.observe(), self._planned.episode.item.instruction
+        return self._observed(self._env.observe())
+
+    def _observed(self, seen: Mapping[str, Any]) -> Observation:
+        instruction = self._planned.episode.item.instruction
         return Observation(seen["pixels"]["image"], seen["agent_pos"], instruction, self._intrinsics)
 
     def _shoot(self) -> None:
