@@ -13,12 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from probe_kit.demo import PERMUTATIONS
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.extract import Run, extract_run
+from probe_kit.extract import Run
 from probe_kit.intervene import (
     ClosedLoop,
     Effects,
-    Follow,
     Interchange,
     Passing,
     Source,
@@ -26,9 +26,8 @@ from probe_kit.intervene import (
     intervene_on,
 )
 from probe_kit.intervene.conditions import Intervention
-from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, settings_of, source_of
+from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, probed
 from probe_kit.suite import Suite, build_suite
-from probe_kit.train import train_probes
 
 ABSENT = "counting"
 """A category of which nothing was trained."""
@@ -61,13 +60,9 @@ class Trial:
 
 
 def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, twin: Run | None) -> Run:
-    """The organism's episodes, probes and `follow`."""
-    settings = replace(settings_of(organism, suite), video="none", frames="none", env_workers=0)
-    if steps is not None:
-        settings = replace(settings, scene=replace(settings.scene, max_steps=steps))
-    run = extract_run(settings, folder / organism.folder)
-    train_probes(run, permutations=100, controls=("binding",), suite=suite.folder, twin=twin)
-    intervene_on(run, Follow(), source_of(organism, suite))
+    """The organism's episodes, probes and `follow`; what `demo --compare` made of the same suite is reused."""
+    shorter = organism if steps is None else replace(organism, max_steps=steps)
+    run, _ = probed(shorter, suite, folder, PERMUTATIONS, lambda _: lambda *_: None, twin)
     return run
 
 
