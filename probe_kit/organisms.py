@@ -35,7 +35,7 @@ class Organism:
     """A model by its name, and the verdict that is true of it per category; `absent` or `unknown` if not named.
 
     folder: what its run is called. asked: it reads and does not act. max_steps: actions per episode; None for as
-    many as its scene has.
+    many as its scene has. view: the tokens whose mean is probed.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Organism:
     truth: tuple[tuple[str, Truth], ...] = ()
     asked: bool = False
     max_steps: int | None = None
+    view: str = "mean"
 
     def expected(self, category: str) -> Truth:
         """What is true by construction."""
@@ -69,6 +70,7 @@ EARLY = Organism(
     "pi0-tiny-early",
     truth=(("color", "encoded, unused"), ("shape", "encoded, unused"), ("state", "encoded, unused")),
     max_steps=SHORT,
+    view="mean:language",  # where a reader answers; nothing was trained that would take it from there
 )
 RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True, max_steps=SHORT)
 OTHER_TWINS = tuple(
@@ -139,7 +141,13 @@ def probed(
     )
     progress = stage(f"probing sites, {organism.name}")
     results = train_probes(
-        run, permutations=permutations, controls=("binding",), suite=suite.folder, twin=twin, progress=progress
+        run,
+        views=(organism.view,),
+        permutations=permutations,
+        controls=("binding",),
+        suite=suite.folder,
+        twin=twin,
+        progress=progress,
     )
     progress = stage(f"exchanging pictures, {organism.name}")
     intervene_on(run, Follow(), source_of(organism, suite), progress=progress)

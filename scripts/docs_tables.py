@@ -96,9 +96,9 @@ def _span(rows: Sequence[Row], name: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _percent(share: float) -> str:
+def _percent(share: float | None) -> str:
     """One decimal, none where it is zero."""
-    return f"{100 * share:.1f}".removesuffix(".0")
+    return "n/a" if share is None else f"{100 * share:.1f}".removesuffix(".0")
 
 
 def _retention(row: Row, undefined: str) -> str:

@@ -178,7 +178,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
     }
 
 
-ORDERS = [list(POOL), list(POOL)[::-1], *(random.Random(seed).sample(list(POOL), len(POOL)) for seed in range(3))]
+ORDERS = [list(POOL), list(POOL)[::-1], *(random.Random(seed).sample(list(POOL), len(POOL)) for seed in range(1))]
 """Of any two, each comes last in one of the first two."""
 
 
