@@ -30,9 +30,9 @@ SHORT = {
     "ExtractSettings(model, ": f"ExtractSettings(model, {SCENE}",
     "permutations=24": "permutations=3",
     '["color", "state"]': '["color"]',
-    'roles=("all", "language")': 'roles=("all",)',
+    '"memory.*"': '"memory.02"',
 }
-"""Episodes that end after one inference, few relabellings, one category, and one role of tokens."""
+"""Episodes that end after one inference, few relabellings, one category, and one block of the memory."""
 
 
 def shortened(source: str) -> str:
