@@ -178,9 +178,12 @@ def stored_attention(run: RunReader) -> dict[str, Weighed]:
 def foremost_attention(run: RunReader) -> dict[str, tuple[Told, Weighed]]:
     """`stored_attention`, and of which stored intervention each is."""
     found: dict[str, tuple[Told, Weighed]] = {}
+    read: dict[str, Weighed] = {}
     for told in told_of(run, ATTENTION):
-        every, before = Weighed.from_bytes(told.stored.bundle.read(WEIGHED)), found.get(told.category)
-        weighed = every.only(every.categories == told.category)
+        key, before = told.stored.key, found.get(told.category)
+        if key not in read:
+            read[key] = Weighed.from_bytes(told.stored.bundle.read(WEIGHED))
+        weighed = read[key].only(read[key].categories == told.category)
         if before is None or (before[0].rank, len(before[1].roles)) <= (told.rank, len(weighed.roles)):
             found[told.category] = told, weighed
     return found
