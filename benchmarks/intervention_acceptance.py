@@ -131,7 +131,9 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
     """Along one direction it passes, along a random one it does not; what is not used turns nothing."""
     categories = (*trial.used, *trial.unused)
     effects = trial.done(
-        Interchange(categories=categories, sites=(place,), roles=(role,), direction="mean-difference", controls=1)
+        Interchange(
+            categories=categories, sites=(place,), roles=(role,), direction="mean-difference:1", controls=1
+        )
     )
     steered = trial.done(Steer(categories=trial.used, sites=(place,), role=role, doses=(4.0,), controls=1))
     for category in categories:
@@ -142,7 +144,7 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
             )
             continue
         yield Property(
-            f"{category}: rank 1 along the mean difference at {place} {role} ≥ .8",
+            f"{category}: rank 1 along the mean differences of positions at {place} {role} ≥ .8",
             own.effect is not None and own.effect >= 0.8, shown(own.effect),
         )  # fmt: skip
         yield Property(

@@ -6,7 +6,7 @@ it is held against: the same scene, the same seeds, and a dose of zero that must
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.env.rules import DEFAULT_RULE
@@ -16,15 +16,16 @@ from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.hooks.sites import Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
-from probe_kit.intervene.directions import MEAN_DIFFERENCE, axes_of
+from probe_kit.intervene.directions import MEAN_DIFFERENCE
 from probe_kit.intervene.inside import BACKBONE, stored_passing
 from probe_kit.intervene.interchange import NONE, TakenOver, needed
 from probe_kit.intervene.passing import Passing
 from probe_kit.intervene.patching import Kept, Ledger, Tokens, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
-from probe_kit.intervene.settings import CHUNK
+from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import PLAIN
 from probe_kit.intervene.tiles import TILES
+from probe_kit.intervene.token_directions import bases_of, check_direction
 from probe_kit.train.reader import RunReader
 
 CELL = "|"
@@ -35,13 +36,13 @@ KIND = "closed-loop"
 class ClosedLoop(Intervention):
     """Interchange at a few cells, carried out: dose zero, exchanged pictures, every cell, and its controls.
 
-    cells: `PLACE|ROLE`, such as `backbone.02|image`; see `best_cells`. direction: along which a cell is taken over
-    as well, beside `controls` random ones of the data's own covariance, where a place is one site and the role no
-    tile; `none` for neither. The tokens of every cell are also taken over whole.
+    cells: `PLACE|ROLE`, such as `backbone.02|image`; see `best_cells`. direction: as of an `Interchange`; along it
+    a cell is taken over as well, beside `controls` random ones of the data's own covariance, where a place is one
+    site and the role no tile; `none` for neither. The tokens of every cell are also taken over whole.
     """
 
     cells: tuple[str, ...]
-    direction: str = MEAN_DIFFERENCE
+    direction: str = f"{MEAN_DIFFERENCE}:1"
     controls: int = 1
     seed: int = 0
 
@@ -51,7 +52,9 @@ class ClosedLoop(Intervention):
             raise UsageError("a closed loop is read where the cube ends; leave --readout out")
         if not self.cells or any(cell.count(CELL) != 1 for cell in self.cells):
             raise UsageError(f"cells are {self.cells}; expected PLACE|ROLE, such as backbone.02|image")
-        if self.controls and self.direction == NONE:
+        if self.direction != NONE:
+            check_direction(self.direction)
+        elif self.controls:
             raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
 
     @property
@@ -101,8 +104,9 @@ class ClosedLoop(Intervention):
     def _along(self, bench: Bench, place: Place, role: str, donors: tuple[Site, ...]) -> list[Condition]:
         if self.direction == NONE or len(place.sites) != 1 or role in TILES:
             return []
-        axes = axes_of(bench.run, place.only_site, role, self.direction, self.controls, self.seed)
-        return [TakenOver(place, role, donors, name, axes) for name in (self.direction, *axes.control_names)]
+        items = items_of(bench.run, replace(self, items=None))
+        bases = bases_of(bench, items, place, role, self.direction, self.controls, self.seed)
+        return [TakenOver(place, role, donors, name, bases) for name in (self.direction, *bases.control_names)]
 
     @staticmethod
     def _split(cell: str) -> tuple[str, str]:

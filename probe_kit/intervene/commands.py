@@ -54,8 +54,9 @@ def intervene(
     direction: Annotated[
         str | None,
         typer.Option(
-            help="mean-difference or probe: interchange along it only; steer along it (the first is default). "
-            "Closed loop: along it as well (the first is default), or none. Erase: leace (default), "
+            help="mean-difference or probe, of the mean over tokens: interchange along it only; steer along it "
+            "(the first is default). mean-difference:K: interchange along K directions found token by token. "
+            "Closed loop: along it as well (default mean-difference:1), or none. Erase: leace (default), "
             "mean-difference:K or inlp:K, K directions per token.",
             rich_help_panel=INSIDE,
         ),

@@ -2,6 +2,9 @@
 
 A probe's weights are the direction in which the answer is best *read*: they are turned away from what else varies.
 Where it *lies* is the difference of the two class means, and that is the direction to write along.
+
+These are directions of a mean over tokens. An answer that lies in *which* tokens are marked leaves no mean behind;
+see `token_directions`.
 """
 
 from collections.abc import Mapping
@@ -10,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.views import resolve_view
@@ -36,6 +38,10 @@ class Axes:
     fold_of: Mapping[str, int]
     control_names: tuple[str, ...] = ()
 
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """(1, D) the direction that never saw this episode."""
+        return self.of(name, episode, category)[None]
+
     def of(self, name: str, episode: str, category: str) -> Vector:
         """(D,) the direction that never saw this episode."""
         return np.asarray(self.units[name, category][self.fold_of[episode]])
@@ -43,6 +49,11 @@ class Axes:
     def half_gap(self, episode: str, category: str) -> float:
         """Half the distance of the class means, for this episode."""
         return float(self.half_gaps[category][self.fold_of[episode]])
+
+
+def control_names(count: int) -> tuple[str, ...]:
+    """Of so many random directions beside another one."""
+    return tuple(f"control-{number + 1}" for number in range(count))
 
 
 def view_of(role: str) -> str:
@@ -53,13 +64,11 @@ def view_of(role: str) -> str:
 def axes_of(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> Axes:
     """Of every category of the run, from what is pooled over the tokens of `role` at `site`.
 
-    Raises UsageError for an unknown direction, UnknownSiteError for a site or view that is not stored.
+    Raises UnknownSiteError for a site or view that is not stored.
     """
-    if direction not in DIRECTIONS:
-        raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
     episodes = run.episodes
     features = run.column(site, resolve_view(view_of(role), run.views(site.stream))).astype(np.float64)
-    names = tuple(f"control-{number + 1}" for number in range(controls))
+    names = control_names(controls)
     units: dict[tuple[str, str], Vector] = {}
     gaps: dict[str, NDArray[np.float64]] = {}
     fold_of: dict[str, int] = {}

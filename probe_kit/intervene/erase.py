@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.sites import Site
-from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Replayed, Turn
-from probe_kit.intervene.directions import FOLDS
-from probe_kit.intervene.gathered import Gathered, gather
+from probe_kit.intervene.gathered import Gathered, by_episode, fit_by_fold, gather
 from probe_kit.intervene.patching import Kept, Where, patched
 from probe_kit.intervene.places import Place, places, roles_of
 from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import ERASE, READABLE
 from probe_kit.intervene.tiles import TILES, role_tokens
-from probe_kit.statistics.folds import Fold, grouped_folds
-from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
+from probe_kit.statistics.folds import Fold
+from probe_kit.train.erasure import Eraser, Method, Tokens
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -95,26 +93,21 @@ class Erase(Intervention):
         return {READABLE: {one.name: dict(one.readable) for one in conditions if isinstance(one, Erased)}}
 
     def _of(self, place: Place, role: str, gathered: Mapping[str, Gathered]) -> list[Condition]:
-        method = Method.of(self.method)
-        names = (self.method, *(f"control-{number + 1}" for number in range(self.controls)))
-        erasers: dict[str, dict[str, Eraser]] = {name: {} for name in names}
-        readable: dict[str, dict[str, float]] = {name: {} for name in ("", *names)}
+        erasers: dict[str, dict[str, Eraser]] = {}
+        readable: dict[str, dict[str, float]] = {"": {}}
         for category, own in gathered.items():
-            seed = derive_seed("erase", self.seed, category)
-            folds = grouped_folds(own.left.astype(int), own.groups, min(FOLDS, np.unique(own.groups).size), seed)
-            draw = np.random.default_rng(derive_seed("control", self.seed, category, str(place.only_site), role))
-            fitted = [_fitted(own, fold, method, names, draw) for fold in folds]
+            fits = fit_by_fold(
+                own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category
+            )
+            folds = [fold for fold, _ in fits]
             readable[""][category] = _readable(own, folds, None)
-            for name in names:
-                readable[name][category] = _readable(own, folds, [one[name] for one in fitted])
-                erasers[name] |= {
-                    own.episodes[row]: one[name]
-                    for fold, one in zip(folds, fitted, strict=True)
-                    for row in fold.test
-                }
+            for name, of_episode in by_episode(own, fits).items():
+                erasers.setdefault(name, {}).update(of_episode)
+                fitted = [by_name[name] for _, by_name in fits]
+                readable.setdefault(name, {})[category] = _readable(own, folds, fitted)
         return [
             Erased(place, role, UNTOUCHED, {}, readable[""]),
-            *(Erased(place, role, name, erasers[name], readable[name]) for name in names),
+            *(Erased(place, role, name, erasers[name], readable[name]) for name in erasers),
         ]
 
 
@@ -163,15 +156,6 @@ class Without:
         erased = self.eraser(own[:, :known].double().cpu().numpy())
         after[:, :known] = torch.from_numpy(erased).to(own)
         return after
-
-
-def _fitted(
-    own: Gathered, fold: Fold, method: Method, names: Sequence[str], draw: np.random.Generator
-) -> dict[str, Eraser]:
-    """The eraser and its controls, by name, of one fold's training episodes."""
-    training, left = own.tokens.only(fold.train), own.left[fold.train]
-    eraser = fit_eraser(training, left, method)
-    return {names[0]: eraser, **{name: fit_control(training, left, method, eraser, draw) for name in names[1:]}}
 
 
 def _readable(own: Gathered, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:

@@ -1,15 +1,21 @@
-"""The tokens of one place before the action, of whole categories: what erasers are fitted on."""
+"""The tokens of one place before the action, of whole categories, and what is fitted on them fold by fold."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.sites import Site
+from probe_kit.identity import derive_seed
 from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.directions import FOLDS, control_names
 from probe_kit.intervene.places import token_mask
-from probe_kit.train.erasure import Tokens
+from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
+
+Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
+"""Every fold, and by name what is fitted on its training episodes."""
 
 
 @dataclass(frozen=True)
@@ -58,3 +64,34 @@ def _together(rows: Sequence[tuple[str, str, bool, NDArray[np.float64]]]) -> Gat
     for row, own in enumerate(values):
         tokens[row, : len(own)], present[row, : len(own)] = own, True
     return Gathered(tuple(episodes), np.array(groups), np.array(left), Tokens(tokens, present))
+
+
+def fit_by_fold(
+    own: Gathered, site: Site, role: str, method: Method, controls: int, seed: int, category: str
+) -> Fits:
+    """An eraser called `method` and its controls, for every fold of the groups of one category.
+
+    Raises UsageError where no position has episodes enough to learn from.
+    """
+    groups = min(FOLDS, np.unique(own.groups).size)
+    folds = grouped_folds(own.left.astype(int), own.groups, groups, derive_seed("erase", seed, category))
+    draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role))
+    return [(fold, _fitted(own, fold, method, controls, draw)) for fold in folds]
+
+
+def by_episode(own: Gathered, fits: Fits) -> dict[str, dict[str, Eraser]]:
+    """By name and episode, what never saw that episode."""
+    found: dict[str, dict[str, Eraser]] = {}
+    for fold, fitted in fits:
+        for name, eraser in fitted.items():
+            found.setdefault(name, {}).update({own.episodes[row]: eraser for row in fold.test})
+    return found
+
+
+def _fitted(
+    own: Gathered, fold: Fold, method: Method, controls: int, draw: np.random.Generator
+) -> dict[str, Eraser]:
+    training, left = own.tokens.only(fold.train), own.left[fold.train]
+    eraser = fit_eraser(training, left, method)
+    beside = {name: fit_control(training, left, method, eraser, draw) for name in control_names(controls)}
+    return {str(method): eraser, **beside}

@@ -5,7 +5,7 @@ and can do no more than the exchange itself: with all that differs put in, the e
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
@@ -13,10 +13,11 @@ from probe_kit.hooks.interventions import InterventionKind
 from probe_kit.hooks.sites import MEMORY_STREAM, Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
-from probe_kit.intervene.directions import Axes, axes_of
 from probe_kit.intervene.patching import Change, Replaced, ReplacedAlong, patched
 from probe_kit.intervene.places import ALL, Place, places, roles_of
+from probe_kit.intervene.settings import items_of
 from probe_kit.intervene.tiles import TILES, role_tokens
+from probe_kit.intervene.token_directions import Bases, bases_of, check_direction
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Tape
@@ -39,8 +40,9 @@ class Interchange(Intervention):
 
     sites: patterns of places, see `places`. roles: of the tokens that are taken over; a stream is tried at those
     that it has. direction: `none` takes tokens over whole; `mean-difference` or `probe` only along that direction
-    of each place (rank 1), found without the episode it is used on. controls: so many random directions of the
-    data's own covariance, orthogonal to it, per place and role.
+    of each place (rank 1), found in means over tokens without the episode it is used on; `mean-difference:K` along
+    K directions found in the tokens themselves, see `token_directions`. controls: so many times as many random
+    directions of the data's own covariance, orthogonal to it, per place and role.
     """
 
     sites: tuple[str, ...] = SITES
@@ -58,7 +60,9 @@ class Interchange(Intervention):
                 "tiles have no mean in the run from which a direction could be found; exchange them whole: leave "
                 "--direction out"
             )
-        if self.controls and self.direction == NONE:
+        if self.direction != NONE:
+            check_direction(self.direction)
+        elif self.controls:
             raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
 
     @property
@@ -82,15 +86,16 @@ class Interchange(Intervention):
         """Plain, exchanged, and every place at every role. Raises UnknownSiteError, NoProbesError."""
         found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
         donors = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
+        items = items_of(bench.run, replace(self, items=None))
         conditions: list[Condition] = [Plain(), Exchanged()]
         for place in found.values():
             for role in roles_of(bench.policy, place.stream, self.roles):
                 if self.direction == NONE:
                     conditions.append(TakenOver(place, role, donors))
                     continue
-                axes = axes_of(bench.run, place.only_site, role, self.direction, self.controls, self.seed)
+                bases = bases_of(bench, items, place, role, self.direction, self.controls, self.seed)
                 conditions += [
-                    TakenOver(place, role, donors, name, axes) for name in (self.direction, *axes.control_names)
+                    TakenOver(place, role, donors, name, bases) for name in (self.direction, *bases.control_names)
                 ]
         return conditions
 
@@ -100,14 +105,14 @@ class TakenOver:
     """The tokens of one role at one place, from the inference before exchanged pictures.
 
     donors: all sites of which that inference is asked, once for all conditions. direction: the name of one of
-    `axes`, empty to take tokens over whole.
+    `bases`, empty to take tokens over whole.
     """
 
     place: Place
     role: str
     donors: tuple[Site, ...]
     direction: str = ""
-    axes: Axes | None = None
+    bases: Bases | None = None
 
     @property
     def name(self) -> str:
@@ -124,10 +129,10 @@ class TakenOver:
 
     def _change(self, turn: Turn, tokens: int) -> Change:
         donor = donor_of(turn, self.donors)
-        if self.axes is None:
+        if self.bases is None:
             return Replaced(donor, tokens)
-        vector = self.axes.of(self.direction, turn.question.episode_id, turn.question.category)
-        return ReplacedAlong(donor, tokens, vector[None])
+        basis = self.bases.basis(self.direction, turn.question.episode_id, turn.question.category)
+        return ReplacedAlong(donor, tokens, basis)
 
 
 def donor_of(turn: Turn, sites: Sequence[Site]) -> "Tape":

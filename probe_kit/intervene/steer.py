@@ -15,7 +15,7 @@ import numpy as np
 from probe_kit.errors import UsageError
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Intervention, Plain, Played, Turn
-from probe_kit.intervene.directions import MEAN_DIFFERENCE, Axes, axes_of
+from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE, Axes, axes_of
 from probe_kit.intervene.patching import Moved, patched
 from probe_kit.intervene.places import Place, places
 from probe_kit.intervene.tiles import TILES, role_tokens
@@ -47,6 +47,11 @@ class Steer(Intervention):
             raise UsageError(
                 f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
                 "exchange the tile (--kind interchange)"
+            )
+        if self.direction not in DIRECTIONS:
+            raise UsageError(
+                f"{self.direction!r} is no direction for a dose: steering adds one vector to every token. Use "
+                f"{' or '.join(DIRECTIONS)}"
             )
         if self.toward not in get_args(Toward):
             raise UsageError(f"toward is {self.toward!r}; expected one of {', '.join(get_args(Toward))}")

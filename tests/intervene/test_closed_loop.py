@@ -130,7 +130,7 @@ def test_killed_and_resumed_gives_the_same_bytes(
         whole, killed = ((copy.path / "interventions" / key / name).read_bytes() for copy in copies)
         assert whole == killed
     edits = load_effects(copies[0], key).certificate["edits"]
-    assert {name.rpartition("|")[2] for name in edits} == {"plain", "image", "mean-difference", "control-1"}
+    assert {name.rpartition("|")[2] for name in edits} == {"plain", "image", "mean-difference:1", "control-1"}
     assert all(said["fires"] == 2 * 2 for said in edits.values())
 
 
