@@ -83,18 +83,18 @@ class Counted(JointProblems):
 
     work = Work()
 
-    def point(self, strength: float, weights: object, rows: NDArray[np.intp], *, exact: bool) -> Point:
+    def point(self, weights: object, rows: NDArray[np.intp], *, exact: bool) -> Point:
         """As of JointProblems."""
         if exact:
             self.work.double += self._products(rows)
         else:
             self.work.single += self._products(rows)
-        return super().point(strength, weights, rows, exact=exact)
+        return super().point(weights, rows, exact=exact)
 
-    def curved(self, strength: float, directions: object, curvature: object, rows: NDArray[np.intp]) -> object:
+    def curved(self, directions: object, curvature: object, rows: NDArray[np.intp]) -> object:
         """As of JointProblems."""
         self.work.single += self._products(rows)
-        return super().curved(strength, directions, curvature, rows)
+        return super().curved(directions, curvature, rows)
 
     def _products(self, rows: NDArray[np.intp]) -> float:
         width = self.site.turned.shape[1]

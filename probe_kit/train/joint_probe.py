@@ -1,7 +1,12 @@
-"""Nested cross-validation of a site with many samples: all training sets and relabellings in shared products."""
+"""Nested cross-validation of a site with many samples: training sets, relabellings and C in shared products.
 
-from collections.abc import Sequence
+Every C starts from nothing: with the one before as a start, problems took nearly as many products, which were a
+seventh as wide and so half as fast.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import batched
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +60,12 @@ def cross_validate_jointly(
 
 
 def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
-    """Columns of labels whose problems fit into COLUMN_MEMORY; at least one.
+    """Columns of labels whose problems, with all C, fit into COLUMN_MEMORY; at least one."""
+    return max(1, _times_at_once(site, folds) // STRENGTHS.size)
+
+
+def _times_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
+    """How often the problems of all inner folds fit into COLUMN_MEMORY; at least once.
 
     A problem takes three curvatures of every sample in float32 while a step is found, and some 16 rows of weights.
     """
@@ -74,42 +84,52 @@ class _Columns:
     folds: Sequence[NestedFold]
 
     def fitted(self) -> list[FittedFold]:
-        chosen, starts = self._chosen()  # (F, L), and weights by C, outer fold and column
-        count, columns = chosen.shape
-        decisions = np.empty((count, columns, len(self.samples.counts)))
-        first: dict[int, tuple[Matrix, float, float]] = {}
-        inner = len(self.site.sets.outer) - count
-        for strength in np.unique(chosen):
-            fold, column = np.nonzero(chosen == strength)
-            problems = self._problems(inner + fold, column)
-            weights = solve(problems, float(STRENGTHS[strength]), starts[strength][fold, column])
-            decisions[fold, column] = to_numpy(problems.decisions(weights, self.samples.means))
-            first |= _kept(problems, weights, fold, np.flatnonzero(column == 0))
+        chosen, starts = self._chosen()
+        inner = len(self.site.sets.outer) - len(chosen)
+        fold, column = (part.ravel() for part in np.indices(chosen.shape))
+        problems = self._problems(inner + fold, column, STRENGTHS[chosen].ravel())
+        weights = solve(problems, starts[chosen.ravel(), fold, column])
+        decisions = to_numpy(problems.decisions(weights, self.samples.means)).reshape(*chosen.shape, -1)
+        first = _kept(problems, weights, fold, np.flatnonzero(column == 0))
         return [
             FittedFold(decisions[number][:, nested.outer.test].T, STRENGTHS[chosen[number]], *first[number])
             for number, nested in enumerate(self.folds)
         ]
 
-    def _chosen(self) -> tuple[NDArray[np.intp], list[Array]]:
-        """Position of the chosen C by outer fold and column, and where to start there: the inner folds' mean."""
+    def _chosen(self) -> tuple[NDArray[np.intp], Array]:
+        """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
+
+        These are the mean of the inner folds'.
+        """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
-        of_fold, columns = np.array([number for number, _ in sets]), self.labels.shape[1]
-        problems = self._problems(np.repeat(np.arange(len(sets)), columns), np.tile(np.arange(columns), len(sets)))
-        xp, width = namespace(self.site.mean), len(self.site.mean) + 1
-        weights = xp.zeros((len(problems), width), dtype=xp.float64, device=self.site.mean.device)
-        loss, starts = np.zeros((STRENGTHS.size, len(self.folds), columns)), []
-        for step, strength in enumerate(STRENGTHS):
-            weights = solve(problems, float(strength), weights)
-            decided = to_numpy(problems.decisions(weights, self.samples.means)).reshape(len(sets), columns, -1)
+        of_fold = np.array([number for number, _ in sets])
+        loss = np.zeros((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
+        starts = []
+        for step, (weights, decided) in enumerate(self._along_grid(len(sets))):
             for (number, inner), found in zip(sets, decided, strict=True):
                 loss[step, number] += log_loss(found[:, inner.test].T, self.labels[inner.test]) * inner.test.size
-            by_set = weights.reshape(len(sets), columns, width)
-            starts.append(xp.stack([by_set[of_fold == n].mean(axis=0) for n in range(len(self.folds))]))
-        return least_loss(loss), starts
+            starts.append([weights[of_fold == number].mean(axis=0) for number in range(len(self.folds))])
+        xp = namespace(self.site.mean)
+        return least_loss(loss), xp.stack([xp.stack(by_fold) for by_fold in starts])
 
-    def _problems(self, sets: NDArray[np.intp], columns: NDArray[np.intp]) -> JointProblems:
+    def _along_grid(self, sets: int) -> Iterator[tuple[Array, Matrix]]:
+        """For each C, weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
+        xp, columns = namespace(self.site.mean), self.labels.shape[1]
+        width = len(self.site.mean) + 1
+        for some in batched(STRENGTHS, _times_at_once(self.site, self.folds)):
+            grid, set_of, column = (part.ravel() for part in np.indices((len(some), sets, columns)))
+            problems = self._problems(set_of, column, np.array(some)[grid])
+            start = xp.zeros((len(problems), width), dtype=xp.float64, device=self.site.mean.device)
+            weights = solve(problems, start)
+            decided = to_numpy(problems.decisions(weights, self.samples.means))
+            shape = len(some), sets, columns, -1
+            yield from zip(weights.reshape(shape), decided.reshape(shape), strict=True)
+
+    def _problems(
+        self, sets: NDArray[np.intp], columns: NDArray[np.intp], strength: NDArray[np.float64]
+    ) -> JointProblems:
         signs = np.where(self.labels, 1, -1).astype(np.int8).T
-        return JointProblems(self.site, sets, signs[columns])
+        return JointProblems(self.site, sets, signs[columns], strength)
 
 
 def _kept(
@@ -118,7 +138,7 @@ def _kept(
     """Raw weights, intercept and spread of `some` problems, by their outer fold."""
     if not some.size:
         return {}
-    chosen = JointProblems(problems.site, problems.set_of[some], problems.signs[some])
+    chosen = JointProblems(problems.site, problems.set_of[some], problems.signs[some], problems.strength[some])
     found = (*chosen.raw(weights[some]), chosen.deviations(weights[some]))
     raw, intercepts, along = (to_numpy(part) for part in found)
     length = np.linalg.norm(raw, axis=1)

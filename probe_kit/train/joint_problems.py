@@ -20,7 +20,7 @@ and which of the problems they are of, (k, B)."""
 
 @dataclass(frozen=True)
 class JointProblems:
-    """K problems on one site: (K,) training set of each, and (K, E) labels −1/+1 of the episodes.
+    """K problems on one site: (K,) training set of each, (K, E) labels −1/+1 of the episodes, and (K,) C.
 
     Weights are rows (D + 1): u along the site's axes, and the intercept b. With v = axes · u, decisions are
     f = x·v − mean·v + b for x as the site standardises it, and the penalty is ½‖scale ∘ v‖²: scale ∘ v are the
@@ -31,15 +31,17 @@ class JointProblems:
     site: JointSite
     set_of: NDArray[np.intp]
     signs: NDArray[np.int8]
+    strength: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.set_of)
 
-    def rounding(self, strength: float) -> float:
-        """Size of a gradient that is all rounding, in float64."""
-        return float(1e-15 * strength * self.site.sets.counts.max() * self.site.turned.shape[1] ** 0.5)
+    def rounding(self, rows: NDArray[np.intp]) -> Array:
+        """(k,) size of a gradient that is all rounding, in float64."""
+        scale = 1e-15 * self.site.sets.counts.max() * self.site.turned.shape[1] ** 0.5
+        return scale * self._strength(rows, self.site.mean)[:, 0]
 
-    def point(self, strength: float, weights: Array, rows: NDArray[np.intp], *, exact: bool) -> Point:
+    def point(self, weights: Array, rows: NDArray[np.intp], *, exact: bool) -> Point:
         """The objective at `weights` (k, D + 1) of `rows`, in float32 or exactly."""
         xp, sets = namespace(weights), self.set_of[rows]
         loss = xp.zeros(len(rows), dtype=xp.float64, device=weights.device)
@@ -52,41 +54,44 @@ class JointProblems:
             curvature[use, block.rows] = xp.asarray(bend * member, dtype=xp.float32)
             return -signs * misfit * member
 
-        v, scale = self.on_features(weights), self.site.sets.scale[sets]
+        strength = self._strength(rows, weights)
         if exact:
-            mean = self.site.sets.mean[sets]
+            mean, v = self.site.sets.mean[sets], self.on_features(weights)
+            shrunk = self.site.sets.scale[sets] ** 2 * v
             pulled, total = self._swept(v / self.site.scale, weights[:, -1] - (mean * v).sum(axis=1), sets, inside)
-            by_feature = scale**2 * v + strength * (pulled / self.site.scale - mean * total[:, None])
-            by_axis = by_feature @ self._wide_axes
+            by_feature = shrunk + strength * (pulled / self.site.scale - mean * total[:, None])
+            by_axis, measured = by_feature @ self._wide_axes, by_feature / self._divisor[sets]
         else:
             mean, left = self._turned_mean[sets], xp.asarray(weights, dtype=xp.float32)
-            shift = left[:, -1] - (mean * left[:, :-1]).sum(axis=1)
+            v, shift = left[:, :-1] @ self.site.axes.T, left[:, -1] - (mean * left[:, :-1]).sum(axis=1)
+            shrunk = self._square_scale[sets] * v
             pulled, total = self._swept(left[:, :-1], shift, sets, inside)
-            by_axis = (scale**2 * v) @ self._wide_axes + strength * (pulled - mean * total[:, None])
-            by_feature = by_axis @ self._wide_axes.T
-        gradient = xp.hstack([by_axis, xp.asarray(strength * total, dtype=xp.float64)[:, None]])
-        penalty = ((scale * v) ** 2).sum(axis=1)
-        size = ((by_feature / self._divisor[sets]) ** 2).sum(axis=1) + gradient[:, -1] ** 2
-        return Point(strength * loss + 0.5 * penalty, gradient, size**0.5, penalty**0.5, curvature)
+            by_axis = shrunk @ self.site.axes + strength * (pulled - mean * total[:, None])
+            measured = by_axis  # as long as by features, but for their scales: nothing is accepted by it
+        gradient = xp.hstack([by_axis, strength * total[:, None]])
+        penalty = (shrunk * v).sum(axis=1, dtype=xp.float64)
+        size = (measured**2).sum(axis=1) + gradient[:, -1] ** 2
+        return Point(strength[:, 0] * loss + 0.5 * penalty, gradient, size**0.5, penalty**0.5, curvature)
 
-    def curved(self, strength: float, directions: Array, curvature: Array, rows: NDArray[np.intp]) -> Array:
+    def curved(self, directions: Array, curvature: Array, rows: NDArray[np.intp]) -> Array:
         """Hessian times `directions` (k, D + 1), by a point's curvature; all float32."""
         xp, sets = namespace(directions), self.set_of[rows]
         mean, along = self._turned_mean[sets], directions[:, :-1]
         shift = directions[:, -1] - (mean * along).sum(axis=1)
         pulled, total = self._swept(along, shift, sets, lambda f, block, use: f * curvature[use, block.rows])
         penalty = (self._square_scale[sets] * (along @ self.site.axes.T)) @ self.site.axes
+        strength = self._strength(rows, directions)
         inner = penalty + strength * (pulled - mean * total[:, None])
-        return xp.hstack([inner, (strength * total)[:, None]])
+        return xp.hstack([inner, strength * total[:, None]])
 
-    def diagonal(self, strength: float, curvature: Array, rows: NDArray[np.intp]) -> Array:
+    def diagonal(self, curvature: Array, rows: NDArray[np.intp]) -> Array:
         """(k, D + 1) float32, about the Hessian's diagonal: as if all samples were curved alike."""
         xp = namespace(curvature)
-        weight = strength * curvature.sum(axis=1)[:, None]
+        weight = self._strength(rows, curvature) * curvature.sum(axis=1)[:, None]
         share = xp.asarray(self.site.variances / len(self.site.features), dtype=xp.float32)
         return xp.hstack([self._penalty_diagonal[self.set_of[rows]] + weight * share, weight])
 
-    def exact_step(self, strength: float, gradient: Array, curvature: Array, row: int) -> Array:
+    def exact_step(self, gradient: Array, curvature: Array, row: int) -> Array:
         """(D + 1,) Newton step of one problem, by its whole Hessian."""
         xp, number, axes = namespace(gradient), self.set_of[row], self._wide_axes
         hessian = xp.zeros((len(gradient), len(gradient)), dtype=xp.float64, device=gradient.device)
@@ -94,7 +99,7 @@ class JointProblems:
             centred = self.site.turned[block.rows] - self._turned_mean[number]
             x = xp.hstack([centred, xp.ones_like(centred[:, :1])])
             hessian += (x.T * curvature[block.rows]) @ x
-        hessian *= strength
+        hessian *= self.strength[row]
         hessian[:-1, :-1] += (axes.T * self.site.sets.scale[number] ** 2) @ axes
         return xp.linalg.solve(hessian, -gradient)
 
@@ -139,11 +144,14 @@ class JointProblems:
         for fold, blocks in groupby(self.site.blocks, key=lambda block: block.outer):
             use = np.flatnonzero(self.site.sets.outer[sets] != fold)
             some, start = left[use], shift[use][:, None]
+            own, sums = xp.zeros_like(some), xp.zeros_like(start)
             for block in blocks if use.size else ():
                 x = self.site.centred(block) if exact else self.site.turned[block.rows]
                 values = inside(some @ x.T + start, block, use)
-                pulled[use] += values @ x
-                total[use] += values.sum(axis=1)
+                own += values @ x
+                sums += values.sum(axis=1)[:, None]
+            pulled[use] += own
+            total[use] += sums[:, 0]
         return pulled, total
 
     def _of_samples(self, block: Block, rows: NDArray[np.intp], like: Array) -> tuple[Array, Array]:
@@ -151,6 +159,10 @@ class JointProblems:
         signs = self.signs[np.ix_(rows, block.episode)]
         member = self.site.sets.member[:, block.episode][self.set_of[rows]]
         return _like(signs, like), _like(member, like)
+
+    def _strength(self, rows: NDArray[np.intp], like: Array) -> Array:
+        """(k, 1) C of some problems."""
+        return _like(self.strength[rows][:, None], like)
 
     @cached_property
     def _wide_axes(self) -> Array:

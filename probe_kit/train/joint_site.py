@@ -14,6 +14,9 @@ from probe_kit.train.samples import Samples
 ROWS_PER_BLOCK = 512
 """8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
 
+ROWS_PER_PRODUCT = 8192
+"""Rows multiplied with themselves at once: products of fewer are slower, float32 sums over more less exact."""
+
 LEAST_SCALE = 0.1
 """Deviation in a training set, as a share of the site's, below which its probes need axes of their own."""
 
@@ -78,19 +81,19 @@ class JointSite:
         unclear = bool(((scale > 0.25 * rounding) & (scale < 4 * rounding)).any())
         scale[scale <= rounding] = np.inf
         turned = xp.empty(features.shape, dtype=xp.float32, device=mean.device)
-        moments, member = _Moments.none(mean), _members(folds, len(samples.counts))
+        moments, member = _Moments(), _members(folds, len(samples.counts))
         for block in blocks:
             exact = (features.matrix[features.chosen[block.rows]] - mean) / scale
             turned[block.rows] = exact
-            moments.add(exact, turned[block.rows], xp.asarray(member[:, block.episode], device=mean.device))
+            moments.add(exact, xp.asarray(member[:, block.episode], device=mean.device))
         counts = member @ samples.counts
-        variances, wide_axes = xp.linalg.eigh(moments.products)
-        axes = xp.asarray(wide_axes, dtype=xp.float32)
+        axes, variances = _axes(turned), xp.zeros_like(mean)
         for block in blocks:
             turned[block.rows] = turned[block.rows] @ axes
+            variances += xp.square(turned[block.rows]).sum(axis=0)
         outer = np.append(np.repeat(np.arange(len(folds)), [len(f.inner) for f in folds]), np.arange(len(folds)))
         sets = TrainingSets(member.astype(np.float32), outer, counts, *moments.standard(counts))
-        return cls(features, blocks, mean, scale, unclear, sets, axes, variances.clip(0.0), turned)
+        return cls(features, blocks, mean, scale, unclear, sets, axes, variances, turned)
 
     @property
     def alike(self) -> bool:
@@ -108,21 +111,14 @@ class JointSite:
 
 @dataclass
 class _Moments:
-    """Sums over the rows seen so far: per training set of every feature and its square, and of all products."""
+    """Sums over the rows seen so far, per training set: of every feature, and of its square."""
 
-    sums: Array
-    squares: Array
-    products: Array
+    sums: Array = 0.0
+    squares: Array = 0.0
 
-    @classmethod
-    def none(cls, mean: Array) -> "_Moments":
-        xp, width = namespace(mean), len(mean)
-        return cls(0.0, 0.0, xp.zeros((width, width), dtype=xp.float64, device=mean.device))
-
-    def add(self, exact: Array, narrow: Array, member: Array) -> None:
+    def add(self, exact: Array, member: Array) -> None:
         self.sums = self.sums + member @ exact
         self.squares = self.squares + member @ exact**2
-        self.products += narrow.T @ narrow
 
     def standard(self, counts: NDArray[np.float64]) -> tuple[Array, Array]:
         """(F, D) mean and deviation of every training set."""
@@ -130,6 +126,18 @@ class _Moments:
         size = xp.asarray(counts, device=self.sums.device)[:, None]
         mean = self.sums / size
         return mean, xp.sqrt((self.squares / size - mean**2).clip(0.0))
+
+
+def _axes(rows: Array) -> Array:
+    """(D, D) principal axes of (M, D) float32: they precondition only, so float32 will do, in half the time."""
+    xp = namespace(rows)
+    parts = (rows[start : start + ROWS_PER_PRODUCT] for start in range(0, len(rows), ROWS_PER_PRODUCT))
+    products = sum(part.T @ part for part in parts)
+    if not isinstance(products, np.ndarray):
+        return xp.linalg.eigh(products)[1]
+    from scipy.linalg import eigh  # type: ignore[import-untyped]  # numpy's takes as long as in float64
+
+    return eigh(products, driver="evd", overwrite_a=True, check_finite=False)[1]
 
 
 def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:

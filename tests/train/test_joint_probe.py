@@ -1,7 +1,9 @@
 """Training sets solved together give what each gives on its own, and what scikit-learn gives."""
 
 import tracemalloc
+from collections import Counter
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import ProbeNotConvergedError
 from probe_kit.train import joint_probe, joint_site, mixed, probe
+from probe_kit.train.arrays import Array
 from probe_kit.train.joint_probe import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.joint_problems import JointProblems
 from probe_kit.train.joint_site import JointSite, training_sets
+from probe_kit.train.mixed import Point
 from probe_kit.train.nested import FittedFold
 from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import STRENGTHS, cross_validate, nested_folds
@@ -34,6 +38,16 @@ NOISE = GENERATOR.standard_normal((COUNTS.sum(), 12)) + OF_EPISODE
 def narrow_sites_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """The matrices here are tiny."""
     monkeypatch.setattr(joint_probe, "LEAST_WIDTH", 1)
+
+
+class Evaluated(JointProblems):
+    """Counts how often every problem is evaluated."""
+
+    evaluated: ClassVar = Counter[int]()
+
+    def point(self, weights: Array, rows: np.ndarray, *, exact: bool) -> Point:
+        self.evaluated.update(rows.tolist())
+        return super().point(weights, rows, exact=exact)
 
 
 def tokens(features: np.ndarray) -> Samples:
@@ -103,8 +117,8 @@ def test_either_end_of_the_grid_is_scikit_learns_optimum(world: str, strength: f
     site = JointSite.of(samples, FOLDS)
     sets = training_sets(FOLDS)
     signs = np.tile(np.where(LABELS, 1, -1).astype(np.int8), (len(sets), 1))
-    problems = JointProblems(site, np.arange(len(sets)), signs)
-    weights = mixed.solve(problems, float(strength), np.zeros((len(sets), 13)))
+    problems = JointProblems(site, np.arange(len(sets)), signs, np.full(len(sets), strength))
+    weights = mixed.solve(problems, np.zeros((len(sets), 13)))
     found = problems.decisions(weights, samples.means)
     for number, train in enumerate(sets):
         rows = np.isin(np.repeat(np.arange(60), COUNTS), train)
@@ -113,6 +127,23 @@ def test_either_end_of_the_grid_is_scikit_learns_optimum(world: str, strength: f
         oracle.fit(scaler.transform(features[rows]), np.repeat(LABELS, COUNTS)[rows])
         expected = oracle.decision_function(scaler.transform(samples.means))
         np.testing.assert_allclose(found[number], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_steps_that_go_too_far_are_halved_for_the_problems_that_make_them() -> None:
+    """Half of the problems start where nearly every sample is saturated, and so a Newton step overshoots."""
+    site = JointSite.of(tokens(NOISE + 0.2 * SIGNS), FOLDS)
+    sets = np.arange(len(training_sets(FOLDS)))
+    signs = np.tile(np.where(LABELS, 1, -1).astype(np.int8), (sets.size, 1))
+    problems = Evaluated(site, sets, signs, np.full(sets.size, 1.0))
+    start = np.zeros((sets.size, 13))
+    expected = mixed.solve(problems, start)
+    often = max(problems.evaluated.values())
+    start[::2] = np.random.default_rng(0).standard_normal(13) * 20
+    problems.evaluated.clear()
+    found = mixed.solve(problems, start)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    assert max(problems.evaluated[number] for number in sets[1::2]) <= often
+    assert min(problems.evaluated[number] for number in sets[::2]) > often
 
 
 def test_a_feature_that_one_training_set_never_sees_vary_is_left_to_axes_of_its_own() -> None:
@@ -142,9 +173,25 @@ def test_relabellings_are_solved_in_parts_that_fit_into_memory(monkeypatch: pyte
     site = JointSite.of(samples, FOLDS)
     many = np.column_stack([LABELS, flip_items(LABELS, ITEMS, 6, seed=1)])
     at_once = cross_validate_jointly(site, samples, many, FOLDS)
-    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 20 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
+    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 20 * 7 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
     assert labels_at_once(site, FOLDS) == 3
     assert_same(cross_validate_jointly(site, samples, many, FOLDS), at_once)
+
+
+def test_c_is_solved_in_parts_where_one_column_of_labels_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = tokens(NOISE + 0.2 * SIGNS)
+    site = JointSite.of(samples, FOLDS)
+    at_once = cross_validate_jointly(site, samples, COLUMNS, FOLDS)
+    sizes = []
+
+    def solve(problems: mixed.Problems, start: np.ndarray) -> np.ndarray:
+        sizes.append(len(problems))
+        return mixed.solve(problems, start)
+
+    monkeypatch.setattr(joint_probe, "solve", solve)
+    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 20 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
+    assert_same(cross_validate_jointly(site, samples, COLUMNS, FOLDS), at_once)
+    assert sizes == [60, 60, 20, 5] * 3  # C by threes, then the outer folds, for every column of labels
 
 
 def test_59_relabellings_of_many_tokens_stay_within_the_stated_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,5 +224,5 @@ def test_factorised_steps_take_over_from_conjugate_gradients(
 
 def test_an_unfinished_probe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mixed, "MAX_NEWTON_STEPS", 0)
-    with pytest.raises(ProbeNotConvergedError, match=r"of 60 logistic problems \(C=1e-05\) are not at"):
+    with pytest.raises(ProbeNotConvergedError, match=r"of 420 logistic problems \(C from 1e-05 to 10\) are not"):
         cross_validate(tokens(NOISE), COLUMNS, FOLDS)
