@@ -1,9 +1,17 @@
-"""An S3 server of our own on a port of this machine: moto's, which can be stopped and made to fail."""
+"""An S3 server of our own on a port of this machine: moto's, which can be stopped and made to fail.
 
+As a program it says where it listens and ends with its standard input, see `server_elsewhere`.
+"""
+
+import json
 import socket
+import subprocess
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from random import Random
 from threading import Event, Thread
 from typing import Any, NoReturn
@@ -63,16 +71,33 @@ class S3Server:
 
     def empty(self) -> str:
         """Forget everything; the URL of a new bucket."""
-        self._ask("moto-api/reset", "POST")
-        self._ask(BUCKET, "PUT")
-        return f"s3://{BUCKET}"
+        return empty_bucket(self.environment)
 
-    def _ask(self, path: str, method: str) -> None:
-        headers = {
-            "Authorization": "AWS4-HMAC-SHA256 Credential=nobody/20260101/us-east-1/s3/aws4_request",
-            "X-Trusted": "yes",
-        }
-        urlopen(Request(f"{self.environment['AWS_ENDPOINT_URL']}/{path}", method=method, headers=headers)).close()
+
+def empty_bucket(environment: dict[str, str]) -> str:
+    """Make the server to which this leads forget everything; the URL of a new bucket there."""
+    headers = {
+        "Authorization": "AWS4-HMAC-SHA256 Credential=nobody/20260101/us-east-1/s3/aws4_request",
+        "X-Trusted": "yes",
+    }
+    for path, method in (("moto-api/reset", "POST"), (BUCKET, "PUT")):
+        urlopen(Request(f"{environment['AWS_ENDPOINT_URL']}/{path}", method=method, headers=headers)).close()
+    return f"s3://{BUCKET}"
+
+
+@contextmanager
+def server_elsewhere() -> Iterator[dict[str, str]]:
+    """A server in a process of its own, and what leads a client there."""
+    pytest.importorskip("moto.server", reason="moto is not installed")
+    pytest.importorskip("obstore", reason="obstore is not installed (extra `remote`)")
+    command = [sys.executable, str(Path(__file__))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())
+        finally:
+            process.stdin.close()
 
 
 def without_conditions(app: App) -> App:
@@ -170,3 +195,10 @@ def now_and_then(ills: Iterable[str], share: float, seed: int) -> Callable[[str,
     """This share of all requests has one of these, drawn at random."""
     draw, chosen = Random(seed), list(ills)
     return lambda _method, _path: draw.choice(chosen) if draw.random() < share else None
+
+
+if __name__ == "__main__":
+    served = S3Server()
+    print(json.dumps(served.environment), flush=True)
+    sys.stdin.read()
+    served.stop()

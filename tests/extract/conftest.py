@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.s3_server import BadServer, S3Server, without_conditions
+from tests.s3_server import BadServer, S3Server, empty_bucket, server_elsewhere, without_conditions
 
 
 @contextmanager
@@ -40,3 +40,12 @@ def bad_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[BadServer]:
     with _leading_to(server, monkeypatch) as server.url:
         yield server
         server.day.over.set()
+
+
+@pytest.fixture
+def bucket_elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """URL of an empty bucket on a server in a process of its own, which the environment leads to."""
+    with server_elsewhere() as environment:
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        yield empty_bucket(environment)

@@ -23,6 +23,7 @@ from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
+from tests.extract.contents import objects
 from tests.little_run import episode, little_plan, little_writer
 from tests.s3_server import BadServer, now_and_then
 
@@ -40,13 +41,6 @@ def write(run: Path | str, suite: Suite) -> Run:
             writer.write(episode(plan, number))
         seal(run)
     return open_run(run)
-
-
-def objects(run: Path | str) -> dict[str, bytes]:
-    """Every object by key; the columns by what they are called in a folder."""
-    location = locate(run)
-    stamped = f"{location.derived(COLUMNS, open_run(run).stamp)}/"
-    return {key.replace(stamped, f"{COLUMNS}/"): location.read(key) for key in location.keys("")}
 
 
 @pytest.fixture(scope="module")

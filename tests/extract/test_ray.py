@@ -2,6 +2,8 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -9,8 +11,13 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import MissingExtraError
-from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
+from probe_kit.extract.crews.lost import WorkerLostWarning
+from probe_kit.extract.store.layout import COMMITS
+from probe_kit.extract.store.locate import locate
 from probe_kit.suite import build_suite
+from tests.extract.contents import objects
+from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for
 
 
 def test_without_ray_the_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,8 +40,8 @@ def test_an_actor_killed_in_mid_run_changes_nothing_in_the_result(tmp_path: Path
         plain = extract_run(settings, tmp_path / "plain").path
         killer = threading.Thread(target=_kill_the_actor, args=(tmp_path / "run",))
         killer.start()
-        with_ray = ExtractSettings(**{**vars(settings), "ray": "auto"})
-        run = extract_run(with_ray, tmp_path / "run").path
+        with pytest.warns(WorkerLostWarning):
+            run = extract_run(replace(settings, ray="auto"), tmp_path / "run").path
         killer.join()
     finally:
         ray.shutdown()
@@ -49,3 +56,34 @@ def _kill_the_actor(run: Path) -> None:
     started_here = psutil.Process().children(recursive=True)
     (actor,) = [process for process in started_here if "RayActor" in " ".join(process.cmdline())]
     actor.kill()
+
+
+@pytest.mark.slow
+def test_a_node_lost_in_mid_run_changes_nothing_in_the_bucket(tmp_path: Path, bucket_elsewhere: str) -> None:
+    suite = build_suite(tmp_path / "suite", ["color"], 12)
+    settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SceneSpec(max_steps=4), tokens="all")
+    plain = extract_run(settings, tmp_path / "plain")
+    url = f"{bucket_elsewhere}/run"
+
+    def lose(nodes: TwoNodes) -> int:
+        wait_for(lambda: locate(url).keys(COMMITS) and nodes.is_playing())
+        nodes.lose_the_second()
+        return len(locate(url).keys(COMMITS))
+
+    with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
+        kept = thread.submit(lose, nodes)
+        with pytest.warns(WorkerLostWarning) as warned:
+            extract_run(replace(settings, ray=nodes.address, workers=2), url)
+    assert 0 < kept.result() < len(plain.episodes)
+    messages = [str(warning.message) for warning in warned]
+    assert nodes.second_id in messages[0]
+    assert "episodes it held are played again" in messages[0]
+    there = open_run(url)
+    assert there.certificate["hooks_on_equals_hooks_off"]
+    assert verify_run(url, deep=True).ok
+    assert contents(there) == contents(plain)
+
+
+def contents(run: Run) -> dict[str, bytes]:
+    """All but certificates: each process writes one, with the hash of what it played first."""
+    return {key: content for key, content in objects(run.location).items() if not key.startswith("certificate")}

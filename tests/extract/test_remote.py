@@ -19,6 +19,7 @@ from probe_kit.extract.store.location import Location
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
+from tests.extract.contents import objects
 
 KILLING = Path(__file__).with_name("killing.py")
 SHORT = SceneSpec(max_steps=2)
@@ -27,13 +28,6 @@ SITE = Site("expert", 1, iteration=3)
 
 def start(run: str | Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, str(KILLING), str(run), str(suite.folder), *point])
-
-
-def objects(run: str | Path) -> dict[str, bytes]:
-    """Every object by key; the columns by what they are called in a folder."""
-    location = locate(run)
-    stamped = f"{location.derived(COLUMNS, open_run(run).stamp)}/"
-    return {key.replace(stamped, f"{COLUMNS}/"): location.read(key) for key in location.keys("")}
 
 
 @pytest.fixture(scope="module")

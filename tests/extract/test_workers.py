@@ -109,6 +109,7 @@ def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: S
         assert process.returncode == 0, messages
         assert commits(run) == commits(plain)
         if killed:
+            assert "ended with code -9; " in messages
             return
     pytest.fail("no worker could be killed in time")
 

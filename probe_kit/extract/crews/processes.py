@@ -8,6 +8,7 @@ from multiprocessing.connection import Connection, wait
 from probe_kit.child import Child
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.crews.loading import load_worker
+from probe_kit.extract.crews.lost import tell_lost
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Event
 from probe_kit.extract.settings import RunSettings
@@ -93,6 +94,7 @@ def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) 
             f"worker {hand.slot} ended with code {code} before its first episode; its last words are above. Try "
             "fewer --workers, or none to see the error in this process"
         )
+    tell_lost(f"worker {hand.slot} ended with code {code}", len(scheduler.holds(hand.slot)))
     for event in scheduler.lose(hand.slot, f"the worker playing it ended with code {code}"):
         heard(event)
     hand.start()

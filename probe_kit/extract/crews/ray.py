@@ -9,6 +9,7 @@ from typing import Any, Self
 from probe_kit.cluster import ray_cluster
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.crews.loading import load_worker
+from probe_kit.extract.crews.lost import tell_lost
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Done, Event
 from probe_kit.extract.settings import RunSettings
@@ -48,13 +49,19 @@ class RayActor:
         self._opened = ExitStack()
         self._worker: Any = None
 
-    def begin(self) -> ProbeKitError | None:
-        """Load the model. What is wrong with the whole run is an answer: Ray would wrap what is raised."""
+    def begin(self) -> str | ProbeKitError:
+        """Load the model; the node it is on, as `ray list nodes` names it.
+
+        What is wrong with the whole run is an answer: Ray would wrap what is raised.
+        """
+        import ray
+
         try:
             self._worker = self._opened.enter_context(load_worker(self._settings, self._run))
         except ProbeKitError as error:
             return error
-        return None
+        node: str = ray.get_runtime_context().get_node_id()
+        return node
 
     def play(self, numbers: Sequence[int]) -> list[Event] | ProbeKitError:
         """Play and commit these episodes."""
@@ -76,7 +83,10 @@ class RayCrew:
         self._settings, self._run = settings, run
         self._actors: dict[int, Any] = {}
         self._calls: dict[Any, int] = {}
-        self._begun: set[int] = set()
+        self._nodes: dict[int, str] = {}
+        """Of every worker that has begun."""
+        self._seen: dict[int, set[str]] = {}
+        """The nodes that were alive when a worker was started."""
         self._stillborn = 0
 
     def __enter__(self) -> Self:
@@ -97,8 +107,11 @@ class RayCrew:
 
     def _start(self, slot: int) -> None:
         actor = self._kind.remote(self._settings, self._run)
-        self._actors[slot] = actor
+        self._actors[slot], self._seen[slot] = actor, self._alive()
         self._calls[actor.begin.remote()] = slot
+
+    def _alive(self) -> set[str]:
+        return {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
 
     def __exit__(self, *_: object) -> None:
         with self._opened:
@@ -107,7 +120,7 @@ class RayCrew:
 
     def hand_out(self, scheduler: Scheduler) -> None:
         """Give every idle actor something to play."""
-        for slot in sorted(self._begun.difference(self._calls.values())):
+        for slot in sorted(self._nodes.keys() - set(self._calls.values())):
             numbers = scheduler.take_some(slot, EPISODES_PER_CALL)
             if numbers:
                 self._calls[self._actors[slot].play.remote(numbers)] = slot
@@ -118,16 +131,18 @@ class RayCrew:
         slot = self._calls.pop(ready)
         lost = self._ray.exceptions.RayActorError, self._ray.exceptions.ObjectLostError
         try:
-            answer: list[Event] | ProbeKitError | None = self._ray.get(ready)
+            answer: str | list[Event] | ProbeKitError = self._ray.get(ready)
         except lost as error:
             return self._replace(slot, scheduler, error)
         if isinstance(answer, ProbeKitError):
             raise answer
-        self._begun.add(slot)
         self._stillborn = 0
-        for event in answer or ():
+        if isinstance(answer, str):
+            self._nodes[slot] = answer
+            return []
+        for event in answer:
             scheduler.hear(slot, event)
-        return answer or []
+        return answer
 
     def _next_answer(self) -> Any:
         """Of any actor. Says once in a while that there is none to wait for, instead of waiting in silence."""
@@ -135,7 +150,7 @@ class RayCrew:
             ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=PATIENCE)
             if ready:
                 return ready[0]
-            if not self._begun:
+            if not self._nodes:
                 free = {name: self._ray.available_resources().get(name, 0) for name in ("CPU", "GPU")}
                 warnings.warn(
                     f"no worker on the Ray cluster has begun within {PATIENCE:.0f} s: each needs a core"
@@ -148,18 +163,21 @@ class RayCrew:
 
     def _replace(self, slot: int, scheduler: Scheduler, error: Exception) -> list[Event]:
         self._ray.kill(self._actors[slot])  # it may live on behind a broken network
-        if slot not in self._begun:
-            self._stillborn += 1
+        node = self._nodes.pop(slot, None)
+        # Until Ray knows of a lost node it puts workers there that never run, as many as were lost with it.
+        self._stillborn += node is None and self._seen[slot] <= self._alive()
         if self._stillborn >= STILLBORN:
             raise WorkerDiedError(
                 f"{STILLBORN} workers in a row died on the Ray cluster before their first episode; the last one: "
                 f"{error}. Look at the nodes' memory, or leave out --ray to see the error in this process"
             )
-        self._begun.discard(slot)
         self._start(slot)
         events = self._committed(scheduler.holds(slot))
         for event in events:
             scheduler.hear(slot, event)
+        where = "that had not begun yet" if node is None else f"on node {node}"
+        why = " ".join(line for line in str(error).splitlines() if not line.startswith("\t"))  # but Ray's numbers
+        tell_lost(f"a worker {where} of the Ray cluster is lost: {why}", len(scheduler.holds(slot)))
         return [*events, *scheduler.lose(slot, f"its Ray actor died: {error}")]
 
     def _committed(self, numbers: set[int]) -> list[Event]:

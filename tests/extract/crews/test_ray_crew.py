@@ -14,6 +14,7 @@ import pytest
 
 from probe_kit.errors import UnknownModelError, WorkerDiedError
 from probe_kit.extract.crews import ray as crew
+from probe_kit.extract.crews.lost import WorkerLostWarning
 from probe_kit.extract.crews.ray import ClusterFullWarning, run_on_ray
 from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.play.events import Done, Event
@@ -51,11 +52,15 @@ class Call:
 
 @dataclass
 class Cluster:
-    """room: actors that can run at a time. dies: told each call that is due, whether its actor dies with it."""
+    """room: actors that can run at a time. dies: told each call that is due, whether its actor dies with it.
+
+    begins_with: what workers answer to `begin` instead of their node. alive: names of its nodes.
+    """
 
     room: int
     dies: Callable[["Cluster", Call], bool]
     begins_with: Any = None
+    alive: set[str] = field(default_factory=lambda: {"first", "second"})
     actors: list[Actor] = field(default_factory=list)
     calls: list[Call] = field(default_factory=list)
     options: dict[str, Any] = field(default_factory=dict)
@@ -77,6 +82,9 @@ class Cluster:
         for actor in self.actors:
             if not actor.running and not actor.dead and sum(one.running for one in self.actors) < self.room:
                 actor.running = True
+
+    def nodes(self) -> list[dict[str, Any]]:
+        return [{"NodeID": name, "Alive": name in self.alive} for name in ("first", "second")]
 
     def cluster_resources(self) -> dict[str, float]:
         return {"CPU": self.room}
@@ -101,7 +109,9 @@ class Cluster:
             self.kill(ref.actor)
         if ref.actor.dead:
             raise ActorDiedError(f"in {ref.name}")
-        return self.begins_with if ref.name == "begin" else [Done(n, {"outcome": "oob"}) for n in ref.arguments[0]]
+        if ref.name == "begin":
+            return self.begins_with or "first"
+        return [Done(n, {"outcome": "oob"}) for n in ref.arguments[0]]
 
     def kill(self, actor: Actor) -> None:
         actor.running, actor.dead = False, True
@@ -133,13 +143,33 @@ def test_a_lost_node_whose_worker_finds_no_room_again_holds_nobody_up(run: Any) 
         return lost
 
     cluster = Cluster(2, dies)
-    scheduler, heard = run(cluster, 2)
+    with pytest.warns(
+        WorkerLostWarning, match=r"on node first .* is lost: in play; 8 episodes it held are played"
+    ):
+        scheduler, heard = run(cluster, 2)
     assert scheduler.done == set(range(EPISODES))
     assert not scheduler.given_up
     assert sorted(event.number for event in heard if isinstance(event, Done)) == list(range(EPISODES))
     assert len(cluster.actors) == 3
     played = {call.actor for call in cluster.calls if call.name == "play"}
     assert len(played) == 2, "the third never ran, and was given nothing to play"
+
+
+def test_workers_that_ray_puts_on_a_lost_node_before_it_knows_are_no_reason_to_end(run: Any) -> None:
+    lost, workers = range(4), 8
+
+    def dies(cluster: Cluster, call: Call) -> bool:
+        number = cluster.actors.index(call.actor)
+        never_ran = call.name == "begin" and number in range(workers, workers + len(lost))
+        if never_ran:
+            cluster.alive.discard("second")
+        return never_ran or (call.name == "play" and number in lost)
+
+    cluster = Cluster(workers, dies)
+    with pytest.warns(WorkerLostWarning):
+        scheduler, _ = run(cluster, workers)
+    assert scheduler.done == set(range(EPISODES))
+    assert len(cluster.actors) == workers + 2 * len(lost)
 
 
 def test_workers_are_spread_and_hold_a_core(run: Any) -> None:
@@ -150,7 +180,12 @@ def test_workers_are_spread_and_hold_a_core(run: Any) -> None:
 
 
 def test_workers_that_die_before_they_begin_end_the_extraction(run: Any) -> None:
-    with pytest.raises(WorkerDiedError, match="3 workers in a row died on the Ray cluster"):
+    with (
+        pytest.raises(WorkerDiedError, match="3 workers in a row died on the Ray cluster"),
+        pytest.warns(
+            WorkerLostWarning, match="that had not begun yet of the Ray cluster is lost: in begin; it held no"
+        ),
+    ):
         run(Cluster(2, lambda _cluster, call: call.name == "begin"), 2)
 
 
@@ -168,6 +203,7 @@ def test_a_cluster_without_room_is_not_waited_for_in_silence(run: Any) -> None:
 
 def test_an_episode_that_kills_two_workers_is_given_up(run: Any) -> None:
     cluster = Cluster(2, lambda _cluster, call: call.name == "play" and 7 in call.arguments[0])
-    scheduler, _ = run(cluster, 2)
+    with pytest.warns(WorkerLostWarning):
+        scheduler, _ = run(cluster, 2)
     assert set(scheduler.given_up) == {7}
     assert scheduler.done == set(range(EPISODES)) - {7}
