@@ -8,8 +8,10 @@ that a busy machine distorts little. Work is counted as products only: for k pro
 a gradient or a step of conjugate gradients is 4·M·D·k for the samples and 4·D²·k for the axes; once per site
 2·M·D² each for moments and turning. The machine's rate is that of square products in the same process.
 `--part together` and `--part alone` do half of it each, so that a large site can be timed in two processes; alone
-is then given the chosen `--strength` and compares no decisions. Peak memory is that of the whole process, with the
-making of samples.
+is then given the chosen `--strength`. `--decisions FILE` keeps what together decided in the first outer fold, and
+alone compares with it. `--rival-memory` is what alone may take for turned training samples of a set in float64
+(probe_kit has 0.5, beyond which it visits them in blocks, for two to eight times as long). Peak memory is that
+of the whole process, with the making of samples.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -25,8 +28,8 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from probe_kit.train import probe
-from probe_kit.train.features import Coordinates
-from probe_kit.train.joint_probe import cross_validate_jointly, labels_at_once
+from probe_kit.train.features import IN_MEMORY, Coordinates
+from probe_kit.train.joint_probe import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.joint_problems import JointProblems
 from probe_kit.train.joint_site import JointSite
 from probe_kit.train.mixed import Point
@@ -133,6 +136,10 @@ def main() -> None:
     parser.add_argument("--signal", type=float, default=0.3, help="0: none, and C is small")
     parser.add_argument("--part", choices=("together", "alone", "both"), default="both")
     parser.add_argument("--strength", type=float, default=10.0, help="C of the outer fold with --part alone")
+    parser.add_argument(
+        "--rival-memory", type=float, default=IN_MEMORY / 2**30, help="GiB for one training set alone"
+    )
+    parser.add_argument("--decisions", type=Path, help="file of the first outer fold's decisions")
     arguments = parser.parse_args()
     console = Console(width=115, highlight=False)
     samples = samples_of(arguments.episodes, arguments.tokens, arguments.width, arguments.signal)
@@ -142,17 +149,25 @@ def main() -> None:
     folds = nested_folds(real, items, seed=0)
     console.print(
         f"{arguments.episodes} × {arguments.tokens} samples × {arguments.width}, {labels.shape[1]} columns"
+        f"; probe_kit solves them {'together' if can_be_joint(samples) else 'alone'}"
     )
-    with threadpool_limits(1):
-        if arguments.part == "alone":
-            seconds, _ = alone_seconds(samples, labels, folds, np.full(labels.shape[1], arguments.strength))
-            console.print(f"alone: {seconds:.1f} s, scaled; peak memory {peak_memory():.2f} GB")
+    seconds, strengths, decisions = 0.0, np.full(labels.shape[1], arguments.strength), None
+    with threadpool_limits(1), patch("probe_kit.train.features.IN_MEMORY", arguments.rival_memory * 2**30):
+        if arguments.part != "alone":
+            seconds, found = together(samples, labels, folds, console)
+            strengths, decisions = found[0].strengths, found[0].decisions
+            if arguments.decisions:
+                np.save(arguments.decisions, decisions)
+        elif arguments.decisions:
+            decisions = np.load(arguments.decisions)
+        if arguments.part == "together":
             return
-        seconds, found = together(samples, labels, folds, console)
-        if arguments.part == "both":
-            alone, decisions = alone_seconds(samples, labels, folds, found[0].strengths)
-            apart = np.abs(decisions - found[0].decisions).max() / np.abs(decisions).max()
-            console.print(f"alone: {alone:.1f} s, scaled; {alone / seconds:.1f} times; apart {apart:.0e}")
+        alone, rival = alone_seconds(samples, labels, folds, strengths)
+        console.print(f"alone: {alone:.1f} s, scaled; peak memory {peak_memory():.2f} GB")
+        if seconds:
+            console.print(f"{alone / seconds:.1f} times")
+        if decisions is not None:
+            console.print(f"decisions apart by {np.abs(decisions - rival).max() / np.abs(rival).max():.0e}")
 
 
 def together(

@@ -33,7 +33,7 @@ TINY = float(np.finfo(np.float32).tiny)
 class Point:
     """The objective of k problems at some weights.
 
-    value: (k,) C · Σ loss + penalty. gradient: (k, R) by the weights as given, float64. size, length: (k,) norms
+    value: (k,) C · Σ loss + penalty. gradient: (k, R) by weights along axes, float64. size, length: (k,) norms
     of gradient and weights as scikit-learn's objective has them. curvature: (k, …) what products with the Hessian
     need.
     """
@@ -61,14 +61,26 @@ class Point:
 
 
 class Problems(Protocol):
-    """K logistic regressions, a row of R weights for each, the intercept last; `rows` (k,) are some of them."""
+    """K logistic regressions, a row of R weights for each, the intercept last; `rows` (k,) are some of them.
+
+    Weights are on features, or turned along axes on which Hessians are nearly diagonal.
+    """
 
     @property
     def strength(self) -> NDArray[np.float64]:
         """(K,) C."""
 
     def point(self, weights: Array, rows: Rows, *, exact: bool) -> Point:
-        """The objective at `weights` (k, R) in float32, or exactly: in float64 on the exact data."""
+        """The objective at turned `weights` (k, R), in float32, or at ones on features, exactly: in float64.
+
+        Exact is on the data as they are, whatever the axes are.
+        """
+
+    def turned(self, weights: Array) -> Array:
+        """(k, R) weights on features, along axes."""
+
+    def turned_back(self, weights: Array) -> Array:
+        """(k, R) weights along axes, on features."""
 
     def rounding(self, rows: Rows) -> Array:
         """(k,) size of a gradient that is all rounding, in float64."""
@@ -91,7 +103,7 @@ def solve(problems: Problems, start: Array) -> Array:
     Raises ProbeNotConvergedError rather than return one that is not at its optimum.
     """
     search = _Search(problems)
-    return search.refined(search.rough(start))
+    return search.refined(problems.turned_back(search.rough(problems.turned(start))))
 
 
 @dataclass(frozen=True)
@@ -99,7 +111,7 @@ class _Search:
     problems: Problems
 
     def rough(self, start: Array) -> Array:
-        """`start` brought near the optimum in float32. The last step is not looked back at."""
+        """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
         found, rows, weights = start + 0.0, np.arange(len(start)), start
         point = self._at(weights, rows, exact=False)
         for _ in range(MAX_ROUGH_STEPS):
@@ -113,7 +125,8 @@ class _Search:
             if near.all():
                 return found
             rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
-            weights, point = self._moved(weights, point, rows, step, exact=False)
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, step, slope, exact=False)
             found[rows] = weights
         return found
 
@@ -128,7 +141,9 @@ class _Search:
             if not open_.any():
                 return found
             rows, weights, point = rows[open_], weights[open_], point.only(open_)
-            weights, point = self._moved(weights, point, rows, self._newton_step(point, rows), exact=True)
+            step = self._newton_step(point, rows)
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
         strength = self.problems.strength[rows]
         raise ProbeNotConvergedError(
             f"{len(rows)} of {len(self.problems)} logistic problems (C from {strength.min():g} to "
@@ -140,9 +155,10 @@ class _Search:
     def _at(self, weights: Array, rows: Rows, *, exact: bool) -> Point:
         return self.problems.point(weights, rows, exact=exact)
 
-    def _moved(self, weights: Array, point: Point, rows: Rows, step: Array, *, exact: bool) -> tuple[Array, Point]:
-        """One step on, halved per problem until the objective falls enough."""
-        slope = (point.gradient * step).sum(axis=1)
+    def _moved(
+        self, weights: Array, point: Point, rows: Rows, step: Array, slope: Array, *, exact: bool
+    ) -> tuple[Array, Point]:
+        """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
         length = namespace(step).ones_like(slope)
         noise = (1e-11 if exact else 1e-6) * abs(point.value)
         moved = weights + step
