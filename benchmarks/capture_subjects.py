@@ -255,10 +255,7 @@ def subject(
     """A family at the size of its recipe, written to `folder`, or at that of a checkpoint; weights are random."""
     options: Mapping[str, Any] = {}
     if checkpoint is None:
-        recipe = RECIPES[family]
-        place, options = recipe.write(folder / "tiny"), recipe.options
-        _enlarge(place, recipe.larger)
-        checkpoint = str(place)
+        checkpoint, options = str(written(family, folder / "tiny")), RECIPES[family].options
     model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
     seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
     if isinstance(model, Policy):
@@ -268,6 +265,14 @@ def subject(
     reader = model
     questions = [Question(one, "Which of them is red?", ("a", "b")) for one in seen]
     return Subject(reader, lambda: reader.read(questions).option_logits, reader.asked_roles(questions))
+
+
+def written(family: str, folder: Path) -> Path:
+    """The files of a checkpoint at the size of its recipe, without weights; where it lies."""
+    recipe = RECIPES[family]
+    place = recipe.write(folder)
+    _enlarge(place, recipe.larger)
+    return place
 
 
 @contextmanager

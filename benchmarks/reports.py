@@ -3,8 +3,9 @@
     python benchmarks/reports.py FOLDER [--episodes 3440] [--permutations 20] [--only html]
 
 The run is made in FOLDER first, see `full_run.py`, or the one that is there is used. Each command runs in a
-process of its own: processor and wall seconds, peak memory, bytes written. The report is then opened in Chromium:
-how long until its load event has ended, by which the episodes' first cards are drawn.
+process of its own: processor and wall seconds, peak memory, bytes written. Linux counts into a child's peak what
+its parent held when it began, so this process imports nothing of ours. The report is then opened in Chromium: how
+long until its load event has ended, by which the episodes' first cards are drawn.
 Rivals, in the same run: `probe-kit retention` without anything drawn, `--help` (the interpreter and its imports),
 and an empty page in the same browser.
 """
@@ -22,8 +23,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-
-from full_run import probe_full_run, size_of, write_full_run
 
 REPORT, FIGURES, BROWSER = "report.html", "figures", "chromium"
 
@@ -76,7 +75,9 @@ def bench_commands(run: Path, folder: Path, only: str | None) -> None:
 
 
 def _size(written: Path) -> str:
-    return size_of(written) if written.is_dir() else f"{written.stat().st_size / 1e6:.1f} MB"
+    """Files and megabytes."""
+    sizes = [path.stat().st_size for path in (written, *written.rglob("*")) if path.is_file()]
+    return f"{len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
 
 
 _NOTE = """<script>addEventListener("load", () => setTimeout(() => {
@@ -119,7 +120,10 @@ def bench_opening(folder: Path, repeats: int = 5) -> None:
     empty = folder / "empty.html"
     empty.write_text("<!doctype html><title>empty</title><div id=grid></div>")
     pages = {"empty page": empty, "report": folder / REPORT}
-    turns = {name: [opened(path) for _ in range(repeats)] for name, path in pages.items()}
+    turns: dict[str, list[tuple[float, int, int, float]]] = {name: [] for name in pages}
+    for _ in range(repeats):
+        for name, path in pages.items():
+            turns[name].append(opened(path))
     for name, found in turns.items():
         times, processor = sorted(turn[0] / 1e3 for turn in found), median(turn[3] for turn in found)
         print(f"{name}: loaded after {median(times):.2f} s ({times[0]:.2f} to {times[-1]:.2f}), whole browser "
@@ -134,12 +138,13 @@ def main() -> None:
     parser.add_argument("--permutations", type=int, default=20)
     parser.add_argument("--only")
     options = parser.parse_args()
-    run = write_full_run(options.folder, options.episodes)
-    probe_full_run(run, options.permutations)
-    frames = options.folder / "run" / "frames"
-    print(f"{len(run.episodes)} episodes; {size_of(run.path)}, of which frames {size_of(frames)}")
+    made = [str(Path(__file__).with_name("full_run.py")), str(options.folder)]
+    made += ["--episodes", str(options.episodes), "--permutations", str(options.permutations)]
+    subprocess.run([sys.executable, *made], check=True)
+    run = options.folder / "run"
+    print(f"of which frames {_size(run / 'frames')}, probes {_size(run / 'probes')}")
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    bench_commands(run.path, options.folder, options.only)
+    bench_commands(run, options.folder, options.only)
     bench_opening(options.folder)
 
 

@@ -119,6 +119,15 @@ def pi0_tiny() -> "Pi0":
     return load_pi0_tiny()
 
 
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request: pytest.FixtureRequest) -> str:
+    """Where torch works: what a GPU does differently is seen on machines that have one."""
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU on this machine")
+    return str(request.param)
+
+
 @pytest.fixture
 def observation() -> "Observation":
     from probe_kit.hooks import Observation

@@ -247,3 +247,18 @@ def test_a_broken_hook_stops_the_run_at_the_first_episode_with_the_sites_name(
     with pytest.raises(SiteNeverFiredError, match=r"backbone\.02\.residual"):
         extract_run(settings, tmp_path / "run")
     assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
+
+
+@pytest.mark.slow
+def test_a_device_changes_nothing_in_a_run_but_roundings(two_items: Suite, tmp_path: Path, device: str) -> None:
+    """Through pooling on the device, page-locked buffers and the bits of tokens."""
+    settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT, tokens="all", env_workers=0)
+    here = extract_run(settings, tmp_path / "here")
+    there = extract_run(replace(settings, device=device), tmp_path / "there")
+    for stream in here.streams:
+        for site in here.sites(stream):
+            expected = here.column(site)
+            np.testing.assert_allclose(there.column(site), expected, rtol=0, atol=1e-2 * np.abs(expected).max())
+    site = here.sites("backbone")[-1]
+    for ours, theirs in zip(there.tokens(site), here.tokens(site), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-2 * np.abs(theirs).max())

@@ -124,10 +124,10 @@ def test_selectivity_is_the_accuracy_above_random_labels_of_items(planted_run: P
     assert train_probes(planted_run(), permutations=0).scores["selectivity"].isna().all()
 
 
-def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun) -> None:
+def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun, device: str) -> None:
     pytest.importorskip("torch").set_num_threads(1)
     run = planted_run({PLANTED: 2.0}, n_items=24)  # of fewer groups every relabelling would be made
-    by_torch = train_probes(run, permutations=2, device="cpu")
+    by_torch = train_probes(run, permutations=2, device=device)
     shutil.rmtree(run.path)
     by_numpy = train_probes(run, permutations=2)
     assert by_torch.key == by_numpy.key

@@ -1,0 +1,130 @@
+"""How much of its time a model waits for simulators, in the real loop with `--batch auto`.
+
+    python benchmarks/waiting.py [--subjects tiny,large] [--items 12] [--max-steps 20] [--device cuda] [--spread]
+
+`tiny` is the embedded pi0-tiny, whose inference is over in milliseconds: the worst case. `large` is a pi0 of 142
+million random parameters (see `capture_subjects.py`). Batch and simulating processes are what calibration chooses.
+Time is the clock's, from the end of the first inference to the end of the last, without those seconds at the start
+in which the first pictures are drawn; the model works while it is asked for actions (its capture included), and
+waits the rest, for observations, buffers and this process's own affairs. Printed beside it: what calibration
+foretold, and what the clock gives where no simulators work beside the model.
+
+A clock tells nothing on a machine that is busy with other things: the share of its core that the model's process
+got is printed too. `--spread` gives the model's process the first core and its simulators the others.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+from capture_subjects import written
+
+from probe_kit.env import SceneSpec
+from probe_kit.extract import Extraction, ExtractSettings, prepare
+from probe_kit.suite import build_suite
+
+
+@dataclass
+class Clock:
+    """Notes when the model works. spread: see `--spread`."""
+
+    spread: bool
+    calls: list[tuple[float, float, float]] = field(default_factory=list)
+    """Begin and end of every call of the model, and the processor time of this process at its end."""
+
+    def around(self, act: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """`act`, timed."""
+
+        def timed(turns: Sequence[Any]) -> Any:
+            if self.spread and not self.calls:
+                _spread()
+            began = time.perf_counter()
+            try:
+                return act(turns)
+            finally:
+                self.calls.append((began, time.perf_counter(), time.process_time()))
+
+        return timed
+
+    @property
+    def words(self) -> str:
+        """Share of the time after the first call in which the model waited, and what a call took."""
+        (_, start, processor), (_, end, processor_end) = self.calls[0], self.calls[-1]
+        works = sum(done - began for began, done, _ in self.calls[1:])
+        count = len(self.calls) - 1
+        return (
+            f"waited {1 - works / (end - start):6.1%} of {end - start:5.1f} s, {count} calls of "
+            f"{1e3 * works / count:6.1f} ms; its process had "
+            f"{(processor_end - processor) / (end - start):.2f} cores"
+        )
+
+
+def _spread() -> None:
+    """This process to the first core it may use, its children and theirs to the others."""
+    first, *others = sorted(os.sched_getaffinity(0))
+    if not others:
+        return
+    here = psutil.Process()
+    for child in here.children(recursive=True):
+        child.cpu_affinity(others)
+    for thread in here.threads():
+        os.sched_setaffinity(thread.id, {first})
+
+
+def measure(extraction: Extraction, out: Path, spread: bool) -> str:
+    """One run of its own."""
+    clock, cores = Clock(spread), os.sched_getaffinity(0)
+    controller: Any = extraction.controller
+    act = controller.act
+    controller.act = clock.around(act)
+    try:
+        extraction.run(out)
+    finally:
+        controller.act = act
+        os.sched_setaffinity(0, cores)
+    return clock.words
+
+
+def main() -> None:
+    """Each subject with simulators beside it, and without."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--subjects", default="tiny,large")
+    parser.add_argument("--items", type=int, default=12)
+    parser.add_argument("--max-steps", type=int, default=20)
+    parser.add_argument("--tokens", choices=("pooled", "all"), default="pooled")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--spread", action="store_true")
+    options = parser.parse_args()
+    print(f"load {os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} cores; device {options.device}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        suite = build_suite(folder / "suite", ["color"], options.items)
+        base = ExtractSettings(
+            "pi0-tiny", suite=suite.folder, scene=SceneSpec(max_steps=options.max_steps), tokens=options.tokens,
+            device=options.device,
+        )  # fmt: skip
+        for subject in options.subjects.split(","):
+            settings = base
+            if subject == "large":
+                checkpoint = str(written("pi0", folder / "large"))
+                settings = replace(
+                    base, model="pi0", checkpoint=checkpoint, random_weights=True, options={"statistics": "bridge"}
+                )
+            chosen = prepare(replace(settings, calibrate=True))
+            print(f"{subject}: {chosen.calibration.words}", flush=True)
+            print(
+                f"  simulators beside it: {measure(chosen, folder / f'{subject}-beside', options.spread)}",
+                flush=True,
+            )
+            alone = prepare(replace(settings, env_workers=0))
+            print(f"  none beside it:       {measure(alone, folder / f'{subject}-alone', False)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
