@@ -149,7 +149,7 @@ def main() -> None:
     folds = nested_folds(real, items, seed=0)
     console.print(
         f"{arguments.episodes} × {arguments.tokens} samples × {arguments.width}, {labels.shape[1]} columns"
-        f"; probe_kit solves them {'together' if can_be_joint(samples) else 'alone'}"
+        f"; probe_kit solves them {'together' if can_be_joint(samples, labels.shape[1]) else 'alone'}"
     )
     seconds, strengths, decisions = 0.0, np.full(labels.shape[1], arguments.strength), None
     with threadpool_limits(1), patch("probe_kit.train.features.IN_MEMORY", arguments.rival_memory * 2**30):

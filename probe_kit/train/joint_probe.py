@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.arrays import Array, namespace, to_numpy
+from probe_kit.train.features import IN_MEMORY
 from probe_kit.train.joint_problems import JointProblems
 from probe_kit.train.joint_site import JointSite
 from probe_kit.train.mixed import solve
@@ -23,22 +24,25 @@ from probe_kit.train.scores import log_loss
 COLUMN_MEMORY = 2**29
 """Bytes that problems solved at once may take, beyond the samples and what is made of them once."""
 
-SAMPLES_PER_FEATURE = 3
-"""With fewer samples than this per feature, training sets differ too much to share axes."""
+FEW_COLUMNS, FEATURES_PER_COLUMN = 10, 50
+"""Label columns up to which sharing pays, and features for one more. Axes of a training set's own cost as much as
+many columns; each column then costs half, as products pass over its own samples only, and never over axes."""
 
 LEAST_WIDTH = 96
 """Features below which the training sets' own axes cost next to nothing, and sharing products saves nothing."""
 
 
-def can_be_joint(samples: Samples) -> bool:
+def can_be_joint(samples: Samples, columns: int) -> bool:
     """Whether a site's tokens are so many, and so wide, that its training sets should be solved together.
 
-    Never those on a device: there it was not tried.
+    Always those whose inner training sets, three fifths of the tokens, are too large to be turned to axes of their
+    own once. Never those on a device: there it was not tried.
     """
-    if samples.pools or not isinstance(samples.means, np.ndarray):
-        return False
     count, width = samples.features.shape
-    return bool(width >= LEAST_WIDTH and count >= SAMPLES_PER_FEATURE * width)
+    if samples.pools or not isinstance(samples.means, np.ndarray) or width < LEAST_WIDTH or count < width:
+        return False
+    few = columns <= FEW_COLUMNS + width // FEATURES_PER_COLUMN
+    return few or 3 * count // 5 * width * 8 > IN_MEMORY
 
 
 def cross_validate_jointly(

@@ -96,11 +96,11 @@ def refuse_non_finite(samples: Samples) -> None:
 def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
     """The probes of every outer fold, each column of (E, K) labels on its own.
 
-    Many tokens per feature are solved for all training sets together, where these have the same features, and so
-    are small problems.
+    Wide tokens with few columns are solved for all training sets together, where these have the same features, and
+    so are small problems.
     Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
     """
-    if can_be_joint(samples) and (site := JointSite.of(samples, folds)).alike:
+    if can_be_joint(samples, labels.shape[1]) and (site := JointSite.of(samples, folds)).alike:
         return cross_validate_jointly(site, samples, labels, folds)
     if is_small(samples, labels):
         return cross_validate_together(samples, labels, folds)

@@ -96,7 +96,7 @@ def assert_same(found: list[FittedFold], expected: list[FittedFold]) -> None:
 def test_training_sets_together_decide_and_choose_as_each_on_its_own(world: Callable[[], np.ndarray]) -> None:
     samples = tokens(world())
     site = JointSite.of(samples, FOLDS)
-    assert can_be_joint(samples)
+    assert can_be_joint(samples, 3)
     assert site.alike
     assert_same(cross_validate_jointly(site, samples, COLUMNS, FOLDS), alone(samples, COLUMNS))
 
@@ -104,9 +104,20 @@ def test_training_sets_together_decide_and_choose_as_each_on_its_own(world: Call
 def test_pooled_samples_can_be_solved_together_but_are_not() -> None:
     """Nothing was seen to be gained there."""
     samples = Samples.pooled(NOISE[:60, :6] + 0.3 * SIGNS[:60])
-    assert not can_be_joint(samples)
+    assert not can_be_joint(samples, 3)
     site = JointSite.of(samples, FOLDS)
     assert_same(cross_validate_jointly(site, samples, COLUMNS, FOLDS), alone(samples, COLUMNS))
+
+
+def test_many_columns_are_solved_on_axes_of_their_own_where_these_fit_into_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Together 60 columns take as long as alone at a width of 2,048, and longer at smaller ones."""
+    samples = tokens(np.zeros((COUNTS.sum(), 100)))
+    assert can_be_joint(samples, 12)
+    assert not can_be_joint(samples, 13)
+    monkeypatch.setattr(joint_probe, "IN_MEMORY", 8 * 100 * (3 * int(COUNTS.sum()) // 5) - 1)
+    assert can_be_joint(samples, 60)
 
 
 @pytest.mark.parametrize("strength", [STRENGTHS[0], STRENGTHS[-1]])
@@ -164,7 +175,7 @@ def test_a_feature_at_the_edge_of_rounding_is_left_to_axes_of_its_own() -> None:
 def test_fewer_samples_than_features_are_left_to_axes_of_their_own() -> None:
     wide = GENERATOR.standard_normal((COUNTS.sum(), COUNTS.sum() + 5)) + 0.1 * SIGNS
     samples = tokens(wide)
-    assert not can_be_joint(samples)
+    assert not can_be_joint(samples, 3)
     assert_same(cross_validate(samples, LABELS[:, None], FOLDS), alone(samples, LABELS[:, None]))
 
 
@@ -205,7 +216,7 @@ def test_59_relabellings_of_many_tokens_stay_within_the_stated_memory(monkeypatc
     monkeypatch.setattr(joint_site, "ROWS_PER_BLOCK", 128)
     tracemalloc.start()
     try:
-        cross_validate(samples, many, FOLDS)
+        cross_validate_jointly(JointSite.of(samples, FOLDS), samples, many, FOLDS)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
