@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from typing import Any, Self
 
 from probe_kit.cluster import ray_cluster
-from probe_kit.errors import ProbeKitError
+from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.train.crew import Probed, Problems, probe_column
 from probe_kit.train.samples import Samples
 
@@ -44,8 +44,16 @@ class RayCrew:
         return list(ready)
 
     def result(self, task: Any) -> Probed:
-        """What a finished task found."""
-        found: Probed | ProbeKitError = self._ray.get(task)
+        """What a finished task found. Raises WorkerDiedError for one that Ray has repeated in vain."""
+        broken = self._ray.exceptions
+        lost = broken.WorkerCrashedError, broken.OutOfMemoryError, broken.NodeDiedError, broken.ObjectLostError
+        try:
+            found: Probed | ProbeKitError = self._ray.get(task)
+        except lost as error:
+            raise WorkerDiedError(
+                f"a probing task on the Ray cluster was lost again and again; the last time: {error}. The same "
+                "command continues after the last finished site; fewer --jobs take less memory of a node"
+            ) from error
         if isinstance(found, ProbeKitError):
             raise found
         return found

@@ -28,7 +28,10 @@ def test_without_ray_the_error_names_the_extra(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_an_actor_killed_in_mid_run_changes_nothing_in_the_result(tmp_path: Path) -> None:
+def test_an_actor_killed_in_mid_run_changes_nothing_in_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # as in `two_nodes`
     ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
     try:
         ray.init(num_cpus=2, include_dashboard=False)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from probe_kit.train.permutation import flip_items
 from probe_kit.train.probe import nested_folds
 from probe_kit.train.problem import CategoryProblem
 from probe_kit.train.process_crew import ProcessCrew
+from probe_kit.train.ray_crew import RayCrew
 from probe_kit.train.samples import Samples
 from probe_kit.train.workers import probe_columns
 
@@ -90,6 +92,30 @@ def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"probe-kit\[ray\]"):
         columns_of(CrewSettings(ray="auto"))
+
+
+LOST = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError")
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_a_task_that_ray_repeated_in_vain_says_how_to_go_on(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class LostError(Exception):
+        """As Ray raises it."""
+
+    class OtherError(Exception):
+        """Another one."""
+
+    def get(_task: str) -> None:
+        raise LostError("its node is gone")
+
+    kinds = dict.fromkeys(
+        ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError"), OtherError
+    )
+    crew = RayCrew({}, "auto")
+    there = SimpleNamespace(get=get, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
+    monkeypatch.setattr(crew, "_ray", there, raising=False)
+    with pytest.raises(WorkerDiedError, match=r"its node is gone\. The same command continues"):
+        crew.result("a task")
 
 
 def test_ray_is_imported_for_ray_only() -> None:
