@@ -1,26 +1,40 @@
 """What changing streams costs: one inference plain, with one site changed, and with all of them.
 
-    python benchmarks/intervention_cost.py [--pairs 200] [--device cpu]
+    python benchmarks/intervention_cost.py [--family pi0-tiny] [--pairs 200] [--device cpu]
 
-The embedded policy, one observation, one process. Every pair is a plain inference and a changed one, in drawn
-order, one directly behind the other, so that neighbours on the machine disturb both alike. Prints, per way, the
-median of the pairs' ratios of processor time with its 95 % bootstrap interval, and of the times themselves the
-ratio of medians and of lower fifths. The second plain way says what the measurement itself adds. Changes take
-tokens over from an inference before another picture, ledger included.
+The embedded policy, or another family at the size of `capture_subjects`; one observation, one process. Every pair
+is a plain inference and a changed one, in drawn order, one directly behind the other, so that neighbours on the
+machine disturb both alike. Prints, per way, the median of the pairs' ratios of processor time with its 95 %
+bootstrap interval, and of the times themselves the ratio of medians and of lower fifths. The second plain way says
+what the measurement itself adds. Changes take tokens over from an inference before another picture, with a ledger.
 """
 
 import argparse
 import random
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+from capture_subjects import RECIPES, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
 from probe_kit.intervene.patching import Replaced, Tokens, patched
 
+EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
+
+
+def policy_of(family: str, device: str) -> Policy:
+    """The embedded one, or one with random weights."""
+    if family == EMBEDDED:
+        return load_policy(family, device=device)
+    with tempfile.TemporaryDirectory() as folder:
+        made = subject(family, Path(folder), device, None, 1).model
+    assert isinstance(made, Policy)
+    return made
 
 
 def observations() -> tuple[Observation, Observation]:
@@ -37,7 +51,7 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
     acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
     with capture(policy, [*backbone, *acting]) as donor:
-        policy.act([other], [0])
+        policy.listen([other], [0])
     roles = policy.roles([seen])
 
     def changed(sites: list[Site]) -> Callable[[], object]:
@@ -45,15 +59,15 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
 
         def run() -> object:
             with patched(policy, sites, tokens, Replaced(donor, tokens.count)) as ledger:
-                policy.act([seen], [0])
+                policy.listen([seen], [0])
             assert ledger.fires == len(sites)
             return ledger
 
         return run
 
     return {
-        "plain": lambda: policy.act([seen], [0]),
-        "plain again": lambda: policy.act([seen], [0]),
+        "plain": lambda: policy.listen([seen], [0]),
+        "plain again": lambda: policy.listen([seen], [0]),
         "one backbone site": changed(backbone[2:3]),
         f"all {len(backbone)} backbone sites": changed(backbone),
         f"expert's end, {len(acting)} iterations": changed(acting),
@@ -63,10 +77,11 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
 def main() -> None:
     """Time every way against plain."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--family", default=EMBEDDED, help=f"{EMBEDDED} or one of {', '.join(RECIPES)}")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    policy = load_policy("pi0-tiny", device=arguments.device)
+    policy = policy_of(arguments.family, arguments.device)
     every, draw = ways(policy), random.Random(0)
     plain = every.pop("plain")
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in every}
