@@ -87,7 +87,7 @@ def test_accuracies_have_one_axis_in_every_figure_alone_and_together(
                 RoleCurvesDisplay.from_results(results, "color"),
             )
         ]
-    assert set.union(*map(limits, figures)) == {(20.0, 102.0)}
+    assert set.union(*map(limits, figures)) == {(20.0, 109.0)}
 
 
 def test_depth_and_knowledge_have_fixed_axes(
