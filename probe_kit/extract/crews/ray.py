@@ -49,17 +49,18 @@ class RayActor:
         self._opened = ExitStack()
         self._worker: Any = None
 
-    def begin(self) -> str | ProbeKitError:
-        """Load the model; the node it is on, as `ray list nodes` names it.
-
-        What is wrong with the whole run is an answer: Ray would wrap what is raised.
-        """
-        import ray
-
+    def begin(self) -> ProbeKitError | None:
+        """Load the model. What is wrong with the whole run is an answer: Ray would wrap what is raised."""
         try:
             self._worker = self._opened.enter_context(load_worker(self._settings, self._run))
         except ProbeKitError as error:
             return error
+        return None
+
+    def node(self) -> str:
+        """Where it is, as `ray list nodes` names it."""
+        import ray
+
         node: str = ray.get_runtime_context().get_node_id()
         return node
 
@@ -131,11 +132,14 @@ class RayCrew:
         slot = self._calls.pop(ready)
         lost = self._ray.exceptions.RayActorError, self._ray.exceptions.ObjectLostError
         try:
-            answer: str | list[Event] | ProbeKitError = self._ray.get(ready)
+            answer: str | list[Event] | ProbeKitError | None = self._ray.get(ready)
         except lost as error:
             return self._replace(slot, scheduler, error)
         if isinstance(answer, ProbeKitError):
             raise answer
+        if answer is None:  # it has begun
+            self._calls[self._actors[slot].node.remote()] = slot
+            return []
         self._stillborn = 0
         if isinstance(answer, str):
             self._nodes[slot] = answer

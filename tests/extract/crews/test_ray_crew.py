@@ -54,7 +54,7 @@ class Call:
 class Cluster:
     """room: actors that can run at a time. dies: told each call that is due, whether its actor dies with it.
 
-    begins_with: what workers answer to `begin` instead of their node. alive: names of its nodes.
+    begins_with: what workers answer to `begin` if anything is wrong. alive: names of its nodes.
     """
 
     room: int
@@ -110,7 +110,9 @@ class Cluster:
         if ref.actor.dead:
             raise ActorDiedError(f"in {ref.name}")
         if ref.name == "begin":
-            return self.begins_with or "first"
+            return self.begins_with
+        if ref.name == "node":
+            return "first"
         return [Done(n, {"outcome": "oob"}) for n in ref.arguments[0]]
 
     def kill(self, actor: Actor) -> None:
