@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.views import resolve_view
@@ -64,8 +65,10 @@ def view_of(role: str) -> str:
 def axes_of(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> Axes:
     """Of every category of the run, from what is pooled over the tokens of `role` at `site`.
 
-    Raises UnknownSiteError for a site or view that is not stored.
+    Raises UsageError for an unknown direction, UnknownSiteError for a site or view that is not stored.
     """
+    if direction not in DIRECTIONS:
+        raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
     episodes = run.episodes
     features = run.column(site, resolve_view(view_of(role), run.views(site.stream))).astype(np.float64)
     names = control_names(controls)

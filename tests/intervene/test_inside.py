@@ -114,6 +114,11 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
         assert abs(float(vector @ unit)) < 1e-5
 
 
+def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
+    with pytest.raises(UsageError, match="expected one of mean-difference, probe"):
+        axes_of(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
+
+
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
     episode, category = str(copy.episodes["episode_id"][0]), str(copy.episodes["category"][0])
     mean, probe = (
