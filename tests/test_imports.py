@@ -1,5 +1,7 @@
 """Data flows one way, and so do imports: no circle, and nothing imports what comes after it."""
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -77,6 +79,23 @@ def test_what_reads_runs_knows_neither_models_nor_simulators(room: str) -> None:
     assert seen
     strange = {other for other in seen if other not in READS_ONLY and not other.startswith(READS_ONLY[1] + ".")}
     assert not strange
+
+
+def test_what_no_test_machine_installs_is_imported_by_require_alone() -> None:
+    """An `import` of it is an error of types in a fresh clone, and none where a developer happens to have it."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())
+    installed = names(project["project"]["dependencies"]) | names(project["dependency-groups"]["dev"])
+    extras = project["project"]["optional-dependencies"].values()
+    absent = {name for extra in extras for name in names(extra)} - installed
+    assert "ray" in absent
+    statement = re.compile(rf"^\s*(?:import|from) (?:{'|'.join(sorted(absent))})\b", re.MULTILINE)
+    assert statement.search("def late():\n    import ray")
+    assert not [path for path in PACKAGE.rglob("*.py") if statement.search(path.read_text(encoding="utf-8"))]
+
+
+def names(requirements: list[str]) -> set[str]:
+    """The modules that requirements such as `ray>=2.50` bring, where they are called like their package."""
+    return {re.split(r"[^\w-]", requirement)[0].replace("-", "_") for requirement in requirements}
 
 
 def test_a_circle_is_found_wherever_its_imports_stand(tmp_path: Path) -> None:

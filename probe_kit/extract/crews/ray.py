@@ -15,6 +15,7 @@ from probe_kit.extract.play.events import Done, Event
 from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.commits import commit_key
 from probe_kit.extract.store.locate import locate
+from probe_kit.extras import require
 
 # Episodes per call, so that a worker always has something to simulate while it infers; fewer towards the end.
 EPISODES_PER_CALL = 8
@@ -59,9 +60,7 @@ class RayActor:
 
     def node(self) -> str:
         """Where it is, as `ray list nodes` names it."""
-        import ray
-
-        node: str = ray.get_runtime_context().get_node_id()
+        node: str = require("ray", "ray").get_runtime_context().get_node_id()
         return node
 
     def play(self, numbers: Sequence[int]) -> list[Event] | ProbeKitError:
