@@ -128,7 +128,7 @@ def draw(world: World, generator: np.random.Generator) -> tuple[GroupScores, Gro
 def fits(world: World, seed: int) -> tuple[Crossfit, Crossfit]:
     """Bounded and area fit of one data set."""
     backbone, expert = draw(world, np.random.default_rng(seed))
-    return bounded_fit(backbone, expert, PLACES, 0.5, seed), area_fit(backbone, expert, 0.5, seed)
+    return bounded_fit(backbone, expert, PLACES, 0.5, seed), area_fit(backbone, expert, 0.5)
 
 
 def study(world: World, draws: int, shuffles: int, first_seed: int) -> str:
@@ -174,7 +174,7 @@ def perfect(world: World, draws: int, first_seed: int) -> str:
         backbone, expert = draw(world, np.random.default_rng(seed))
         found["debiased"].append(crossfit(backbone, expert, 0.5, seed))
         found["bounded"].append(bounded_fit(backbone, expert, PLACES, 0.5, seed))
-        found["area"].append(area_fit(backbone, expert, 0.5, seed))
+        found["area"].append(area_fit(backbone, expert, 0.5))
     truth = world.truth()
     parts = [f"perfect, 12 groups: {world.name:22}"]
     for name, of_kind in found.items():

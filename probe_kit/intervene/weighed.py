@@ -15,7 +15,8 @@ from probe_kit.errors import UsageError
 from probe_kit.intervene.places import ALL, TILE_ROLES
 from probe_kit.intervene.standing import Told, told_of
 from probe_kit.intervene.stored import ATTENTION, WEIGHED, Stored
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.bootstrap import GAINS, units_seed
+from probe_kit.statistics.student import student_interval
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:
@@ -124,8 +125,8 @@ class Weighed:
             every = _mean(_per_episode(apart, episodes), (1, 2, 3))
             seen = ~np.isnan(every)
             values, units = every[seen], groups[seen]
-            low, high = group_bootstrap(values[:, None], units, units_seed(units, suite), bounds=GAINS)
-            found[block] = float(values.mean()), (float(low[0]), float(high[0]))
+            limits = student_interval(values, units, units_seed(units, suite), GAINS)
+            found[block] = float(values.mean()), limits
         return found
 
     def _rows(self, category: str, call: int | None, by: Sequence[Axis]) -> "list[Attending]":

@@ -53,10 +53,10 @@ def smoothing(sites: Sequence[Site]) -> Matrix:
     return weights
 
 
-def area_fit(backbone: GroupScores, expert: GroupScores, chance: float, seed: int) -> Crossfit:
+def area_fit(backbone: GroupScores, expert: GroupScores, chance: float) -> Crossfit:
     """Mean scores above chance over all sites of both streams: no choice, and so no bias of choosing."""
     held_out = np.array([stream.sums.mean(axis=0) for stream in (expert, backbone)])
     above = held_out.sum(axis=1) / backbone.sizes.sum() - chance
     covariance = scoring_covariance(held_out, backbone.sizes)
-    covariance = with_unseen(covariance, above + chance, backbone.sizes.size, seed)
+    covariance = with_unseen(covariance, held_out, backbone.sizes)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, backbone.sizes)

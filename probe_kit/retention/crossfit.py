@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.statistics.bootstrap import unseen
+from probe_kit.statistics.bootstrap import reach
 
 Matrix = NDArray[np.float64]
 Sides = NDArray[np.int8]
@@ -15,7 +15,6 @@ Sides = NDArray[np.int8]
 REPEATS = 100
 HALVINGS = 100
 REPEATS_OF_HALF = 10
-_NO_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -75,11 +74,18 @@ def scoring_covariance(held_out: Matrix, sizes: Matrix) -> Matrix:
     return covariance
 
 
-def with_unseen(covariance: Matrix, shares: Matrix, n_groups: int, seed: int) -> Matrix:
-    """`covariance` of (2,) shares, where all groups of a stream agree that of what unseen groups may hold."""
-    for stream in np.flatnonzero(covariance.diagonal() < _NO_VARIANCE):
-        share = shares[stream]
-        covariance[stream, stream] = ((unseen(share, n_groups, seed) - share) ** 2).mean()
+def with_unseen(covariance: Matrix, held_out: Matrix, sizes: Matrix) -> Matrix:
+    """`covariance` of two shares, neither of them known better than what groups allow that nobody has seen.
+
+    held_out, sizes: (2, G) correct decisions and (G,) episodes. Where all groups agree the share t of those that
+    are otherwise is Beta(1, G), and they may lie at either bound; an interval of a ratio has one spread for both
+    directions, that toward the farther bound. The more groups differ the less there is of it, see `reach`.
+    """
+    groups, shares = sizes.size, held_out.sum(axis=1) / sizes.sum()
+    each = (held_out / sizes).T
+    part = reach(each) / reach(np.zeros_like(each))
+    least = 2 / ((groups + 1) * (groups + 2)) * (part * np.maximum(shares, 1 - shares)) ** 2
+    np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), least))
     return covariance
 
 
@@ -94,8 +100,8 @@ def crossfit(
     The covariance comes from the same estimate on halves of the data, which share no group: half of what two of
     them differ by is the variance at half the size, and half of that the variance at full size. Choosing again is
     part of it. A bootstrap would count what its copies of a group agree on as signal. A half averages over
-    fewer splits than the whole, which errs on the side of width. Where all groups agree there is no difference to
-    see, and the variance is that of what unseen groups may hold.
+    fewer splits than the whole, which errs on the side of width. Where groups agree, or nearly so, there is little
+    difference to see, and the variance is at least that of what unseen groups may hold.
 
     peak_share: weight of the best site on all groups, scored on them too; it has no part in the covariance.
     """
@@ -106,7 +112,7 @@ def crossfit(
     held_out = (1 - peak_share) * chosen + peak_share * peaks
     above = held_out.sum(axis=1) / sizes.sum() - chance
     covariance = _covariance_by_halving((expert, backbone), splits_of_halves)
-    covariance = with_unseen(covariance, above + chance, sizes.size, seed)
+    covariance = with_unseen(covariance, held_out, sizes)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
 

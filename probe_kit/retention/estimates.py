@@ -1,7 +1,7 @@
 """Numbers with their bootstrap draws, so that averages and differences have intervals too."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import TYPE_CHECKING
 
@@ -14,12 +14,14 @@ from probe_kit.retention.measure import Peak, Retention, backbone_is_known
 from probe_kit.retention.success import shares_of, units_of
 from probe_kit.statistics.bootstrap import (
     GAINS,
+    SHARES,
+    Bounds,
     bootstrap_means,
-    constant,
     draw_groups,
+    group_means,
     interval,
     units_seed,
-    unseen,
+    widened,
 )
 from probe_kit.train.curve import Curve
 
@@ -30,6 +32,7 @@ Limits = tuple[float | None, float | None]
 
 UNBOUNDED: Limits = (None, None)
 TAIL = 0.025
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -37,20 +40,39 @@ class Estimate:
     """A value and its (B,) bootstrap draws; a draw is NaN where the quantity has no meaning.
 
     units: seed of the draws, made from the names of what was drawn. Estimates of equal units are paired.
-    count: how many units were drawn.
+    count: how many units were drawn. each: (count,) the mean of every unit, in the order of their names and NaN in
+    one that has none; None for what is no mean. bounds: between which every unit lies.
     """
 
     value: float
     draws: NDArray[np.float64]
     units: int
     count: int = 1
+    each: NDArray[np.float64] | None = None
+    bounds: Bounds = SHARES
 
     def __sub__(self, other: "Estimate") -> "Estimate":
-        """Paired units that all agree are no proof that unseen ones would: see `unseen`."""
-        value, draws, count = self.value - other.value, self.draws - other.draws, min(self.count, other.count)
-        if constant(draws[:, None])[0]:
-            draws = unseen(value, count, self.units, draws.size, GAINS)
-        return Estimate(value, draws, self.units, count)
+        """Of what is paired, unit by unit."""
+        value, count = self.value - other.value, min(self.count, other.count)
+        if self.units != other.units:
+            return Estimate(value, self.wide - other.wide, self.units, count, bounds=GAINS)
+        each = None if self.each is None or other.each is None else self.each - other.each
+        return Estimate(value, self.draws - other.draws, self.units, count, each, GAINS)
+
+    @property
+    def wide(self) -> NDArray[np.float64]:
+        """The draws with what units may hold that nobody has seen, see `widened`.
+
+        Of what is no mean only draws that all agree have it: they know nothing.
+        """
+        known, each = ~np.isnan(self.draws), self.each
+        if each is None:
+            if not known.any() or np.ptp(self.draws[known]) > _ROUNDING:
+                return self.draws
+            each = np.full(self.count, self.value)
+        each, value, wide = each[~np.isnan(each)], np.array([self.value]), self.draws.copy()
+        wide[known] = widened(wide[known, None], value, each[:, None], self.units, self.bounds)[:, 0]
+        return wide
 
     @property
     def centred(self) -> "Estimate":
@@ -61,12 +83,12 @@ class Estimate:
         """
         known = self.draws[~np.isnan(self.draws)]
         drift = float(np.median(known)) - self.value if known.size else 0.0
-        return Estimate(self.value, self.draws - drift, self.units, self.count)
+        return replace(self, draws=self.draws - drift)
 
     @property
     def ci(self) -> Limits:
         """95 % percentile interval, with the value in it; without limits if too many draws have no meaning."""
-        known = self.draws[~np.isnan(self.draws)]
+        known = self.wide[~np.isnan(self.draws)]
         if known.size < (1 - TAIL) * self.draws.size:
             return UNBOUNDED
         low, high = interval(known[:, None], np.array([self.value]))
@@ -79,23 +101,23 @@ Estimates = Mapping[str, Estimate]
 
 def average(estimates: Sequence[Estimate]) -> Estimate:
     """The mean of several, draw by draw."""
-    draws = np.mean([estimate.draws for estimate in estimates], axis=0)
-    units = sorted({estimate.units for estimate in estimates})
-    return Estimate(
-        value=fmean(estimate.value for estimate in estimates),
-        draws=draws,
-        units=units[0] if len(units) == 1 else derive_seed(*units),
-        count=max(estimate.count for estimate in estimates),
-    )
+    value, units = fmean(estimate.value for estimate in estimates), sorted({one.units for one in estimates})
+    count = max(estimate.count for estimate in estimates)
+    each = [estimate.each for estimate in estimates if estimate.each is not None]
+    if len(units) == 1 and len(each) == len(estimates):
+        draws = np.mean([estimate.draws for estimate in estimates], axis=0)
+        return Estimate(value, draws, units[0], count, np.mean(each, axis=0), estimates[0].bounds)
+    draws = np.mean([estimate.wide for estimate in estimates], axis=0)
+    return Estimate(value, draws, units[0] if len(units) == 1 else derive_seed(*units), count)
 
 
 def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
     """SR of a table of episodes, whole groups of items drawn."""
     groups = units_of(episodes)
     units = units_seed(groups, suite)
-    correct = shares_of(episodes, "correct")
-    draws = bootstrap_means(correct[:, None], groups, units)
-    return Estimate(float(correct.mean()), draws[:, 0], units, np.unique(groups).size)
+    correct = shares_of(episodes, "correct")[:, None]
+    each = group_means(correct, groups)[:, 0]
+    return Estimate(float(correct.mean()), bootstrap_means(correct, groups, units)[:, 0], units, each.size, each)
 
 
 def probe_estimates(
@@ -104,9 +126,10 @@ def probe_estimates(
     """Accuracy of the best sites, and retention's three estimates where it is defined, whole groups drawn."""
     units = units_seed(curve.groups, suite)
     rows = [curve.sites.index(peak.site) for peak in peaks.values()]
-    draws = bootstrap_means(curve.correct[rows].T, curve.groups, units)
+    correct = curve.correct[rows].T
+    draws, each = bootstrap_means(correct, curve.groups, units), group_means(correct, curve.groups)
     found = {
-        f"{name}_accuracy": Estimate(peak.accuracy, draws[:, column], units, curve.n_groups)
+        f"{name}_accuracy": Estimate(peak.accuracy, draws[:, column], units, curve.n_groups, each[:, column])
         for column, (name, peak) in enumerate(peaks.items())
     }
     if retention is not None and retention.defined:

@@ -110,7 +110,7 @@ def measure_retention(
     places = tuple([curve.sites[row] for row in chosen] for chosen in rows)
     fit = crossfit(*streams, curve.chance, derive_seed("crossfit", seed))
     bounded = bounded_fit(*streams, (places[0], places[1]), curve.chance, derive_seed("crossfit", seed))
-    area = area_fit(*streams, curve.chance, derive_seed("area", seed))
+    area = area_fit(*streams, curve.chance)
     return Retention(
         chance=curve.chance,
         backbone=backbone,

@@ -12,7 +12,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.asked import ask_of
 from probe_kit.retention.estimates import Estimate, Limits
 from probe_kit.retention.success import listened, shares_of, units_of
-from probe_kit.statistics.bootstrap import bootstrap_ratios, units_seed
+from probe_kit.statistics.bootstrap import bootstrap_ratios, group_means, units_seed
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:
@@ -154,8 +154,9 @@ class Judged:
         units = units_seed(groups, self.run.suite)
         right = shares_of(episodes, "correct") * (weights > 0)
         draws = bootstrap_ratios(right, weights, groups, units)
-        count = np.unique(groups[weights > 0]).size
-        return Estimate(float(right.sum() / weights.sum()), draws, units, count)
+        counts, tops = (group_means(part[:, None], groups)[:, 0] for part in (weights, right))
+        each = np.divide(tops, counts, out=np.full(counts.size, np.nan), where=counts > 0)
+        return Estimate(float(right.sum() / weights.sum()), draws, units, int((counts > 0).sum()), each)
 
 
 def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.identity import derive_seed
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 Matrix = NDArray[np.float64]
 
@@ -28,9 +29,11 @@ def group_bootstrap(
     """95 % interval of the mean over episodes, with whole groups resampled.
 
     values: (E, S), a score per episode in each of S columns, within `bounds`. groups: (E,). Returns low and high,
-    (S,) each. Where all groups of a column agree resampling has no width and would claim certainty; see `unseen`.
+    (S,) each. Where groups agree, or all but a few, resampling claims more certainty than there is; see `widened`.
     """
-    return interval(bootstrap_means(values, groups, seed, draws, bounds), values.mean(axis=0))
+    value, each = values.mean(axis=0), group_means(values, groups)
+    wide = widened(bootstrap_means(values, groups, seed, draws), value, each, seed, bounds)
+    return interval(wide, value)
 
 
 def interval(draws: Matrix, value: Matrix) -> tuple[Matrix, Matrix]:
@@ -40,26 +43,31 @@ def interval(draws: Matrix, value: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def bootstrap_means(
-    values: NDArray[np.floating] | NDArray[np.bool_],
-    groups: ArrayLike,
-    seed: int,
-    draws: int = DRAWS,
-    bounds: Bounds = SHARES,
+    values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike, seed: int, draws: int = DRAWS
 ) -> Matrix:
     """Means over episodes in every draw of whole groups, (draws, S) from (E, S) values and (E,) groups.
 
-    The same names of groups and seed draw the same groups, whatever the values. A column whose groups all agree
-    is drawn from what `unseen` groups may hold.
+    The same names of groups and seed draw the same groups, whatever the values.
     """
+    sums, sizes = _sums(values, groups)
+    times = draw_groups(sizes.size, seed, draws)
+    means: Matrix = (times @ sums) / (times @ sizes)[:, None]
+    return means
+
+
+def group_means(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -> Matrix:
+    """(G, S) means of (E, S) values over the episodes of each group, in the order of their names."""
+    sums, sizes = _sums(values, groups)
+    means: Matrix = sums / sizes[:, None]
+    return means
+
+
+def _sums(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -> tuple[Matrix, Matrix]:
+    """(G, S) sums of (E, S) values over the episodes of each group, and (G,) how many these are."""
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     sums = np.zeros((names.size, values.shape[1]))
     np.add.at(sums, group_of, values.astype(np.float64))
-    sizes = np.bincount(group_of).astype(np.float64)
-    times = draw_groups(names.size, seed, draws)
-    means: Matrix = (times @ sums) / (times @ sizes)[:, None]
-    for column in np.flatnonzero(constant(means)):
-        means[:, column] = unseen(float(means[0, column]), names.size, seed, draws, bounds)
-    return means
+    return sums, np.bincount(group_of).astype(np.float64)
 
 
 def bootstrap_ratios(
@@ -67,8 +75,7 @@ def bootstrap_ratios(
 ) -> Matrix:
     """A conditional share in every draw of whole groups: (draws,) sums of values over sums of weights, (E,) each.
 
-    values: at most the weights. NaN in a draw without weight. Draws that all agree come from what `unseen` groups
-    may hold, as in `bootstrap_means`.
+    values: at most the weights. NaN in a draw without weight.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     tops, bottoms = (np.bincount(group_of, part, names.size) for part in (values, weights))
@@ -76,30 +83,74 @@ def bootstrap_ratios(
     below = (times @ bottoms).astype(np.float64)
     ratios: Matrix = np.full(draws, np.nan)
     np.divide(times @ tops, below, where=below > 0, out=ratios)
-    known = ratios[below > 0]
-    if constant(known[:, None])[0]:
-        return unseen(float(known[0]), int((bottoms > 0).sum()), seed, draws)
     return ratios
 
 
-def constant(draws: Matrix) -> NDArray[np.bool_]:
-    """(S,) whether all (B, S) draws agree, up to rounding."""
-    agree: NDArray[np.bool_] = np.ptp(draws, axis=0) < 1e-12
-    return agree
+def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bounds = SHARES) -> Matrix:
+    """(B, S) draws, of which no quantile lies nearer to the (S,) `value` than that of `unseen` groups.
 
+    Draws of groups hold nothing that was not seen. Where fifteen of sixteen agree, hardly any of them has three of
+    the other kind, and the interval would be narrower than where all sixteen do. Now one group that is otherwise
+    moves both quantiles that are compared, and so the outer one, toward it.
 
-def unseen(value: float, count: int, seed: int, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
-    """(draws,) means that `count` groups are consistent with that all have `value`.
-
-    The share t of groups that are otherwise is Beta(1, count) given that none was seen: its 97.5 % point is that
-    of Clopper and Pearson. They lie at either bound, by turns; at the value itself where that is a bound.
+    each: (G, S) means of the groups. Draws keep their order, so that those of two runs on the same groups stay
+    paired; equal ones are ordered by `seed`.
     """
-    share = 1 - np.linspace(0, 1, draws) ** (1 / count)
-    low, high = bounds
-    ends = [end for end in (low, high) if abs(end - value) > 1e-9]
-    end = np.resize(ends, draws)
-    means: Matrix = value + share * (end - value)
-    return np.random.default_rng(derive_seed("unseen", seed)).permutation(means)
+    mixed = np.random.default_rng(derive_seed("unseen", seed)).permutation(len(draws))
+    order = mixed[np.argsort(draws[mixed].round(12), axis=0, kind="stable")]  # equal up to the rounding of sums
+    ordered, least = np.take_along_axis(draws, order, axis=0), unseen(value, each, len(draws), bounds)
+    half = len(draws) // 2
+    ordered[:half] = np.minimum(ordered[:half], least[:half])
+    ordered[half:] = np.maximum(ordered[half:], least[half:])
+    wide = np.empty_like(draws)
+    np.put_along_axis(wide, order, ordered, axis=0)
+    return wide
+
+
+def unseen(value: NDArray[np.floating], each: Matrix, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
+    """(draws, S) quantiles, from least to largest, that a mean has for what groups may hold that nobody has seen.
+
+    value: (S,) the mean. each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with
+    half of the chance each; where what is most common lies at a bound only the other one is left, and has all of
+    it: of groups that all agree there it is Clopper and Pearson's interval.
+    """
+    tails = np.linspace(0, 1, draws, dtype=np.float64)[:, None]
+    low, high = np.minimum(bounds[0], value), np.maximum(bounds[1], value)
+    least_common, most_common = _commonest(each)
+    below = reach(each, np.where(most_common >= high, 0.5, 1.0) * tails)
+    above = reach(each, np.where(least_common <= low, 0.5, 1.0) * (1 - tails))
+    least: Matrix = np.where(tails < 0.5, value - (value - low) * below, value + (high - value) * above)
+    return least
+
+
+def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -> Matrix:
+    """(…, S) which share of groups may be otherwise, and not have been seen, with chance `tail` for either side.
+
+    each: (G, S) means of the groups. Where at most one is otherwise than most, it is a share of which nothing is
+    seen with chance 2 · tail, at 0.025 about 3 / G. (One that is otherwise says that there are such, and not what
+    others are like.) Of more the next one may as well be like any of them: with k only one in k is like nothing
+    seen.
+    """
+    chance = np.minimum(2 * tail * np.maximum(unlike(each), 1), 1.0)
+    share: Matrix = 1 - chance ** (1 / len(each))
+    return share
+
+
+def unlike(each: NDArray[np.floating]) -> NDArray[np.int64]:
+    """(S,) how many of (G, S) means of groups are not what most of them are."""
+    most = [np.unique(column, return_counts=True)[1].max() for column in each.round(9).T]
+    return len(each) - np.array(most, np.int64)
+
+
+def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
+    """(S,) least and largest of the values that most of (G, S) means of groups have."""
+    found = []
+    for column in each.round(9).T:
+        values, counts = np.unique(column, return_counts=True)
+        common = values[counts == counts.max()]
+        found.append((common[0], common[-1]))
+    least, largest = np.array(found, np.float64).T
+    return least, largest
 
 
 def units_seed(names: ArrayLike, suite: str) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.identity import derive_seed
-from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
 from probe_kit.train.baselines import Features, suite_of, tile_pixels, word_counts
 from probe_kit.train.controls import BINDING, BaselineScore, Excess
 from probe_kit.train.paired import better_than_reference
@@ -65,7 +65,7 @@ def binding_scores(
             for name, stream in run.streams.items()
         }
         first = references.get("backbone", next(iter(references.values())))
-        scores.append(_score(first, problem, category, results.settings.seed))
+        scores.append(_score(first, problem, category, results.settings.suite))
         found += list(_held_against(results, category, references))
     return scores, found
 
@@ -80,8 +80,8 @@ def _reference(inputs: BindingInputs, problem: CategoryProblem, width: int, seed
     return max(right, key=lambda one: int(one.sum()))
 
 
-def _score(right: NDArray[np.bool_], problem: CategoryProblem, category: str, seed: int) -> BaselineScore:
-    low, high = group_bootstrap(right[:, None], problem.groups, derive_seed("interval", seed, category, BINDING))
+def _score(right: NDArray[np.bool_], problem: CategoryProblem, category: str, suite: str) -> BaselineScore:
+    low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, suite))
     return BaselineScore(
         name=BINDING,
         category=category,

@@ -1,5 +1,7 @@
 """What follows, what goes against, what has a habit, and what the verdict makes of them."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from probe_kit.intervene.following import WORTH, following
 from probe_kit.intervene.stored import Answers
 from tests.intervene.answers import answers_of, follower, habit
 
+Kind = Callable[[int], tuple[np.ndarray, np.ndarray]]
 SUITE = "suite@1#0123456789ab"
 
 
@@ -50,6 +53,21 @@ def test_following_in_few_episodes_is_not_called_following() -> None:
     assert found.p_follows == 2.0**-24
     assert found.net < WORTH
     assert not found.is_following
+
+
+@pytest.mark.parametrize("kind", [follower, habit])
+def test_one_group_unlike_the_others_makes_nothing_surer(
+    kind: Callable[[int], tuple[np.ndarray, np.ndarray]],
+) -> None:
+    like = of(kind(64), groups=16)
+    for other in (follower, habit):
+        plain, exchanged = kind(64)
+        unlike = (np.arange(64) // 2) % 16 == 0
+        for part, source in zip((plain, exchanged), other(64), strict=True):
+            part[unlike] = source[unlike]
+        found = of((plain, exchanged), groups=16)
+        assert found.net_ci[0] <= like.net_ci[0] or found.net > like.net
+        assert found.net_ci[1] >= like.net_ci[1] or found.net < like.net
 
 
 def test_items_that_share_pictures_do_not_add_up() -> None:

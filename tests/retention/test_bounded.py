@@ -67,7 +67,7 @@ def test_it_is_the_estimate_of_the_prototype() -> None:
 
 
 def test_area_is_the_ratio_of_means_and_needs_no_choice() -> None:
-    fits = [area_fit(scores(7, 0.3, 2 * seed), scores(18, 0.15, 2 * seed + 1), 0.5, seed) for seed in range(200)]
+    fits = [area_fit(scores(7, 0.3, 2 * seed), scores(18, 0.15, 2 * seed + 1), 0.5) for seed in range(200)]
     assert np.mean([fit.expert / fit.backbone for fit in fits]) == pytest.approx(0.5, abs=0.01)
     covered = [(found := retention_interval(fit)).low <= 0.5 <= found.high for fit in fits]
     assert np.mean(covered) > 0.9
@@ -75,7 +75,7 @@ def test_area_is_the_ratio_of_means_and_needs_no_choice() -> None:
 
 def test_a_stack_that_is_always_right_has_an_interval_with_a_width() -> None:
     perfect = GroupScores(np.full((7, 20), 4.0), np.full(20, 4.0))
-    for fit in (area_fit(perfect, perfect, 0.5, 0), bounded_fit(perfect, perfect, (BACKBONE, BACKBONE), 0.5, 0)):
+    for fit in (area_fit(perfect, perfect, 0.5), bounded_fit(perfect, perfect, (BACKBONE, BACKBONE), 0.5, 0)):
         found = retention_interval(fit)
         assert fit.expert / fit.backbone == 1
         assert found.low < 0.95 < 1.05 < found.high

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from scipy.special import stdtrit
 
+from probe_kit.hooks.sites import Site
 from probe_kit.retention import (
     Difference,
     RetentionRow,
@@ -17,9 +18,11 @@ from probe_kit.retention import (
     measure_retention,
     retention,
 )
+from probe_kit.retention.bounded import area_fit, bounded_fit
+from probe_kit.retention.crossfit import GroupScores, crossfit
 from probe_kit.retention.displays import LayerCurveDisplay
-from probe_kit.retention.estimates import average, probe_estimates
-from probe_kit.statistics.bootstrap import GAINS, SHARES, group_bootstrap, unseen
+from probe_kit.retention.estimates import average, probe_estimates, sr_estimate
+from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train import ArrayRun, Curve, load_results
 from probe_kit.train.add_controls import add_twin
 
@@ -120,12 +123,6 @@ def test_groups_that_agree_have_an_interval_that_narrows_with_their_number(value
     assert high[0] - low[0] < 4 / count
 
 
-def test_what_unseen_groups_may_hold_keeps_to_the_bounds() -> None:
-    for bounds, value in product((SHARES, GAINS), (0.0, 0.4, 1.0)):
-        draws = unseen(value, 10, 0, bounds=bounds)
-        assert bounds[0] <= draws.min() < draws.max() <= bounds[1]
-
-
 def test_a_twin_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": PERFECT}, "one"))
     twin = load_results(probed_run({"color": HOPELESS}, "twin", random_weights=True))
@@ -181,3 +178,41 @@ def test_six_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_mean_
         assert there.ci != (None, None)
         for unclear in (here, here - there, there - here, average([here, there]), average([here, there]).centred):
             assert unclear.ci == (None, None), name
+
+
+@pytest.mark.parametrize("right", [3.0, 0.0])
+@pytest.mark.parametrize("groups", [10, 16])
+def test_a_ratio_is_no_better_known_for_one_group_that_is_unlike_the_others(right: float, groups: int) -> None:
+    sizes = np.full(groups, 4.0)
+    alike = GroupScores(np.full((3, groups), 4.0), sizes)
+    sums = alike.sums.copy()
+    sums[:, 0] = right
+    one = GroupScores(sums, sizes)
+    places = [Site("backbone", layer) for layer in range(3)]
+    for fit in (
+        lambda scores: crossfit(scores, scores, 0.5, 0),
+        lambda scores: bounded_fit(scores, scores, (places, places), 0.5, 0),
+        lambda scores: area_fit(scores, scores, 0.5),
+    ):
+        for stream in range(2):
+            least = [
+                (found.expert, found.backbone)[stream] - 1.96 * found.covariance[stream, stream] ** 0.5
+                for found in (fit(one), fit(alike))
+            ]
+            assert least[0] < least[1]
+
+
+def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_never_do(
+    outcome_table: Callable[..., pd.DataFrame],
+) -> None:
+    right = outcome_table(32, 0, 0)
+    wrong = right.copy()
+    wrong.loc[wrong["item_id"] == wrong["item_id"].iloc[0], "outcome"] = "wrong"
+    here, there = (sr_estimate(one, "suite") for one in (right, wrong))
+    same, other = (here - here).ci, (here - there).ci
+    assert same[0] is not None
+    assert same[1] is not None
+    assert other[0] >= same[0]  # type: ignore[operator]
+    assert other[1] >= same[1]  # type: ignore[operator]
+    several = average([here, there])
+    assert there.ci[0] <= several.ci[0] <= here.ci[0]  # type: ignore[operator]

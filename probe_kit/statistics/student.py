@@ -1,0 +1,33 @@
+"""Interval of the mean of a measured quantity, which hardly two groups have alike."""
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.statistics.bootstrap import GAINS, Bounds, group_bootstrap
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+
+def student_interval(
+    values: NDArray[np.floating], groups: ArrayLike, seed: int, bounds: Bounds = GAINS
+) -> tuple[float, float]:
+    """95 % interval of the mean over episodes, by Student's t with whole groups as the unit.
+
+    values: (E,) measured, within `bounds`, at which the interval ends. groups: (E,). Of shares, which many groups
+    have alike, `group_bootstrap` is the better one; it is taken, with `seed`, where all groups agree. A single
+    group says nothing of others.
+    """
+    from scipy.special import stdtrit  # type: ignore[import-untyped]
+
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    if names.size == 1:
+        return bounds
+    mean, sizes = float(values.mean()), np.bincount(group_of)
+    rest = np.bincount(group_of, values) - mean * sizes
+    error = sqrt(float(rest @ rest) * names.size / (names.size - 1)) / values.size
+    if error < 1e-12:
+        low, high = group_bootstrap(values[:, None], groups, seed, bounds=bounds)
+        return float(low[0]), float(high[0])
+    spread = float(stdtrit(names.size - 1, 1 - SIGNIFICANCE / 2)) * error
+    return max(bounds[0], mean - spread), min(bounds[1], mean + spread)
