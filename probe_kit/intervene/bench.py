@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,13 @@ if TYPE_CHECKING:
 Chunk = NDArray[np.float32]
 FAR = 0.01
 """Metres by which a repeated first action may differ from the stored one; more is another policy or scene."""
+
+
+class Progress(Protocol):
+    """Called after every item."""
+
+    def __call__(self, done: int, total: int, what: str, /) -> None:
+        """done: items so far, of `total`. what: the last one."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +86,14 @@ class Question:
 class Bench:
     """A policy and a scene; a context manager, because it holds a simulator.
 
-    items: of the run's suite, by id. twins: of those that have one, see `twins_of`.
+    items: of the run's suite, by id. twins: of those that have one, see `twins_of`. learning: is told of items
+    that are inferred beforehand, for directions and erasers.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
         self.items, self.twins = items, twins_of(items.values())
+        self.learning: Progress | None = None
         self.stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))

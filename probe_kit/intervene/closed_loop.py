@@ -4,7 +4,7 @@ What the first inference would do is a forecast. Here the cube lands somewhere, 
 it is held against: the same scene, the same seeds, and a dose of zero that must give every one of them again.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,14 +18,14 @@ from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
 from probe_kit.intervene.directions import MEAN_DIFFERENCE
 from probe_kit.intervene.inside import BACKBONE, stored_passing
-from probe_kit.intervene.interchange import NONE, TakenOver, needed
+from probe_kit.intervene.interchange import NONE, TakenOver, along, needed
 from probe_kit.intervene.passing import Passing
 from probe_kit.intervene.patching import Kept, Ledger, Tokens, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
 from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import PLAIN
 from probe_kit.intervene.tiles import TILES
-from probe_kit.intervene.token_directions import bases_of, check_direction
+from probe_kit.intervene.token_directions import Bases, bases_of, check_direction
 from probe_kit.train.reader import RunReader
 
 CELL = "|"
@@ -68,6 +68,11 @@ class ClosedLoop(Intervention):
         sites, roles = zip(*map(self._split, self.cells), strict=True)
         return needed(sites, roles)
 
+    @property
+    def learns(self) -> bool:
+        """Where its direction is of tokens."""
+        return ":" in self.direction
+
     def own_settings(self) -> dict[str, Any]:
         """Where and along what; it is read where the cube ends."""
         return {
@@ -89,10 +94,12 @@ class ClosedLoop(Intervention):
         split = [self._split(cell) for cell in self.cells]
         tried = [(place, role) for pattern, role in split for place in places(pattern, bench.policy)]
         donors = tuple(dict.fromkeys(site for place, _ in tried for site in place.sites))
+        bases = self._bases(bench, tried)
         found: list[Condition] = [DoseZero(donors), Exchanged()]
         for place, role in tried:
             found.append(TakenOver(place, role, donors))
-            found += self._along(bench, place, role, donors)
+            if (place, role) in bases:
+                found += along(self.direction, bases[place, role], place, role, donors)
         return found
 
     def play(self, bench: Bench, item: str, conditions: Sequence[Condition]) -> Replayed:
@@ -101,12 +108,14 @@ class ClosedLoop(Intervention):
 
         return play(bench, bench.questions(item), conditions)
 
-    def _along(self, bench: Bench, place: Place, role: str, donors: tuple[Site, ...]) -> list[Condition]:
-        if self.direction == NONE or len(place.sites) != 1 or role in TILES:
-            return []
+    def _bases(self, bench: Bench, tried: Sequence[tuple[Place, str]]) -> Mapping[tuple[Place, str], Bases]:
+        """Of the cells that have directions."""
+        wanted: dict[Place, list[str]] = {}
+        for place, role in tried:
+            if self.direction != NONE and len(place.sites) == 1 and role not in TILES:
+                wanted.setdefault(place, []).append(role)
         items = items_of(bench.run, replace(self, items=None))
-        bases = bases_of(bench, items, place, role, self.direction, self.controls, self.seed)
-        return [TakenOver(place, role, donors, name, bases) for name in (self.direction, *bases.control_names)]
+        return bases_of(bench, items, wanted, self.direction, self.controls, self.seed)
 
     @staticmethod
     def _split(cell: str) -> tuple[str, str]:

@@ -137,7 +137,9 @@ def intervene(
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
     source = Source(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
     with progress() as bar:
-        effects = intervene_on(opened, asked, source, progress=counter(bar, "items replayed"))
+        learning = counter(bar, "items learnt from") if asked.learns else None
+        replayed = counter(bar, "items replayed")
+        effects = intervene_on(opened, asked, source, progress=replayed, learning=learning)
     _show(effects, style)
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", effects.key, run))
 

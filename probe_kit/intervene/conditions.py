@@ -59,6 +59,11 @@ class Intervention(Asked, ABC):
         """What of the interventions a family must support for it."""
         return ("edit",)
 
+    @property
+    def learns(self) -> bool:
+        """Whether items are inferred beforehand, for directions or erasers of their tokens."""
+        return False
+
     def playable(self, bench: Bench, items: Sequence[str]) -> list[str]:
         """Those of the items' ids that it can be asked of; the others are passed over, and counted."""
         del bench

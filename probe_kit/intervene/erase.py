@@ -65,6 +65,11 @@ class Erase(Intervention):
         """`erase`."""
         return ERASE
 
+    @property
+    def learns(self) -> bool:
+        """Always."""
+        return True
+
     def own_settings(self) -> dict[str, Any]:
         """Where, how and beside how many controls."""
         return {
@@ -75,40 +80,28 @@ class Erase(Intervention):
     def conditions(self, bench: Bench) -> Sequence[Condition]:
         """Plain, then every place and role at dose 0, erased, and with its controls. Raises UnknownSiteError."""
         found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
-        items = items_of(bench.run, self)
-        conditions: list[Condition] = [Plain()]
-        for place in found.values():
-            roles = roles_of(bench.policy, place.stream, self.roles)
-            every = gather(bench, items, place.only_site, roles)
-            for role in roles:
-                own = {category: rows for (name, category), rows in every.items() if name == role}
-                conditions += self._of(place, role, own)
-        if len(conditions) == 1:
+        wanted = {place: roles_of(bench.policy, place.stream, self.roles) for place in found.values()}
+        if not any(wanted.values()):
             raise UsageError(f"no token of {', '.join(found)} plays {', '.join(self.roles)}")
-        return conditions
+        cells: dict[tuple[Place, str], _Cell] = {}
+        for place, role, category, own in gather(bench, items_of(bench.run, self), wanted):
+            self._fit(cells.setdefault((place, role), _Cell()), place, role, category, own)
+        return [Plain(), *(erased for (place, role), cell in cells.items() for erased in cell.at(place, role))]
 
     def told(self, conditions: Sequence[Condition], found: Replayed) -> dict[str, Any]:
         """How well a fresh probe reads the answer behind each condition, by category."""
         del found
         return {READABLE: {one.name: dict(one.readable) for one in conditions if isinstance(one, Erased)}}
 
-    def _of(self, place: Place, role: str, gathered: Mapping[str, Gathered]) -> list[Condition]:
-        erasers: dict[str, dict[str, Eraser]] = {}
-        readable: dict[str, dict[str, float]] = {"": {}}
-        for category, own in gathered.items():
-            fits = fit_by_fold(
-                own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category
-            )
-            folds = [fold for fold, _ in fits]
-            readable[""][category] = _readable(own, folds, None)
-            for name, of_episode in by_episode(own, fits).items():
-                erasers.setdefault(name, {}).update(of_episode)
-                fitted = [by_name[name] for _, by_name in fits]
-                readable.setdefault(name, {})[category] = _readable(own, folds, fitted)
-        return [
-            Erased(place, role, UNTOUCHED, {}, readable[""]),
-            *(Erased(place, role, name, erasers[name], readable[name]) for name in erasers),
-        ]
+    def _fit(self, cell: "_Cell", place: Place, role: str, category: str, own: Gathered) -> None:
+        """Add one category's erasers, and what is readable with each and without."""
+        fits = fit_by_fold(own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category)
+        folds = [fold for fold, _ in fits]
+        cell.readable.setdefault(UNTOUCHED, {})[category] = _readable(own, folds, None)
+        for name, of_episode in by_episode(own, fits).items():
+            cell.erasers.setdefault(name, {}).update(of_episode)
+            fitted = [by_name[name] for _, by_name in fits]
+            cell.readable.setdefault(name, {})[category] = _readable(own, folds, fitted)
 
 
 @dataclass(frozen=True)
@@ -138,6 +131,18 @@ class Erased:
         with patched(bench.policy, self.place.sites, tokens, change) as ledger:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, ledger)
+
+
+@dataclass
+class _Cell:
+    """One place and role. erasers: by name and episode. readable: by name and category."""
+
+    erasers: dict[str, dict[str, Eraser]] = field(default_factory=dict)
+    readable: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def at(self, place: Place, role: str) -> list[Erased]:
+        """Untouched first, then every eraser."""
+        return [Erased(place, role, name, self.erasers.get(name, {}), own) for name, own in self.readable.items()]
 
 
 @dataclass(frozen=True)

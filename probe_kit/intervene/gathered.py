@@ -1,6 +1,6 @@
 """The tokens of one place before the action, of whole categories, and what is fitted on them fold by fold."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,14 +8,16 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.sites import Site
 from probe_kit.identity import derive_seed
-from probe_kit.intervene.bench import Bench
+from probe_kit.intervene.bench import Bench, Question
 from probe_kit.intervene.directions import FOLDS, control_names
-from probe_kit.intervene.places import token_mask
+from probe_kit.intervene.places import Place, token_mask
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.erasure import Eraser, Method, Tokens, fit_control, fit_eraser
 
 Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
 """Every fold, and by name what is fitted on its training episodes."""
+_Row = tuple[str, str, bool, NDArray[np.float64]]
+"""Of one episode: its name, its group, whether the correct picture lies left, and (T, D) its tokens."""
 
 
 @dataclass(frozen=True)
@@ -33,29 +35,44 @@ class Gathered:
 
 
 def gather(
-    bench: Bench, items: Sequence[str], site: Site, roles: Sequence[str]
-) -> dict[tuple[str, str], Gathered]:
-    """By role and category, from one plain inference per episode. items: by id, all of their episodes.
+    bench: Bench, items: Sequence[str], wanted: Mapping[Place, Sequence[str]]
+) -> Iterator[tuple[Place, str, str, Gathered]]:
+    """Place, role, category and what was gathered there, from one plain inference per episode and place.
 
-    Takes 8 bytes per number: episodes × tokens × width.
+    items: by id, all of their episodes. wanted: roles by place. What is held at a time is of one place and
+    category: 8 bytes per number, episodes × tokens × width. Raises UnknownSiteError for a place of several sites.
     """
+    sites = {place: place.only_site for place, roles in wanted.items() if roles}
+    of_category: dict[str, list[str]] = {}
+    for item in items:
+        of_category.setdefault(bench.items[item].category, []).append(item)
+    done = 0
+    for place, site in sites.items():
+        for category, own in of_category.items():
+            rows: dict[str, list[_Row]] = {role: [] for role in wanted[place]}
+            for item in own:
+                for question in bench.questions(item):
+                    _infer(bench, question, site, rows)
+                done += 1
+                if bench.learning is not None:
+                    bench.learning(done, len(sites) * len(items), item)
+            for role in list(rows):
+                yield place, role, category, _together(rows.pop(role))
+
+
+def _infer(bench: Bench, question: Question, site: Site, rows: Mapping[str, list[_Row]]) -> None:
+    """Add the episode's row to those of every role."""
     from probe_kit.hooks import capture
 
-    found: dict[tuple[str, str], list[tuple[str, str, bool, NDArray[np.float64]]]] = {}
-    for item in items:
-        for question in bench.questions(item):
-            with capture(bench.policy, [site]) as tape:
-                bench.act(question.seen, question.seed)
-            passing = tape[site][0].double().cpu().numpy()
-            for role in roles:
-                mask = token_mask(bench.policy, question.seen, site.stream, role)
-                found.setdefault((role, question.category), []).append(
-                    (question.episode_id, question.group_id, question.side_correct == "left", passing[mask])
-                )
-    return {name: _together(rows) for name, rows in found.items()}
+    with capture(bench.policy, [site]) as tape:
+        bench.act(question.seen, question.seed)
+    passing = tape[site][0].double().cpu().numpy()
+    for role, found in rows.items():
+        mask = token_mask(bench.policy, question.seen, site.stream, role)
+        found.append((question.episode_id, question.group_id, question.side_correct == "left", passing[mask]))
 
 
-def _together(rows: Sequence[tuple[str, str, bool, NDArray[np.float64]]]) -> Gathered:
+def _together(rows: Sequence[_Row]) -> Gathered:
     """Sequences of different lengths side by side, their first tokens together."""
     episodes, groups, left, values = zip(*rows, strict=True)
     longest = max(len(own) for own in values)

@@ -75,6 +75,11 @@ class Interchange(Intervention):
         """Edits; and a memory, where one of its places is."""
         return needed(self.sites, self.roles)
 
+    @property
+    def learns(self) -> bool:
+        """Where its direction is of tokens."""
+        return ":" in self.direction
+
     def own_settings(self) -> dict[str, Any]:
         """Where, which tokens and along what."""
         return {
@@ -86,17 +91,14 @@ class Interchange(Intervention):
         """Plain, exchanged, and every place at every role. Raises UnknownSiteError, NoProbesError."""
         found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
         donors = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
-        items = items_of(bench.run, replace(self, items=None))
+        wanted = {place: roles_of(bench.policy, place.stream, self.roles) for place in found.values()}
         conditions: list[Condition] = [Plain(), Exchanged()]
-        for place in found.values():
-            for role in roles_of(bench.policy, place.stream, self.roles):
-                if self.direction == NONE:
-                    conditions.append(TakenOver(place, role, donors))
-                    continue
-                bases = bases_of(bench, items, place, role, self.direction, self.controls, self.seed)
-                conditions += [
-                    TakenOver(place, role, donors, name, bases) for name in (self.direction, *bases.control_names)
-                ]
+        if self.direction == NONE:
+            return conditions + [TakenOver(place, role, donors) for place in wanted for role in wanted[place]]
+        items = items_of(bench.run, replace(self, items=None))
+        found_along = bases_of(bench, items, wanted, self.direction, self.controls, self.seed)
+        for (place, role), bases in found_along.items():
+            conditions += along(self.direction, bases, place, role, donors)
         return conditions
 
 
@@ -133,6 +135,11 @@ class TakenOver:
             return Replaced(donor, tokens)
         basis = self.bases.basis(self.direction, turn.question.episode_id, turn.question.category)
         return ReplacedAlong(donor, tokens, basis)
+
+
+def along(direction: str, bases: Bases, place: Place, role: str, donors: tuple[Site, ...]) -> list[TakenOver]:
+    """What is taken over along a direction, and along each of its controls."""
+    return [TakenOver(place, role, donors, name, bases) for name in (direction, *bases.control_names)]
 
 
 def donor_of(turn: Turn, sites: Sequence[Site]) -> "Tape":

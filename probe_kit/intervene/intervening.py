@@ -1,7 +1,7 @@
 """Carrying out an intervention: replay what is missing, store it, say what it means."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from probe_kit.extract.store.layout import INTERVENTIONS
 from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.registry import known_families
-from probe_kit.intervene.bench import Bench, Source, open_bench
+from probe_kit.intervene.bench import Bench, Progress, Source, open_bench
 from probe_kit.intervene.conditions import Condition, Intervention, Replayed
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
@@ -28,13 +28,6 @@ if TYPE_CHECKING:
 REDO = "the same `probe-kit intervene` then plays it again"
 
 
-class Progress(Protocol):
-    """Called after every item."""
-
-    def __call__(self, done: int, total: int, what: str, /) -> None:
-        """done: items so far, of `total`. what: the last one."""
-
-
 def intervene_on(
     run: Run,
     asked: Intervention | None = None,
@@ -42,13 +35,15 @@ def intervene_on(
     *,
     load: "Callable[[Run, Source], Policy] | None" = None,
     progress: Progress | None = None,
+    learning: Progress | None = None,
 ) -> Effects:
     """Intervene on a run's policy, and store what came of it with the run; what is stored is read back.
 
     asked: what to do; `Follow()` by default. source: where policy and pictures are, by default the embedded suite
-    and the model's own checkpoint. load: how the policy is found, if not by its name. What was interrupted is
-    continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError, and what `open_bench`
-    raises.
+    and the model's own checkpoint. load: how the policy is found, if not by its name. progress: told of items
+    replayed; learning: of items inferred before that, where directions or erasers of tokens are found. What was
+    interrupted is continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError, and what
+    `open_bench` raises.
     """
     asked = asked or Follow()
     refuse_unfit(run)
@@ -58,7 +53,7 @@ def intervene_on(
     if is_stored(run.location, key):
         tidy_bundle(run.location, INTERVENTIONS, key)
     else:
-        _carry_out(run, asked, settings, key, source or Source(), load, progress)
+        _carry_out(run, asked, settings, key, source or Source(), load, progress, learning)
     return load_effects(run, key)
 
 
@@ -70,10 +65,12 @@ def _carry_out(
     source: Source,
     load: "Callable[[Run, Source], Policy] | None",
     progress: Progress | None,
+    learning: Progress | None,
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
     wanted = items_of(run, asked)
     with open_bench(run, source, load) as bench, bench.ready():
+        bench.learning = learning or notebook_progress("items learnt from")
         items = asked.playable(bench, wanted)
         conditions = asked.conditions(bench)
         parts = _replayed(bench, asked, items, conditions, pieces, progress or notebook_progress("items replayed"))

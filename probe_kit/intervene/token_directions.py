@@ -55,22 +55,32 @@ def check_direction(direction: str) -> None:
 
 
 def bases_of(
-    bench: Bench, items: Sequence[str], place: Place, role: str, direction: str, controls: int, seed: int
-) -> Bases:
-    """What `direction` means at one place and role: of the run's columns, or of the tokens of these items (ids).
+    bench: Bench,
+    items: Sequence[str],
+    wanted: Mapping[Place, Sequence[str]],
+    direction: str,
+    controls: int,
+    seed: int,
+) -> dict[tuple[Place, str], Bases]:
+    """By place and role what `direction` means there: of the run's columns, or of the tokens of these items (ids).
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
-    same for every token; from one plain inference per episode. Raises UnknownSiteError for a place of several
-    sites or one that is not stored, UsageError where there are too few episodes to learn from.
+    same for every token; from one plain inference per episode and place. wanted: roles by place. Raises
+    UnknownSiteError for a place of several sites or one that is not stored, UsageError where there are too few
+    episodes to learn from.
     """
-    site = place.only_site
     if ":" not in direction:
-        return axes_of(bench.run, site, role, direction, controls, seed)
-    bases: dict[tuple[str, str], Vector] = {}
-    for (_, category), own in gather(bench, items, site, [role]).items():
-        fits = fit_by_fold(own, site, role, Method.of(direction), controls, seed, category)
+        return {
+            (place, role): axes_of(bench.run, place.only_site, role, direction, controls, seed)
+            for place, roles in wanted.items()
+            for role in roles
+        }
+    bases: dict[tuple[Place, str], dict[tuple[str, str], Vector]] = {}
+    for place, role, category, own in gather(bench, items, wanted):
+        fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
+        found = bases.setdefault((place, role), {})
         for name, of_episode in by_episode(own, fits).items():
-            bases |= {
+            found |= {
                 (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
             }
-    return TokenAxes(bases, control_names(controls))
+    return {cell: TokenAxes(found, control_names(controls)) for cell, found in bases.items()}

@@ -72,7 +72,11 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(benc
     """Held against numpy's decomposition of the tokens that the policy has there."""
     items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))[:6]
     (place,) = places("backbone.02", bench.policy)
-    axes = bases_of(bench, items, place, "image", "mean-difference:2", 1, seed=0)
+    heard: list[tuple[int, int]] = []
+    bench.learning = lambda done, total, _: heard.append((done, total))
+    (axes,) = bases_of(bench, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
+    bench.learning = None
+    assert heard == [(done, len(items)) for done in range(1, len(items) + 1)]
     assert isinstance(axes, TokenAxes)
     questions = [question for item in items for question in bench.questions(item)]
     rows = []
