@@ -30,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from capture_subjects import RECIPES, Subject, hidden_states, subject
+from capture_subjects import LARGER, Subject, hidden_states, subject
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -180,7 +180,7 @@ def trace(run: Callable[[], Output], path: str) -> None:
 def main() -> None:
     """One family after another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--families", default=",".join(RECIPES))
+    parser.add_argument("--families", default=",".join(LARGER))
     parser.add_argument("--checkpoint", help="its config gives the size; for one family")
     parser.add_argument("--dtype", help="default float32 on a CPU, bfloat16 elsewhere")
     parser.add_argument("--batch", type=int, default=1)

@@ -9,7 +9,8 @@ import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +28,8 @@ from probe_kit.hooks.roles import Roles
 sys.modules["tests"] = types.ModuleType("tests")
 sys.modules["tests"].__path__ = [str(Path(__file__).parents[1] / "tests")]
 
-from tests import (  # noqa: E402
-    internvla_checkpoints,
-    magma_checkpoints,
-    pi0_checkpoints,
-    prismatic_checkpoints,
-    smolvla_checkpoints,
-    spatialvla_checkpoints,
-    vlm_checkpoints,
-    xiaomi_checkpoints,
-)
+from tests import magma_checkpoints  # noqa: E402
+from tests.every_checkpoint import WRITERS  # noqa: E402
 
 WIDTH, DEPTH, INNER, HEADS, KEYS, HEAD = 768, 12, 3072, 12, 4, 64
 TOWER, TOWER_DEPTH, TOWER_INNER, TOWER_HEADS = 384, 6, 1536, 6
@@ -59,158 +52,113 @@ _TOWER: Values = {
 _ROPE: Values = {"rope_scaling": {"mrope_section": [16, 8, 8]}}
 _TIMM: Values = {"depth": TOWER_DEPTH, "embed_dim": TOWER, "num_heads": TOWER_HEADS}
 _GEMMA: Values = {"depth": DEPTH, "num_heads": HEADS, "num_kv_heads": 1, "head_dim": HEAD}
+_PRISMATIC: Values = {
+    "config.json": {
+        "text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
+        "image_sizes": [224, 224], "timm_model_overrides": [_TIMM, _TIMM],
+    }
+}  # fmt: skip
 
-
-@dataclass(frozen=True)
-class Recipe:
-    """How a family's files are written, and what in them is made larger, by file.
-
-    options: of `load_model`.
-    """
-
-    write: Callable[[Path], Path]
-    larger: Mapping[str, Values]
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
-RECIPES = {
-    "pi0": Recipe(
-        pi0_checkpoints.write_intact,
-        {
-            "config.json": {"resize_imgs_with_padding": [224, 224], "chunk_size": 50, "n_action_steps": 50},
-            "dims.json": {
-                "vlm": {**_GEMMA, "width": WIDTH, "mlp_dim": INNER},
-                "expert": {**_GEMMA, "width": 384, "mlp_dim": 1536},
-                "vision": {
-                    "hidden": TOWER, "layers": TOWER_DEPTH, "heads": TOWER_HEADS, "inter": TOWER_INNER,
-                    "patch": 14,
-                },
+LARGER: dict[str, Values] = {
+    "pi0": {
+        "config.json": {"resize_imgs_with_padding": [224, 224], "chunk_size": 50, "n_action_steps": 50},
+        "dims.json": {
+            "vlm": {**_GEMMA, "width": WIDTH, "mlp_dim": INNER},
+            "expert": {**_GEMMA, "width": 384, "mlp_dim": 1536},
+            "vision": {
+                "hidden": TOWER, "layers": TOWER_DEPTH, "heads": TOWER_HEADS, "inter": TOWER_INNER,
+                "patch": 14,
             },
         },
-    ),
-    "smolvla": Recipe(
-        smolvla_checkpoints.write_smolvla,
-        {
-            "config.json": {
-                "resize_imgs_with_padding": [256, 256], "chunk_size": 50, "n_action_steps": 50, "num_steps": 10,
-                "num_vlm_layers": DEPTH,
-            },
-            "vlm/config.json": {
-                "text_config": _HEADED, "scale_factor": 2,
-                "vision_config": {**_TOWER, "patch_size": 16, "image_size": 256},
-            },
-            "vlm/processor_config.json": {"image_seq_len": 64},
+    },
+    "smolvla": {
+        "config.json": {
+            "resize_imgs_with_padding": [256, 256], "chunk_size": 50, "n_action_steps": 50, "num_steps": 10,
+            "num_vlm_layers": DEPTH,
         },
-    ),
-    "openvla": Recipe(
-        prismatic_checkpoints.write_checkpoint,
-        {"config.json": {"text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
-                         "image_sizes": [224, 224], "timm_model_overrides": [_TIMM, _TIMM]}},
-        {"tokenizer": "bytes"},
-    ),
-    "prismatic": Recipe(
-        prismatic_checkpoints.write_checkpoint,
-        {"config.json": {"text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
-                         "image_sizes": [224, 224], "timm_model_overrides": [_TIMM, _TIMM]}},
-        {"tokenizer": "bytes"},
-    ),
-    "spatialvla": Recipe(
-        spatialvla_checkpoints.write_checkpoint,
-        {
-            "config.json": {
-                "projection_dim": WIDTH, "text_config": {**_HEADED, "query_pre_attn_scalar": HEAD},
-                "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
-            },
-            "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
+        "vlm/config.json": {
+            "text_config": _HEADED, "scale_factor": 2,
+            "vision_config": {**_TOWER, "patch_size": 16, "image_size": 256},
         },
-    ),
-    "magma": Recipe(
-        lambda folder: magma_checkpoints.write_checkpoint(folder, steered=False, shards=1),
-        {
-            "config.json": {
-                "text_config": {**_TEXT, "max_position_embeddings": 4096},
-                "vision_config": {
-                    "img_size": 256, "mm_hidden_size": TOWER,
-                    "timm_overrides": {"depths": [2, 2, 6, 2], "dims": [48, 96, 192, 384]},
-                },
-            },
-            "preprocessor_config.json": {"base_img_size": 256},
+        "vlm/processor_config.json": {"image_seq_len": 64},
+    },
+    "openvla": _PRISMATIC,
+    "prismatic": _PRISMATIC,
+    "spatialvla": {
+        "config.json": {
+            "projection_dim": WIDTH, "text_config": {**_HEADED, "query_pre_attn_scalar": HEAD},
+            "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
         },
-    ),
-    "xiaomi-r0": Recipe(
-        xiaomi_checkpoints.write_checkpoint,
-        {
-            "config.json": {
-                "vlm_config": {
-                    "text_config": {**_HEADED, **_ROPE},
-                    "vision_config": {**_QWEN_TOWER, "deepstack_visual_indexes": [1, 3]},
-                },
-                "dit_config": {
-                    "hidden_size": 512, "num_hidden_layers": 6, "head_dim": HEAD, "num_key_value_heads": KEYS,
-                },
-            }
-        },
-    ),
-    "internvla-m1": Recipe(
-        internvla_checkpoints.write_checkpoint,
-        {
-            "../vlm/config.json": {
-                "text_config": {**_TEXT, **_ROPE},
-                "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]},
-            },
-            "config.yaml": {
-                "framework": {
-                    "layer_qformer": {
-                        "qformer_start_layer": 9, "qformer_end_layer": 13, "num_query_tokens": 64,
-                        "input_dim": WIDTH, "ouptput_dim": TOWER,
-                    },
-                    "action_model": {"action_hidden_dim": TOWER, "future_action_window_size": 15},
-                }
-            },
-            "dims.json": {
-                "dino": {**_TIMM, "img_size": 518, "patch_size": 14, "px": 224},
-                "dit": {"depth": 8, "token_size": TOWER, "num_heads": TOWER_HEADS}, "qformer_heads": TOWER_HEADS,
+        "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
+    },
+    "magma": {
+        "config.json": {
+            "text_config": {**_TEXT, "max_position_embeddings": 4096},
+            "vision_config": {
+                "img_size": 256, "mm_hidden_size": TOWER,
+                "timm_overrides": {"depths": [2, 2, 6, 2], "dims": [48, 96, 192, 384]},
             },
         },
-    ),
-    "paligemma": Recipe(
-        vlm_checkpoints.write_paligemma,
-        {
-            "config.json": {
-                "text_config": {**_HEADED, "num_key_value_heads": 1},
-                "projection_dim": WIDTH, "hidden_size": WIDTH,
-                "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
-            },
-            "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
-        },
-    ),
-    "qwen2.5-vl": Recipe(
-        vlm_checkpoints.write_qwen2_5_vl,
-        {"config.json": {**_TEXT, **_ROPE, "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]}}},
-    ),
-    "qwen3-vl": Recipe(
-        vlm_checkpoints.write_qwen3_vl,
-        {
-            "config.json": {
+        "preprocessor_config.json": {"base_img_size": 256},
+    },
+    "xiaomi-r0": {
+        "config.json": {
+            "vlm_config": {
                 "text_config": {**_HEADED, **_ROPE},
                 "vision_config": {**_QWEN_TOWER, "deepstack_visual_indexes": [1, 3]},
+            },
+            "dit_config": {
+                "hidden_size": 512, "num_hidden_layers": 6, "head_dim": HEAD, "num_key_value_heads": KEYS,
+            },
+        }
+    },
+    "internvla-m1": {
+        "../vlm/config.json": {
+            "text_config": {**_TEXT, **_ROPE},
+            "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]},
+        },
+        "config.yaml": {
+            "framework": {
+                "layer_qformer": {
+                    "qformer_start_layer": 9, "qformer_end_layer": 13, "num_query_tokens": 64,
+                    "input_dim": WIDTH, "ouptput_dim": TOWER,
+                },
+                "action_model": {"action_hidden_dim": TOWER, "future_action_window_size": 15},
             }
         },
-    ),
-    "internvl": Recipe(
-        vlm_checkpoints.write_internvl,
-        {
-            "config.json": {
-                "text_config": _HEADED, "vision_config": {**_TOWER, "image_size": [224, 224]},
-            },
-            "preprocessor_config.json": {"size": {"height": 224, "width": 224}, "max_patches": 2},
+        "dims.json": {
+            "dino": {**_TIMM, "img_size": 518, "patch_size": 14, "px": 224},
+            "dit": {"depth": 8, "token_size": TOWER, "num_heads": TOWER_HEADS}, "qformer_heads": TOWER_HEADS,
         },
-    ),
-    "ovis2.5": Recipe(
-        vlm_checkpoints.write_ovis2_5,
-        {"config.json": {"llm_config": _HEADED, "vit_config": _TOWER}},
-    ),
+    },
+    "paligemma": {
+        "config.json": {
+            "text_config": {**_HEADED, "num_key_value_heads": 1},
+            "projection_dim": WIDTH, "hidden_size": WIDTH,
+            "vision_config": {**_TOWER, "image_size": 224, "projection_dim": WIDTH},
+        },
+        "preprocessor_config.json": {"size": {"height": 224, "width": 224}},
+    },
+    "qwen2.5-vl": {
+        "config.json": {
+            **_TEXT, **_ROPE, "vision_config": {**_QWEN_TOWER, "fullatt_block_indexes": [2, 5]},
+        }
+    },
+    "qwen3-vl": {
+        "config.json": {
+            "text_config": {**_HEADED, **_ROPE},
+            "vision_config": {**_QWEN_TOWER, "deepstack_visual_indexes": [1, 3]},
+        }
+    },
+    "internvl": {
+        "config.json": {
+            "text_config": _HEADED, "vision_config": {**_TOWER, "image_size": [224, 224]},
+        },
+        "preprocessor_config.json": {"size": {"height": 224, "width": 224}, "max_patches": 2},
+    },
+    "ovis2.5": {"config.json": {"llm_config": _HEADED, "vit_config": _TOWER}},
 }  # fmt: skip
+"""What is made larger, by family and file."""
 
 
 @dataclass(frozen=True)
@@ -252,10 +200,10 @@ class Subject:
 def subject(
     family: str, folder: Path, device: str, dtype: str | None, batch: int, checkpoint: str | None = None
 ) -> Subject:
-    """A family at the size of its recipe, written to `folder`, or at that of a checkpoint; weights are random."""
+    """A family as `LARGER` has it, written to `folder`, or at the size of a checkpoint; weights are random."""
     options: Mapping[str, Any] = {}
     if checkpoint is None:
-        checkpoint, options = str(written(family, folder / "tiny")), RECIPES[family].options
+        checkpoint, options = str(written(family, folder / "tiny")), WRITERS[family][1]
     model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
     seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
     if isinstance(model, Policy):
@@ -268,10 +216,12 @@ def subject(
 
 
 def written(family: str, folder: Path) -> Path:
-    """The files of a checkpoint at the size of its recipe, without weights; where it lies."""
-    recipe = RECIPES[family]
-    place = recipe.write(folder)
-    _enlarge(place, recipe.larger)
+    """The files of a checkpoint as `LARGER` has it, without weights; where it lies."""
+    write, _ = WRITERS[family]
+    if family == "magma":  # weights that steer its answers fit the tiny network only
+        write = partial(magma_checkpoints.write_checkpoint, steered=False, shards=1)
+    place = write(folder)
+    _enlarge(place, LARGER[family])
     return place
 
 

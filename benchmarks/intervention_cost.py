@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from capture_subjects import RECIPES, subject
+from capture_subjects import LARGER, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
 from probe_kit.intervene.patching import Replaced, Tokens, patched
@@ -77,7 +77,7 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
 def main() -> None:
     """Time every way against plain."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--family", default=EMBEDDED, help=f"{EMBEDDED} or one of {', '.join(RECIPES)}")
+    parser.add_argument("--family", default=EMBEDDED, help=f"{EMBEDDED} or one of {', '.join(LARGER)}")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()

@@ -5,7 +5,6 @@ machine without a GPU the case `cuda` skips, and `cpu` loads every family twice.
 """
 
 import gc
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +16,8 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract.play.examples import example_observations
 from probe_kit.hooks import Policy, Reader, capture, load_model
 from probe_kit.hooks.model import Question
-from tests import (
-    internvla_checkpoints,
-    magma_checkpoints,
-    pi0_checkpoints,
-    prismatic_checkpoints,
-    smolvla_checkpoints,
-    spatialvla_checkpoints,
-    vlm_checkpoints,
-    xiaomi_checkpoints,
-)
+from tests.every_checkpoint import WRITERS
 
-BYTES = {"tokenizer": "bytes"}
-WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
-    "pi0": (pi0_checkpoints.write_intact, {}),
-    "smolvla": (smolvla_checkpoints.write_smolvla, {}),
-    "openvla": (prismatic_checkpoints.write_checkpoint, BYTES),
-    "prismatic": (prismatic_checkpoints.write_checkpoint, BYTES),
-    "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
-    "magma": (magma_checkpoints.write_checkpoint, {}),
-    "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {}),
-    "internvla-m1": (internvla_checkpoints.write_checkpoint, {}),
-    "paligemma": (vlm_checkpoints.write_paligemma, {}),
-    "qwen2.5-vl": (vlm_checkpoints.write_qwen2_5_vl, {}),
-    "qwen3-vl": (vlm_checkpoints.write_qwen3_vl, {}),
-    "internvl": (vlm_checkpoints.write_internvl, {}),
-    "ovis2.5": (vlm_checkpoints.write_ovis2_5, {}),
-}
 OF_LARGEST = 2e-3
 """Difference allowed, as a share of a site's largest value: other kernels, other roundings, layer after layer."""
 
