@@ -12,8 +12,8 @@ EVERY = 60.0
 class Heartbeat:
     """A progress callback (done, total, …): a line after `FIRST` seconds, then every `EVERY`, and one at the end.
 
-    what: what is counted. say: takes each line. clock: seconds, of any origin. Work done before the first call, as
-    that of a run that is continued, is counted as done but not in the rate.
+    what: what is counted. say: takes each line. clock: seconds, of any origin. The rate is that of what was done
+    since the first call: before it a model was loaded, or a run that is continued was made.
     """
 
     def __init__(
@@ -23,26 +23,22 @@ class Heartbeat:
         self._say = say
         self._clock = clock
         self._started = clock()
-        self._before: int | None = None
+        self._first: tuple[int, float] | None = None
         self._due = self._started + FIRST
 
     def __call__(self, done: int, total: int, *_: object) -> None:
         """`done` of `total` are finished; whatever else a caller tells is not used."""
         now = self._clock()
-        if self._before is None:
-            self._before = max(done - 1, 0)
+        if self._first is None:
+            self._first = done, now
         if now < self._due and done < total:
             return
         self._due = now + EVERY
-        self._say(f"{self._what}: {done}/{total}{self._pace(done, total, now - self._started)}")
-
-    def _pace(self, done: int, total: int, seconds: float) -> str:
-        made = done - (self._before or 0)
-        if made <= 0 or seconds <= 0:
-            return ""
-        rate = made / seconds
-        left = f", about {spoken((total - done) / rate)} left" if done < total else f" in {spoken(seconds)}"
-        return f", {_per_time(rate)}{left}"
+        before, since = self._first
+        rate = (done - before) / (now - since) if now > since else 0.0
+        pace = f", {_per_time(rate)}" if rate > 0 else ""
+        left = f", about {spoken((total - done) / rate)} left" if rate > 0 and done < total else ""
+        self._say(f"{self._what}: {done}/{total} after {spoken(now - self._started)}{pace}{left}")
 
 
 def spoken(seconds: float) -> str:
