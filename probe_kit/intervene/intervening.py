@@ -15,8 +15,10 @@ from probe_kit.intervene.bench import Bench, Progress, Source, open_bench
 from probe_kit.intervene.conditions import Condition, Intervention, Replayed
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
+from probe_kit.intervene.interchange import ROLES
 from probe_kit.intervene.passing import Named
 from probe_kit.intervene.patching import LEDGER
+from probe_kit.intervene.places import places, refuse_unplayed
 from probe_kit.intervene.settings import SHADOW, items_of, key_of, refuse_unfit, settings_of
 from probe_kit.intervene.shadow import shadowed
 from probe_kit.intervene.stored import EXCHANGED, Answers, is_stored, save
@@ -71,6 +73,7 @@ def _carry_out(
     wanted = items_of(run, asked)
     with open_bench(run, source, load) as bench, bench.ready():
         bench.learning = learning or notebook_progress("items learnt from")
+        _refuse_unplayed_roles(bench, settings)
         items = asked.playable(bench, wanted)
         conditions = asked.conditions(bench)
         parts = _replayed(bench, asked, items, conditions, pieces, progress or notebook_progress("items replayed"))
@@ -88,6 +91,14 @@ def _carry_out(
     effects = effects_csv(answers, run.suite, str(settings.get("toward", EXCHANGED)), asked.kind, further)
     save(run.location, settings, key, answers, effects, certificate, further)
     pieces.discard()
+
+
+def _refuse_unplayed_roles(bench: Bench, settings: Mapping[str, Any]) -> None:
+    """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it."""
+    roles, sites = settings.get("roles"), settings.get("sites")
+    if roles and sites:
+        found = [place.stream for pattern in sites for place in places(pattern, bench.policy)]
+        refuse_unplayed(bench.policy, tuple(dict.fromkeys(found)), roles, ROLES)
 
 
 def refuse_unsupported(run: Run, asked: Intervention) -> None:

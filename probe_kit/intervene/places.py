@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import EmptyRoleError, UnknownSiteError
+from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.hooks.observation import Observation
 from probe_kit.hooks.sites import MEMORY, MEMORY_STREAM, Site
 from probe_kit.hooks.views import plays
@@ -103,3 +103,19 @@ def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
     named = policy.role_names.get(policy.tokens_of(stream), ())
     tiles = TILE_ROLES if any(plays(name, "image") for name in named) else ()
     return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]
+
+
+def refuse_unplayed(policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]) -> None:
+    """Raise UsageError for a wanted role that no token of these streams plays.
+
+    usual: the roles that are tried if nothing is said, of which one that is there will do.
+    """
+    there = {role for stream in streams for role in roles_of(policy, stream, wanted)}
+    missing = [role for role in wanted if role not in there]
+    if not missing or (there and tuple(wanted) == tuple(usual)):
+        return
+    named = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
+    raise UsageError(
+        f"no token of {', '.join(streams)} plays {missing[0]!r}; expected one of "
+        f"{', '.join(dict.fromkeys((ALL, *named)))}"
+    )

@@ -220,7 +220,9 @@ def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def rule_sentence(row: Ruled) -> str:
     """What outcomes were judged by, and what the rule gives away; for captions."""
-    steps = f", mean of the last {row.last_steps} control steps" if row.last_steps > 1 else ""
+    steps = f", mean of the last {row.last_steps} control steps (all, where there are fewer)" * (
+        row.last_steps > 1
+    )
     text = f"outcome rule {row.rule}{f': {row.rule_words}' if row.rule_words else ''}{steps}"
     if row.sr_idle is None:
         return text

@@ -104,17 +104,21 @@ class Eraser:
 def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Eraser:
     """What erases the answer from such tokens. left: (N,) the answer.
 
-    Raises UsageError if no position has episodes enough of either answer.
+    Raises UsageError if no position has episodes enough of either answer, or if there are fewer directions than
+    the method's name says.
     """
     _check(tokens, left)
     centred, means = tokens.centred()
     usable = tokens.usable(left)
+    _refuse_more(method, min(centred.shape[2], len(left)))
     if method.way == "leace":
         removed, read = _leace(centred, tokens.present, _answer(tokens, left), usable)
     elif method.way == "inlp":
         removed = read = _inlp(centred, tokens.present, left, usable, method.rank)
     else:
         removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank)
+    fitted = usable if len(removed) == usable.size else slice(None)
+    _refuse_more(method, int((np.linalg.norm(removed[fitted], axis=-1) > 0).sum(axis=1).min()))
     return Eraser(means, removed, read, usable)
 
 
@@ -123,7 +127,8 @@ def fit_control(
 ) -> Eraser:
     """The same taken away for no answer: as many random directions of the data's own covariance, beside `own`.
 
-    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way.
+    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way. Raises UsageError
+    if beside `own` no room is left for as many.
     """
     _check(tokens, left)
     centred, means = tokens.centred()
@@ -143,6 +148,13 @@ def fit_control(
         weights = draw.normal(size=(method.rank, *centred.shape[:2]))
         drawn = np.einsum("knt,ntd->kd", weights, centred)[None]
     beside = np.stack([_basis(one, past=taken) for one, taken in zip(drawn, own.removed, strict=True)])
+    fitted = usable if len(beside) == usable.size else slice(None)
+    room = int((np.linalg.norm(beside[fitted], axis=-1) > 0).sum(axis=1).min())
+    if room < method.rank:
+        raise UsageError(
+            f"{method} leaves room for {room} random directions beside it, of {centred.shape[2]} dimensions and "
+            f"{len(left)} episodes; expected {method.rank}. Ask for fewer directions, or for --controls 0"
+        )
     return Eraser(means, beside, beside, usable)
 
 
@@ -184,6 +196,15 @@ def _check(tokens: Tokens, left: NDArray[np.bool_]) -> None:
         raise UsageError(
             f"no position has {FEWEST} episodes of either answer among {len(left)} to learn from; expected more "
             "items (leave --items out, or extract more)"
+        )
+
+
+def _refuse_more(method: Method, there: int) -> None:
+    """A name says how many directions there are: it is not kept for fewer."""
+    if method.rank > there:
+        raise UsageError(
+            f"{method} asks for {method.rank} directions, and these tokens have {there} to find; expected "
+            f"{method.way}:{max(there, 1)} or fewer"
         )
 
 

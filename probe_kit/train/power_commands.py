@@ -40,6 +40,8 @@ def power(
     for name, value in (("--power", wanted), ("--width", width)):
         if value is not None and not isfinite(value):
             raise UsageError(f"{name} is {value}; expected a number")
+    if width is not None and wanted is not None:
+        raise UsageError("--power and --width are two questions; ask them one after the other")
     counts = [_whole(part) for part in split(items) or ()]
     signals = [_points(part) for part in split(signal) or ()]
     if width is not None:

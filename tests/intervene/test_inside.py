@@ -8,9 +8,19 @@ import pytest
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks import Site
-from probe_kit.intervene import Effects, Interchange, Source, Steer, intervene_on, load_effects, stored_passing
+from probe_kit.intervene import (
+    Effects,
+    Erase,
+    Interchange,
+    Source,
+    Steer,
+    intervene_on,
+    load_effects,
+    stored_passing,
+)
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.directions import axes_of
+from probe_kit.intervene.inside import keys_inside
 from probe_kit.intervene.patching import EVERY, Kept, Ledger, Replaced, ReplacedAlong, Tokens, _Patch
 from probe_kit.intervene.places import places, token_mask
 
@@ -55,6 +65,29 @@ def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: Effects) -
     said = whole.certificate["edits"]["expert.02@0-1|all"]
     assert said["fires"] == 2 * 4
     assert "expert.02@0-1|language" not in whole.certificate["edits"]
+
+
+@pytest.mark.parametrize(
+    ("sites", "roles", "role"),
+    [
+        (("backbone.02",), ("imgae",), "imgae"),
+        (("backbone.02",), ("image", "words"), "words"),
+        (("backbone.02",), ("image.wrist",), "image.wrist"),
+        (("expert.*",), ("language",), "language"),
+        (("memory.*",), ("action",), "action"),
+    ],
+)
+def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
+    copy: Run, source: Source, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
+) -> None:
+    before = keys_inside(copy)
+    for asked in (
+        Interchange(categories=("color",), items=1, sites=sites, roles=roles),
+        Erase(categories=("color",), items=1, sites=sites[:1], roles=roles),
+    ):
+        with pytest.raises(UsageError, match=f"plays '{role}'; expected one of all, "):
+            intervene_on(copy, asked, source, load=lambda *_: twin)
+    assert keys_inside(copy) == before
 
 
 def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: Effects) -> None:

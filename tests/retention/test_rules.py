@@ -71,7 +71,7 @@ def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
 def test_the_mean_over_the_last_steps_is_an_option_of_the_rule(idle: Run) -> None:
     row = retention([idle], rule="box", last_steps=11).rows[0]
     assert (row.sr, row.last_steps) == (0.5, 11)
-    assert "mean of the last 11 control steps" in rule_sentence(row)
+    assert "mean of the last 11 control steps (all, where there are fewer)" in rule_sentence(row)
 
 
 def test_shares_of_an_episode_count_as_shares() -> None:

@@ -164,3 +164,24 @@ def test_ways_have_names() -> None:
     assert [str(Method.of(name)) for name in ("leace", "inlp", "mean-difference:2")] == [
         "leace", "inlp:5", "mean-difference:2",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "there"), [("mean-difference:4", POSITIONS), ("mean-difference:999", WIDTH), ("inlp:13", WIDTH)]
+)
+def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, there: int) -> None:
+    tokens, left = drawn()
+    with pytest.raises(UsageError, match=f"asks for .* have {there} to find; expected .*:{there} or fewer"):
+        fit_eraser(tokens, left, Method.of(name))
+
+
+@pytest.mark.parametrize(("way", "most"), [("mean-difference", 1), ("inlp", 2)])
+def test_controls_that_find_no_room_beside_it_are_refused(way: str, most: int) -> None:
+    """In four dimensions a control of three directions has one that is beside, and would be called equal."""
+    tokens, left = drawn()
+    narrow = Tokens(tokens.values[..., : 2 * most], tokens.present)
+    fits = {rank: fit_eraser(narrow, left, Method.of(f"{way}:{rank}")) for rank in (most, most + 1)}
+    control = fit_control(narrow, left, Method.of(f"{way}:{most}"), fits[most], np.random.default_rng(0))
+    assert (np.linalg.norm(control.removed, axis=-1) > 0.99).all()
+    with pytest.raises(UsageError, match=f"leaves room for {most - 1} random directions"):
+        fit_control(narrow, left, Method.of(f"{way}:{most + 1}"), fits[most + 1], np.random.default_rng(0))

@@ -53,3 +53,9 @@ def test_the_command_prints_every_number_of_items() -> None:
     assert "against a twin" in text
     assert CliRunner().invoke(app, ["power", "--width", "16"]).stdout.startswith("151 items")
     assert CliRunner().invoke(app, ["power", "--items", "many"]).exit_code == 2
+
+
+def test_two_questions_are_not_answered_by_one_of_them() -> None:
+    found = CliRunner().invoke(app, ["power", "--width", "16", "--power", "80"])
+    assert found.exit_code == 2
+    assert "two questions" in found.output
