@@ -171,14 +171,13 @@ class Model(ABC):
 
     def stream_of(self, site: Site) -> Stream:
         """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
-        every = self.every_stream()
-        stream = every.get(site.stream)
+        stream = self.streams.get(site.stream) or self.every_stream().get(site.stream)
         if stream is None or not stream.holds(site):
             there = "; ".join(
                 f"{own.name}: {own.layers} layers"
                 + (f" x {own.iterations} iterations" if own.iterations else "")
                 + f" of {', '.join(own.quantities)}"
-                for own in every.values()
+                for own in self.every_stream().values()
             )
             raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {there}")
         return stream

@@ -119,7 +119,7 @@ class Stream:
 
     def holds(self, site: Site) -> bool:
         """Whether `site` is one of its `sites`; none are listed for it, as it is asked at every edit."""
-        named = (site.stream, site.quantity in self.quantities) == (self.name, True)
+        named = site.stream == self.name and site.quantity in self.quantities
         return named and site.iteration in self._steps and site.layer in self._layers_of(site.quantity)
 
     @property
@@ -127,8 +127,9 @@ class Stream:
         return (None,) if self.iterations is None else range(self.iterations)
 
     def _layers_of(self, quantity: str) -> range:
-        once = {"residual": range(self.layers), "final_norm": range(self.layers - 1, self.layers)}
-        return once.get(quantity, range(self.layers - 1))
+        if quantity == "residual":
+            return range(self.layers)
+        return range(self.layers - 1, self.layers) if quantity == "final_norm" else range(self.layers - 1)
 
 
 def memory_stream(blocks: int, width: int) -> Stream:

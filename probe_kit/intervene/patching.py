@@ -187,7 +187,9 @@ class _Patch:
         if activation.shape[0] != 1 or activation.shape[1] != count:
             raise CaptureError(f"{site} passes as {tuple(activation.shape)}; expected one row of {count} tokens")
         before = _at(activation, where)
-        after = self.change(site, before.float(), where).to(activation.dtype)
+        after = self.change(site, before.float(), where)
+        if after.dtype != activation.dtype:
+            after = after.to(activation.dtype)
         self.pairs.setdefault(before.shape, []).extend((before, after))
         if after.shape[1] == count:
             return after
