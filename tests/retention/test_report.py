@@ -18,11 +18,12 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.store.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.displays.gallery import gallery
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.provenance import citation
-from probe_kit.retention.report.readings import summarise
+from probe_kit.retention.report.readings import _clear_words, summarise
 from probe_kit.retention.report.tables import behaviour_table, control_table, retention_table
 from probe_kit.train import ArrayRun
 
@@ -44,6 +45,7 @@ def cards(page: str) -> list[dict[str, Any]]:
 
 def test_the_page_needs_nothing_but_itself(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL})])
+    assert "<b>Bold</b>: above chance and every control" in page
     assert not re.findall(r"(?:src|href)=[\"'](?!#|data:)", page)
     assert "@import" not in page
     assert "default-src 'none'" in page
@@ -176,6 +178,25 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
     assert [headline.value for headline in summary.headlines[:2]] == ["60.0 %", "77.3 %"]
     assert "120 of 200 episodes" in dict(summary.by_category)["color"]
     assert "not above chance" in dict(summary.by_category)["shape"]
+
+
+def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
+    beats = {"chance": True, "binding": False, "twin": False}
+    both = "an untrained conjunction of pictures and words or its twin"
+    assert _clear_words(0.01, beats) == f"above chance but no better than {both}, p = 0.010"
+    assert _clear_words(0.6, beats | {"chance": False}) == f"not above chance nor better than {both}, p = 0.600"
+    assert _clear_words(0.6, {"chance": False, "binding": None}) == "not above chance, p = 0.600"
+
+
+def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: ProbedRun) -> None:
+    """A caption that asks for chance alone calls an untrained conjunction evidence."""
+    runs = [probed_run({"color": SIGNAL, "shape": NOISE}, name) for name in ("one", "other")]
+    table = retention(runs)
+    said = [one.reading for one in gallery(runs, table) if one.subject == "probes"]
+    marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
+    assert len(marked) > 4
+    assert all("every control" in reading for reading in marked)
+    assert "every control" in GLOSSARY["n/a"]
 
 
 def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:

@@ -33,6 +33,7 @@ from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.displays.side_by_side import curves_side_by_side, has_maps, maps_side_by_side
+from probe_kit.retention.displays.style import SIGNAL
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.known import KnownUsed
 from probe_kit.retention.measure import Iterations
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
 _TableDisplay = type[SuccessTableDisplay] | type[SideTableDisplay] | type[RetentionTableDisplay]
 
 SUFFIXES = (".png", ".pdf")
+
+ONLY_FILLED = f"Only filled markers are evidence: {SIGNAL}"
+DOTS = f"Dots mark evidence: {SIGNAL}"
 
 
 @dataclass(frozen=True)
@@ -193,7 +197,7 @@ def _side_by_side(
                 f"curves-side-by-side{_suffix(view, views)}",
                 "Layer curves side by side" + (f", view {view}" * (len(views) > 1)), "probes",
                 "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
-                "on one scale; of several iterations the best of every layer. Only filled markers are evidence. "
+                f"on one scale; of several iterations the best of every layer. {ONLY_FILLED}. "
                 "Bars are 95 % intervals at each line's best layer; the table says whether two runs differ.",
                 None, partial(curves_side_by_side, known, called, view, iterations),
             )
@@ -204,7 +208,7 @@ def _side_by_side(
                     f"maps-side-by-side{_suffix(view, views)}",
                     "Layer × iteration side by side" + (f", view {view}" * (len(views) > 1)), "probes",
                     "Where and when the answer can be read while the action is made, a column per run. Colours "
-                    "run from chance to 100 % in every map. Dots mark what is above chance.",
+                    f"run from chance to 100 % in every map. {DOTS}.",
                     None, partial(maps_side_by_side, known, called, view),
                 )
             )  # fmt: skip
@@ -274,8 +278,8 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
             f"{name}-layer-curves{_suffix(view, views)}", "Layer curves" + (f", view {view}" * (len(views) > 1)),
             "probes",
             "How often a linear probe names the side of the correct picture in episodes it has not seen, layer by "
-            "layer; the part that makes the action has a line per iteration. Only filled markers are evidence: "
-            "they beat the best layer of relabelled data. The grey band is what no knowledge looks like; a caret "
+            f"layer; the part that makes the action has a line per iteration. {ONLY_FILLED}, against the best "
+            "layer of relabelled data. The grey band is what no knowledge looks like; a caret "
             "marks the best layer, or all that tie.",
             position, partial(layer_curve, results, view, iterations),
         )
@@ -287,7 +291,7 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
             f"{name}-iteration-maps{_suffix(view, views)}",
             "Layer × iteration" + (f", view {view}" * (len(views) > 1)), "probes",
             "The action is made in several iterations (flow-matching steps or action tokens). Dark cells: "
-            "the answer can be read at that layer and iteration. Dots mark what is above chance.",
+            f"the answer can be read at that layer and iteration. {DOTS}.",
             position, partial(iteration_maps, results, view, stream),
         )
         for view in views
@@ -362,8 +366,8 @@ def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -
         Exhibit(
             f"{name}-calls{_suffix(view, views)}", "Over the episode" + (f", view {view}" * (len(views) > 1)),
             "probes",
-            "The best site of each part at every inference that was captured, counted from 0. Filled markers are "
-            "evidence; dotted: what the best site of relabelled data stays below. An answer that is not there at "
+            f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
+            "dotted: what the best site of relabelled data stays below. An answer that is not there at "
             "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
             position, partial(call_curves, calls, view, events),
         )

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 class IterationMapDisplay(Shown):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
-    accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream.
-    layers, iterations: the numbers along both sides, (L,) and (I,). Colours run from chance to 100 % in every map
-    of every run.
+    accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream, and
+    above the controls that were run. layers, iterations: the numbers along both sides, (L,) and (I,). Colours run
+    from chance to 100 % in every map of every run.
     """
 
     category: str

@@ -106,7 +106,10 @@ GLOSSARY = MappingProxyType(
         ),
         "gap": "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
         "groups": "Independent groups of questions; questions that share a picture count once.",
-        "n/a": "The backbone itself is not above chance, so there is nothing that could be retained.",
+        "n/a": (
+            "The backbone's best layer does not beat chance and every control that was run, so there is nothing "
+            "that could be retained."
+        ),
         "A − B": (
             "Difference of two runs on the same questions: of both the same groups of questions are drawn, over "
             "and over, and the interval holds 95 % of what that gives. Zero inside it: they may be equal."

@@ -113,7 +113,8 @@ def _knowledge(rows: Sequence[RetentionRow]) -> str:
 def _judge(rows: Sequence[RetentionRow]) -> str:
     """What had to be beaten."""
     names = [name for name in ("binding", "twin") if any(row.prefix_beats.get(name) is not None for row in rows)]
-    return f"chance, {' and '.join(names)}" if names else "chance (no control was run)"
+    *first, last = ["chance", *names]
+    return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
 
 
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
@@ -193,8 +194,8 @@ def _clear_words(p: float | None, beats: Beats) -> str:
         return "not tested, for lack of relabellings"
     controls = {"binding": "an untrained conjunction of pictures and words", "twin": "its twin"}
     equals = [words for name, words in controls.items() if beats.get(name) is False]
-    clear = "above chance" if p < SIGNIFICANCE else "not above chance"
-    return f"{clear}{f' but no better than {" and ".join(equals)}' if equals else ''}, p = {p:.3f}"
+    clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
+    return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"
 
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
