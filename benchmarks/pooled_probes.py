@@ -5,8 +5,10 @@
 One inner training set on the whole grid of C and one outer set at the C that was chosen are timed (`--folds`: as
 many of each as outer folds), in processor time and on one thread, and scaled to the 20 and 5 of a site. Work is
 counted as it is done: a product of N samples in R coordinates with k columns is 2·N·R·k, whole Hessians are
-2·N·R²·k, and coordinates 2·N·D² for moments and again for turning; the eigenvectors of D × D, about 9·D³, are
-shown apart and are no part of the share. The rate is that of square products, 2,048 wide, in the same process.
+2·N·R²·k. Coordinates are N·D² for moments, of which one half is computed, and 2·N·D² for turning training samples,
+as much for every test sample; where eigenvectors are found in float32, D³ in float64 and 2·D³ in float32 make them
+orthogonal again. The eigenvectors of D × D, about 9·D³, are shown apart and are no part of the share. The rate is
+that of square products, 2,048 wide, in the same process.
 """
 
 import argparse
@@ -23,6 +25,7 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from probe_kit.train import probe
+from probe_kit.train.axes import WORTH_NARROWING
 from probe_kit.train.design import DenseDesign
 from probe_kit.train.features import Coordinates
 from probe_kit.train.nested import INNER_FOLDS, OUTER_FOLDS, nested_folds
@@ -36,6 +39,9 @@ class Work:
 
     single: float = 0.0
     double: float = 0.0
+
+    def __sub__(self, other: "Work") -> "Work":
+        return Work(self.single - other.single, self.double - other.double)
 
     def add(self, design: DenseDesign, columns: int, inner: int = 1) -> None:
         """A product of the design with so many columns; inner: of so many coordinates each."""
@@ -91,33 +97,53 @@ def main() -> None:
     real, items = labels_of(asked.episodes)
     labels = np.column_stack([real, flip_items(real, items, asked.relabellings, seed=0)])
     folds = nested_folds(real, items, seed=0)
-    spent = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}
-    fit, work, setting = Coordinates.fit.__func__, Work(), [0.0]  # type: ignore[attr-defined]
+    spent, done = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}, {"inner": Work(), "outer": Work()}
+    fit, turn, work, setting = Coordinates.fit.__func__, Coordinates.__call__, Work(), Work()  # type: ignore[attr-defined]
+
+    def total() -> Work:
+        return Work(work.single + setting.single, work.double + setting.double)
 
     def timed_fit(cls: type[Coordinates], features: object) -> Coordinates:
         start = time.process_time()
         made: Coordinates = fit(cls, features)
         spent["coordinates"] += time.process_time() - start
         count, width = samples_shape(features)
-        setting[0] += 4 * count * width**2 / 1e9
+        if count >= width >= WORTH_NARROWING:
+            setting.single += 2 * width**3 / 1e9
+            setting.double += (3 * count + width) * width**2 / 1e9
+        else:
+            setting.double += 3 * count * width**2 / 1e9
         return made
+
+    def timed_turn(self: Coordinates, features: NDArray[np.float64]) -> object:
+        start = time.process_time()
+        turned = turn(self, features)
+        spent["coordinates"] += time.process_time() - start
+        setting.double += 2 * len(features) * self.axes.shape[0] * self.axes.shape[1] / 1e9
+        return turned
 
     with (
         threadpool_limits(1),
         patch.multiple(DenseDesign, **counting(work)),
         patch.object(Coordinates, "fit", classmethod(timed_fit)),
+        patch.object(Coordinates, "__call__", timed_turn),
     ):
         single, double = rate(np.float32), rate(np.float64)
         for fold in folds[: asked.folds]:
             start = time.process_time()
             strengths = probe.choose_strengths(samples, labels, fold.inner[:1])
             spent["inner"] += time.process_time() - start
+            done["inner"] = total() - done["outer"]
             start = time.process_time()
             probe._fit_fold(samples, labels, fold.outer, strengths)
             spent["outer"] += time.process_time() - start
+            done["outer"] = total() - done["inner"]
     seconds = spent["inner"] + spent["outer"]
-    bound = work.single / single + (work.double + setting[0]) / double
-    whole = (OUTER_FOLDS * INNER_FOLDS * spent["inner"] + OUTER_FOLDS * spent["outer"]) / asked.folds
+    bound = {part: of.single / single + of.double / double for part, of in done.items()}
+    whole, least = (
+        (OUTER_FOLDS * INNER_FOLDS * of["inner"] + OUTER_FOLDS * of["outer"]) / asked.folds
+        for of in (spent, bound)
+    )
     console.print(f"N = {asked.episodes:,}, D = {asked.width:,}, {labels.shape[1]} label columns")
     console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64")
     console.print(
@@ -126,11 +152,13 @@ def main() -> None:
     )
     console.print(
         f"products: {work.single:.0f} GFLOP in float32, {work.double:.0f} in float64; "
-        f"coordinates {setting[0]:.0f} and eigenvectors about {2 * asked.folds * 9 * asked.width**3 / 1e9:.0f}"
+        f"coordinates {setting.single:.0f} and {setting.double:.0f}, "
+        f"eigenvectors about {2 * asked.folds * 9 * asked.width**3 / 1e9:.0f}"
     )
     console.print(
-        f"{bound / seconds:.0%} of the rate (without eigenvectors, as if float32 paid nothing: "
-        f"{(work.single + work.double + setting[0]) / double / seconds:.0%})"
+        f"{sum(bound.values()) / seconds:.0%} of the rate, {bound['inner'] / spent['inner']:.0%} in the inner set "
+        f"and {least / whole:.0%} of a site (of both sets, as if float32 paid nothing: "
+        f"{(total().single + total().double) / double / seconds:.0%})"
     )
     console.print(
         f"a site, scaled: {whole:.0f} s; {asked.sites} sites: {asked.sites * whole / 3600:.1f} CPU-hours"

@@ -69,10 +69,10 @@ class DenseDesign(_OfAllColumns):
         """(N, R)."""
         return self.samples.shape[0], self.samples.shape[1]
 
-    @property
+    @cached_property
     def spectrum(self) -> Array:
         """(R, 1) squared length of every column."""
-        return namespace(self.samples).square(self.samples).sum(axis=0)[:, None]
+        return namespace(self.samples).einsum("nr,nr->r", self.samples, self.samples)[:, None]
 
     def __matmul__(self, weights: Array) -> Array:
         return self.samples @ weights

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.train.arrays import Array, namespace, to_numpy
+from probe_kit.train.axes import narrow_axes
 from probe_kit.train.nested import NestedFold
 from probe_kit.train.rows import ChosenRows
 from probe_kit.train.samples import Samples
@@ -87,7 +88,7 @@ class JointSite:
             turned[block.rows] = exact
             moments.add(exact, xp.asarray(member[:, block.episode], device=mean.device))
         counts = member @ samples.counts
-        axes, variances = _axes(turned), xp.zeros_like(mean)
+        axes, variances = narrow_axes(_products(turned)), xp.zeros_like(mean)
         for block in blocks:
             turned[block.rows] = turned[block.rows] @ axes
             variances += xp.square(turned[block.rows]).sum(axis=0)
@@ -128,16 +129,10 @@ class _Moments:
         return mean, xp.sqrt((self.squares / size - mean**2).clip(0.0))
 
 
-def _axes(rows: Array) -> Array:
-    """(D, D) principal axes of (M, D) float32: they precondition only, so float32 will do, in half the time."""
-    xp = namespace(rows)
+def _products(rows: Array) -> Array:
+    """(D, D) moments of (M, D) float32: they precondition only, so float32 will do, in half the time."""
     parts = (rows[start : start + ROWS_PER_PRODUCT] for start in range(0, len(rows), ROWS_PER_PRODUCT))
-    products = sum(part.T @ part for part in parts)
-    if not isinstance(products, np.ndarray):
-        return xp.linalg.eigh(products)[1]
-    from scipy.linalg import eigh  # type: ignore[import-untyped]  # numpy's takes as long as in float64
-
-    return eigh(products, driver="evd", overwrite_a=True, check_finite=False)[1]
+    return sum(part.T @ part for part in parts)
 
 
 def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:

@@ -1,11 +1,14 @@
 """Many L2-regularised logistic regressions on the same samples, solved exactly and at once.
 
 The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
-Samples come in principal coordinates (`features.Coordinates`), whose columns are orthogonal: there the
+Samples come in principal coordinates (`features.Coordinates`), whose columns are nearly orthogonal: there the
 Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
-need a few products each, and all label columns share them as matrix–matrix products. Steps through many samples
-are found in float32; whether a solution is accepted is decided by gradients in float64, so that the precision of a
-step shapes the way, never the optimum. numpy arrays or torch tensors: samples on a GPU are solved there.
+need a few products each, and all label columns share them as matrix–matrix products.
+
+Through many samples, products are float32 between two points that are known exactly: decisions and sums there are
+float64, and float32 only adds what changed since. Whether a solution is accepted is decided at an exact point, so
+that the precision of a step shapes the way, never the optimum. numpy arrays or torch tensors: samples on a GPU are
+solved there.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,33 +19,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train.arrays import Array, namespace
+from probe_kit.train.arrays import Array, keep_freed_memory, namespace
+from probe_kit.train.conjugate import newton_steps
 from probe_kit.train.design import Design
 
 MAX_NEWTON_STEPS = 100
-MAX_CG_STEPS = 100
-FINEST = 1e-4
-"""Relative precision of a step beyond which float32 is rounding."""
+MAX_STEPS_BETWEEN = 10
+"""Newton steps by products in float32 from one exact point to the next."""
+COARSEST, FINEST = 0.1, 1e-5
+"""Relative precision of a step: what any is worth, and what is rounding in float32."""
+NEAR = 2e-2
+"""Relative gradient after which one more step in float32 is made, before a point is looked at exactly."""
+GAIN = 1e-5
+"""Share of an exact point's gradient that steps in float32 leave: less would be their rounding."""
+SAFETY = 0.3
+"""Share of the tolerance that they aim at, so that the exact gradient is below it."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where problems, one column each, are, and what is known there.
+
+    weights: (R, K). decisions: (N, K) Z · weights. loss: (K,) of all samples. misfit: (N, K) 1 − P(label).
+    pulled: (R, K) Zᵀ · (signs ∘ misfit).
+    """
+
+    weights: Array
+    decisions: Array
+    loss: Array
+    misfit: Array
+    pulled: Array
+
+    def like(self) -> "_Point":
+        """As many points, of which nothing is known yet."""
+        return _Point(*(namespace(part).empty_like(part) for part in vars(self).values()))
+
+    def only(self, chosen: Array) -> "_Point":
+        """Some of them."""
+        return _Point(*(part[..., chosen] for part in vars(self).values()))
+
+    def put(self, chosen: Array, others: "_Point") -> None:
+        """`others` in the place of some."""
+        for part, other in zip(vars(self).values(), vars(others).values(), strict=True):
+            part[..., chosen] = other
 
 
 @dataclass(frozen=True)
 class _Problems:
-    """Problems still to be solved, one column each: where they are, and the objective there."""
+    """Problems still to be solved, one column each, and where they are."""
 
     samples: Design
     columns: Array
     strength: Array  # (K,)
     rounding: Array  # (K,) gradients as small as this are zero
     signs: Array  # (N, K) labels as −1 and +1
-    weights: Array  # (R, K)
-    decisions: Array  # (N, K)
-    objective: Array  # (K,)
+    at: _Point
 
     def only(self, chosen: Array) -> "_Problems":
+        """Some of them."""
         if chosen.all():
             return self
-        arrays = {name: member[..., chosen] for name, member in vars(self).items() if name != "samples"}
-        return _Problems(self.samples.of(chosen), **arrays)
+        columns, strength, rounding = self.columns[chosen], self.strength[chosen], self.rounding[chosen]
+        return _Problems(
+            self.samples.of(chosen), columns, strength, rounding, self.signs[:, chosen], self.at.only(chosen)
+        )
 
 
 class LogisticSolver:
@@ -56,11 +96,11 @@ class LogisticSolver:
     def __init__(self, samples: Design, tolerance: float = 1e-9) -> None:
         self.samples = samples
         self.tolerance = tolerance
-        self.spectrum = samples.spectrum
-        self.xp = namespace(self.spectrum)
-        self.penalty = self.xp.ones_like(self.spectrum[:, :1])
+        spectrum = samples.spectrum
+        self.xp = namespace(spectrum)
+        self.penalty = self.xp.ones_like(spectrum[:, :1])
         self.penalty[-1] = 0.0
-        self.rounding = 1e-15 * (self.spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
+        self.rounding = 1e-15 * (spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
 
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
         """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
@@ -69,49 +109,42 @@ class LogisticSolver:
         TooFewGroupsError for a column with a single class, which has no optimum.
         """
         refuse_single_class(labels)
-        signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.spectrum.device) - 1.0
+        signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.penalty.device) - 1.0
         yield from self.path_of_signs(signs, strengths)
 
     def path_of_signs(self, signs: Array, strengths: Iterable[float | Array]) -> Iterator[Array]:
-        """`path` for labels as −1 and +1, (N, K); a sample with 0 is none."""
+        """`path` for labels as −1 and +1, (N, K); a sample with 0 is none. A C may be (K,), one per column."""
+        if self._narrow is not self.samples:
+            keep_freed_memory()
         shape = self.samples.shape[1], signs.shape[1]
         weights = self.xp.zeros(shape, dtype=signs.dtype, device=signs.device)
+        at = self._point(self.samples, signs, weights, self.xp.zeros_like(signs))
         for strength in strengths:
-            weights = self.solve(signs, strength, weights)
-            yield weights
+            at = self._solved(signs, strength, at)
+            yield at.weights
 
-    def solve(self, signs: Array, strength: float | Array, start: Array) -> Array:
-        """Optimal weights (R, K) of labels −1/+1 (N, K), found from `start` (R, K).
-
-        strength: C of all, or (K,) of every column.
-        """
+    def _solved(self, signs: Array, strength: float | Array, start: _Point) -> _Point:
+        """The optima of labels −1/+1 (N, K), found from points `start` that are known exactly."""
         xp = self.xp
-        solved = xp.empty_like(start)
-        decisions = self.samples @ start
-        each = xp.ones_like(start[-1])
-        objective = self._objective(signs, strength, start, decisions)
+        solved = start.like()
+        each = xp.ones_like(start.weights[-1])
         columns = xp.arange(signs.shape[1], device=signs.device)
-        todo = _Problems(
-            self.samples, columns, each * strength, each * self.rounding, signs, start, decisions, objective
-        )
+        todo = _Problems(self.samples, columns, each * strength, each * self.rounding, signs, start)
         for _ in range(MAX_NEWTON_STEPS):
-            misfit = _sigmoid(-todo.signs * todo.decisions)
-            gradient = self.penalty * todo.weights - todo.strength * todo.samples.gather(todo.signs * misfit)
-            size = xp.linalg.norm(gradient, axis=0)
-            scale = xp.maximum(xp.linalg.norm(todo.weights[:-1], axis=0), size)
-            relative = size / scale.clip(np.finfo(float).tiny)
+            gradient, size, relative = self._gradient(todo)
             # Negated, so that NaN stays open and ends in an error.
             open_ = ~((relative <= self.tolerance) | (size <= todo.rounding * todo.strength))
-            solved[:, todo.columns[~open_]] = todo.weights[:, ~open_]
+            solved.put(todo.columns[~open_], todo.at.only(~open_))
             if not open_.any():
                 return solved
-            todo, misfit, gradient = todo.only(open_), misfit[:, open_], gradient[:, open_]
-            curvature = todo.strength * misfit * (1 - misfit)
-            if todo.samples.small:
-                step = self._exact_newton_steps(todo.samples, gradient, curvature)
+            todo, gradient, relative = todo.only(open_), gradient[:, open_], relative[open_]
+            if self._narrow is self.samples:
+                steps = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
+                todo = replace(todo, at=self._moved(todo, gradient, *steps))
             else:
-                step = self._newton_steps(gradient, curvature, self._precision(relative[open_]))
-            todo = self._moved(todo, gradient, step)
+                weights = self._led_nearer(todo, gradient, relative)
+                exact = self._point(todo.samples, todo.signs, weights, todo.samples @ weights)
+                todo = replace(todo, at=exact)
         raise ProbeNotConvergedError(
             f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
             f"C={todo.strength[0]:g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst "
@@ -119,51 +152,53 @@ class LogisticSolver:
             "Look for extreme feature values."
         )
 
-    def _precision(self, relative: Array) -> Array:
-        """(K,) of a step from points with such gradients: more than the point has, or is asked, is wasted work."""
-        enough = (0.1 * self.tolerance / relative).clip(min=FINEST)
-        return self.xp.maximum(self.xp.sqrt(relative), enough).clip(max=0.1)
+    def _led_nearer(self, todo: _Problems, gradient: Array, relative: Array) -> Array:
+        """(R, K) weights nearer to the optimum, by products in float32 that add to what is known exactly.
 
-    def _newton_steps(self, gradient: Array, curvature: Array, precision: Array) -> Array:
-        """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision`.
-
-        Columns that conjugate gradients do not settle in time are solved exactly.
+        The last step is not looked back at: the exact point does that.
         """
-        xp = self.xp
-        design, exact = self._narrow, (gradient, curvature)
-        penalty, spectrum, gradient, curvature, precision = (
-            xp.asarray(part, dtype=design.spectrum.dtype)
-            for part in (self.penalty, self.spectrum, gradient, curvature, precision)
-        )
-        step = xp.zeros_like(gradient)
-        todo = xp.arange(gradient.shape[1], device=gradient.device)
-        target = precision * xp.linalg.norm(gradient, axis=0)
-        diagonal = penalty + spectrum * curvature.mean(axis=0)
-        rest = -gradient
-        direction = rest / diagonal
-        slope = (rest * direction).sum(axis=0)
-        for _ in range(MAX_CG_STEPS):
-            product = penalty * direction + design.gather(curvature * (design @ direction))
-            length = slope / (direction * product).sum(axis=0)
-            step[:, todo] += length * direction
-            rest = rest - length * product
-            keep = xp.linalg.norm(rest, axis=0) > target[todo]
-            if not keep.any():
-                return xp.asarray(step, dtype=xp.float64)
-            if not keep.all():
-                todo = todo[keep]
-                rest, direction, diagonal, curvature = (
-                    part[:, keep] for part in (rest, direction, diagonal, curvature)
-                )
-                slope = slope[keep]
-            scaled = rest / diagonal
-            previous, slope = slope, (rest * scaled).sum(axis=0)
-            direction = scaled + (slope / previous) * direction
-        step, (gradient, curvature) = xp.asarray(step, dtype=xp.float64), exact
-        for column in todo:  # one after another: all Hessians may be more than the memory holds
+        weights = self.xp.empty_like(todo.at.weights)
+        goal = (GAIN * relative).clip(min=SAFETY * self.tolerance)
+        todo = replace(todo, columns=self.xp.arange(len(relative), device=relative.device))
+        for _ in range(MAX_STEPS_BETWEEN):
+            step, change = self._newton_steps(todo, gradient, relative, goal)
+            far = relative > NEAR
+            weights[:, todo.columns[~far]] = todo.at.weights[:, ~far] + step[:, ~far]
+            if not far.any():
+                return weights
+            todo, goal = todo.only(far), goal[far]
+            if not far.all():
+                gradient, step, change = gradient[:, far], step[:, far], change[:, far]
+            todo = replace(todo, at=self._moved(todo, gradient, step, change))
+            gradient, _, relative = self._gradient(todo)
+        weights[:, todo.columns] = todo.at.weights
+        return weights
+
+    def _gradient(self, todo: _Problems) -> tuple[Array, Array, Array]:
+        """(R, K) of the objective; its norm (K,), and that in units of the weights."""
+        xp, at = self.xp, todo.at
+        gradient = self.penalty * at.weights
+        gradient -= todo.strength * at.pulled
+        size = xp.linalg.norm(gradient, axis=0)
+        scale = xp.maximum(xp.linalg.norm(at.weights[:-1], axis=0), size)
+        return gradient, size, size / scale.clip(np.finfo(float).tiny)
+
+    def _newton_steps(
+        self, todo: _Problems, gradient: Array, relative: Array, goal: Array | float
+    ) -> tuple[Array, Array]:
+        """(R, K) steps, as precise as `goal` asks, the relative gradient that is wanted, and Z · steps, (N, K)."""
+        curvature = todo.strength * todo.at.misfit * (1 - todo.at.misfit)
+        if todo.samples.small:
+            step = self._exact_newton_steps(todo.samples, gradient, curvature)
+            return step, todo.samples @ step
+        # More than the point has, or is asked, is wasted work.
+        precision = self.xp.maximum(relative, (goal / relative).clip(min=FINEST)).clip(max=COARSEST)
+        found = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
+        for column in found.unsettled:  # one after another: all Hessians may be more than the memory holds
             one = gradient[:, column, None], curvature[:, column, None]
-            step[:, column] = self._exact_newton_steps(self.samples, *one)[:, 0]
-        return step
+            found.step[:, column] = self._exact_newton_steps(self.samples, *one)[:, 0]
+            found.change[:, column] = self.samples @ found.step[:, column]
+        return found.step, found.change
 
     @cached_property
     def _narrow(self) -> Design:
@@ -176,24 +211,36 @@ class LogisticSolver:
         hessians[:, diagonal, diagonal] += self.penalty[:, 0]
         return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
-    def _moved(self, todo: _Problems, gradient: Array, step: Array) -> _Problems:
-        """`todo` moved along `step`, which is halved per column until the objective falls enough."""
-        change = todo.samples @ step
-        slope = (gradient * step).sum(axis=0)
+    def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array) -> _Point:
+        """The points along `step`, which is halved per column until the objective falls enough."""
+        here = todo.at
+        value, slope = self._objective(todo.strength, here.weights, here.loss), (gradient * step).sum(axis=0)
         length = self.xp.ones_like(slope)
+        noise = (1e-12 if self._narrow is self.samples else 1e-6) * abs(value)
+        weights, decisions = here.weights + step, here.decisions + change
         while True:
-            weights, decisions = todo.weights + length * step, todo.decisions + length * change
-            objective = self._objective(todo.signs, todo.strength, weights, decisions)
-            bound = todo.objective + 1e-4 * length * slope + 1e-12 * abs(todo.objective)
-            too_far = objective > bound
+            loss, misfit = _losses(todo.signs * decisions)
+            bound = value + 1e-4 * length * slope + noise
+            too_far = self._objective(todo.strength, weights, loss) > bound
             if not too_far.any():
-                return replace(todo, weights=weights, decisions=decisions, objective=objective)
+                break
             length[too_far] /= 2
+            weights, decisions = here.weights + length * step, here.decisions + length * change
+        if self._narrow is self.samples:
+            pulled = todo.samples.gather(todo.signs * misfit)
+        else:
+            narrow = self._narrow
+            more = self.xp.asarray(todo.signs * (misfit - here.misfit), dtype=narrow.spectrum.dtype)
+            pulled = here.pulled + narrow.gather(more)
+        return _Point(weights, decisions, loss, misfit, pulled)
 
-    def _objective(self, signs: Array, strength: float | Array, weights: Array, decisions: Array) -> Array:
-        margins = signs * decisions
-        loss = ((-margins).clip(0.0) + self.xp.log1p(self.xp.exp(-abs(margins)))).sum(axis=0)
-        return strength * loss + 0.5 * (self.penalty * weights * weights).sum(axis=0)
+    def _point(self, samples: Design, signs: Array, weights: Array, decisions: Array) -> _Point:
+        """What is known at `weights`, in float64."""
+        loss, misfit = _losses(signs * decisions)
+        return _Point(weights, decisions, loss, misfit, samples.gather(signs * misfit))
+
+    def _objective(self, strength: Array, weights: Array, loss: Array) -> Array:
+        return strength * loss + 0.5 * self.xp.square(weights[:-1]).sum(axis=0)
 
 
 def refuse_single_class(labels: NDArray[np.bool_]) -> None:
@@ -202,6 +249,12 @@ def refuse_single_class(labels: NDArray[np.bool_]) -> None:
         raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
 
 
-def _sigmoid(values: Array) -> Array:
-    with np.errstate(over="ignore"):  # exp(large) = inf gives the right limit, 0
-        return 1.0 / (1.0 + namespace(values).exp(-values))
+def _losses(margins: Array) -> tuple[Array, Array]:
+    """(K,) sums of log(1 + exp(−m)) over (N, K) margins, and each one's negative slope, 1 − P(label)."""
+    xp = namespace(margins)
+    small = -abs(margins)
+    xp.exp(small, out=small)
+    loss = (xp.log1p(small) + (-margins).clip(0.0)).sum(axis=0)
+    misfit = xp.maximum(small, xp.asarray(margins <= 0, dtype=small.dtype))
+    misfit /= 1.0 + small
+    return loss, misfit

@@ -60,7 +60,7 @@ def test_streamed_probes_decide_as_probes_in_memory() -> None:
 @pytest.mark.usefixtures("small_blocks")
 def test_exact_newton_steps_work_on_streamed_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     (expected,) = LogisticSolver(streamed().train).path(LABELS, np.array([10.0]))
-    monkeypatch.setattr("probe_kit.train.solver.MAX_CG_STEPS", 1)
+    monkeypatch.setattr("probe_kit.train.conjugate.MAX_CG_STEPS", 1)
     (found,) = LogisticSolver(streamed().train).path(LABELS, np.array([10.0]))
     np.testing.assert_allclose(found, expected, atol=1e-8)
 

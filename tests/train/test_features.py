@@ -1,7 +1,12 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+import torch
 
-from probe_kit.train.features import Coordinates, principal_axes
+from probe_kit.train import axes
+from probe_kit.train.axes import principal_axes
+from probe_kit.train.features import Coordinates
 from probe_kit.train.standardiser import Standardiser
 
 
@@ -31,10 +36,30 @@ def test_test_samples_are_scaled_with_training_statistics() -> None:
 @pytest.mark.parametrize("shape", [(20, 50), (50, 20)])
 def test_axes_are_orthonormal_and_lose_nothing_of_the_training_samples(shape: tuple[int, int]) -> None:
     samples = noise(*shape)
-    axes = principal_axes(samples)
-    assert axes.shape == (shape[1], 20)
-    np.testing.assert_allclose(axes.T @ axes, np.eye(20), atol=1e-12)
-    np.testing.assert_allclose(samples @ axes @ axes.T, samples, atol=1e-12)
+    found = principal_axes(samples)
+    assert found.shape == (shape[1], 20)
+    np.testing.assert_allclose(found.T @ found, np.eye(20), atol=1e-12)
+    np.testing.assert_allclose(samples @ found @ found.T, samples, atol=1e-12)
+
+
+@pytest.mark.parametrize("steepness", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("make", [np.asarray, torch.from_numpy])
+def test_many_axes_are_found_in_float32_and_orthogonal_in_float64(
+    steepness: float, make: Callable[[np.ndarray], np.ndarray | torch.Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(axes, "WORTH_NARROWING", 100)
+    monkeypatch.setattr(axes, "LEADING", 8)
+    samples = noise(150, 100) * 100 * np.arange(1.0, 101) ** -steepness
+    found = np.asarray(principal_axes(make(samples)))
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found.T @ found, np.eye(100), atol=1e-10)
+    moments = (samples @ found).T @ (samples @ found)
+    assert (np.diff(np.diag(moments)) > -1.0).all(), "ascending"
+    curved = np.eye(100) + moments  # as of an objective with its penalty
+    scale = np.sqrt(np.diag(curved))
+    spread = np.linalg.eigvalsh(curved / np.outer(scale, scale))
+    assert spread[0] > 0.9
+    assert spread[-1] < 1.1
 
 
 def test_coordinates_of_training_samples_are_uncorrelated() -> None:

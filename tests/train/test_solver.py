@@ -7,7 +7,7 @@ import pytest
 from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train import design, solver
+from probe_kit.train import axes, conjugate, design, solver
 from probe_kit.train.design import DenseDesign, StackedDesign
 from probe_kit.train.features import Coordinates
 from probe_kit.train.probe import STRENGTHS
@@ -30,6 +30,8 @@ def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Pat
     """
     if request.param == "by steps in float32":
         monkeypatch.setattr(design, "WORTH_NARROWING", 0)
+        monkeypatch.setattr(axes, "WORTH_NARROWING", 16)
+        monkeypatch.setattr(axes, "LEADING", 4)
     return beside_another_fold if request.param == "beside another fold" else alone
 
 
@@ -112,7 +114,7 @@ def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
 ) -> None:
     samples = Coordinates.fit(NOISE).train
     (expected,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
-    monkeypatch.setattr(solver, "MAX_CG_STEPS", 1)
+    monkeypatch.setattr(conjugate, "MAX_CG_STEPS", 1)
     (found,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
     np.testing.assert_allclose(found, expected, atol=1e-8)
 
@@ -131,6 +133,29 @@ def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkey
         assert other.dtype == np.float64
         assert (np.linalg.norm(one - other, axis=0) < 1e-7 * np.linalg.norm(one, axis=0)).all()
     assert not exact, "conjugate gradients settle in float32 as they do in float64"
+
+
+def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = Coordinates.fit(NOISE[:, :40]).train
+    labels = GENERATOR.random((90, 5)) < 0.5
+    expected = list(LogisticSolver(samples).path(labels, STRENGTHS))
+    blurred = DenseDesign((samples.samples * (1 + 1e-3 * GENERATOR.random(samples.shape))).astype(np.float32))
+    monkeypatch.setattr(DenseDesign, "narrow", lambda _self: blurred)
+    for one, other in zip(expected, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
+        assert (np.linalg.norm(one - other, axis=0) < 1e-8 * np.linalg.norm(one, axis=0)).all()
+
+
+def test_every_weight_given_back_has_an_exact_gradient_that_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(design, "WORTH_NARROWING", 0)
+    samples = Coordinates.fit(outliers_and_constants()).train.samples
+    labels = GENERATOR.random((90, 20)) < 0.5
+    signs = 2.0 * labels - 1
+    for strength, weights in zip(
+        STRENGTHS, LogisticSolver(DenseDesign(samples)).path(labels, STRENGTHS), strict=True
+    ):
+        misfit = 1 / (1 + np.exp(signs * (samples @ weights)))
+        gradient = np.vstack([weights[:-1], 0 * weights[-1:]]) - strength * samples.T @ (signs * misfit)
+        assert (np.linalg.norm(gradient, axis=0) < 1.1e-9 * np.linalg.norm(weights[:-1], axis=0)).all()
 
 
 def test_an_unfinished_probe_is_an_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
