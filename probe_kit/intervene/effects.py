@@ -7,6 +7,8 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.carried_out import CarriedOut, carried_out
 from probe_kit.intervene.erased import Erasing, erased
@@ -29,6 +31,7 @@ from probe_kit.intervene.stored import (
 )
 from probe_kit.intervene.verdict import Judgement, encoded_in, judgements
 from probe_kit.intervene.weighed import Weighed
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 from probe_kit.train.store import load_results
 
@@ -121,6 +124,7 @@ class Effects:
         return (
             *self._replayed(),
             *self._passed_over(),
+            *self._few_groups(),
             *self._one_step(),
             *self._large_doses(),
             *self._broken_hands(),
@@ -132,6 +136,17 @@ class Effects:
         counts = self.certificate.get("items", {"asked": 0, "played": 0})
         left_out = counts["asked"] - counts["played"]
         return [f"{left_out} of {counts['asked']} items have no twin and were passed over."] if left_out else []
+
+    def _few_groups(self) -> list[str]:
+        if self.attention is not None:
+            return []
+        counts = {category: np.unique(own.groups).size for category, own in self.answers.by_category()}
+        return [
+            f"{category}: with {count} group{'s' * (count != 1)} of items no p can be below {0.5**count:.2g}, so "
+            "that nothing is beyond chance. Play more (--items)."
+            for category, count in counts.items()
+            if 0.5**count >= SIGNIFICANCE
+        ]
 
     def _no_cause(self) -> list[str]:
         if self.attention is None:

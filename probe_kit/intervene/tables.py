@@ -97,9 +97,9 @@ def _cells(row: Following) -> "tuple[Cell, ...]":
 
 
 _CHANGE_LEGEND = (
-    "effect: share of what the whole exchange does, n/a where that is nothing; turned: share of episodes that "
-    "turn to the side they are pushed to, minus those that turn from it; p: family-wise over all changes of the "
-    "category, one-sided; moved: how far tokens were moved, in their own norms"
+    "effect: share of what the whole exchange does, n/a where that is not beyond chance; turned: share of "
+    "episodes that turn to the side they are pushed to, minus those that turn from it; p: family-wise over all "
+    "changes of the category, one-sided; moved: how far tokens were moved, in their own norms"
 )
 
 

@@ -49,7 +49,15 @@ def mine(copy: Run, effects: Effects, tmp_path: Path) -> Run:
 def test_plain_inferences_are_the_runs_bit_for_bit(effects: Effects) -> None:
     check = effects.certificate["replay"]
     assert check == {"episodes": 8, "compared": 8, "equal": 8, "largest_difference": 0.0}
-    assert effects.notes == ()
+
+
+def test_too_few_groups_are_said_to_show_nothing(effects: Effects) -> None:
+    assert len(effects.notes) == 2
+    assert "with 1 group of items no p can be below 0.5, so that nothing is beyond chance" in effects.notes[0]
+    assert all(min(row.p_follows, row.p_against) >= 0.5 for row in effects.rows)
+    enough = replace(effects.answers, groups=np.array([f"g{number}" for number in range(8)]))
+    many = replace(enough, categories=np.full(8, "color"))
+    assert replace(effects, answers=many).notes == ()
 
 
 def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, bench: Bench) -> None:
