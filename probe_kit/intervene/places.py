@@ -33,6 +33,11 @@ class Place:
     @property
     def only_site(self) -> Site:
         """Its one site, where a direction can be found. Raises UnknownSiteError if it has several."""
+        if self.stream == MEMORY_STREAM:
+            raise UnknownSiteError(
+                f"{self.name} is keys and values, of which a run stores no means, so that no direction is found; "
+                "name a place of another stream, such as backbone.02"
+            )
         if len(self.sites) != 1:
             raise UnknownSiteError(
                 f"{self.name} is {len(self.sites)} sites, each with directions of its own; name one, such as "

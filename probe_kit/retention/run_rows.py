@@ -106,6 +106,10 @@ def _row(
             _kept(retention),
             probed.background(success),
         ]
+    elif results is not None:
+        parts.append(
+            Kept(retention_note=f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})")
+        )
     return Drawn(RetentionRow.of(category, view, group, *parts), estimates, None if success is None else episodes)
 
 

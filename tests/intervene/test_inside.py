@@ -206,6 +206,9 @@ def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
     assert len(every.sites) == twin.streams["expert"].iterations
     with pytest.raises(UnknownSiteError, match="each with directions of its own"):
         _ = every.only_site
+    (memory,) = places("memory.02", twin)
+    with pytest.raises(UnknownSiteError, match="no direction is found; name a place of another stream"):
+        _ = memory.only_site
 
 
 @pytest.mark.parametrize("pattern", ["backbone.9", "backbone.00@1", "expert.01@9-12", "brain.01", "backbone", ""])

@@ -25,7 +25,9 @@ from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.provenance import citation
 from probe_kit.retention.report.readings import _clear_words, summarise
 from probe_kit.retention.report.tables import behaviour_table, control_table, retention_table
-from probe_kit.train import ArrayRun
+from probe_kit.train import ArrayRun, load_results
+from probe_kit.train.controls import Controls
+from probe_kit.train.store import save_results
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
@@ -116,7 +118,9 @@ import sys
 from pathlib import Path
 import pandas as pd
 from probe_kit.retention.report import write_report
-from probe_kit.train import ArrayRun
+from probe_kit.train import ArrayRun, load_results
+from probe_kit.train.controls import Controls
+from probe_kit.train.store import save_results
 episodes = pd.read_json({str(tmp_path / "episodes.json")!r})
 write_report([ArrayRun(Path({str(tmp_path)!r}), "pi0", "suite", episodes, {{}})], {str(tmp_path / "r.html")!r})
 print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])
@@ -174,7 +178,7 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
     words = " ".join(summary.sentences)
     assert "60.0 % of episodes" in words
     assert "in the backbone in 2 of 3 categories (all but shape)" in words
-    assert "1 left out" in words
+    assert "1 left out: no backbone signal)" in words
     assert [headline.value for headline in summary.headlines[:2]] == ["60.0 %", "77.3 %"]
     assert "120 of 200 episodes" in dict(summary.by_category)["color"]
     assert "not above chance" in dict(summary.by_category)["shape"]
@@ -186,6 +190,25 @@ def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_b
     assert _clear_words(0.01, beats) == f"above chance but no better than {both}, p = 0.010"
     assert _clear_words(0.6, beats | {"chance": False}) == f"not above chance nor better than {both}, p = 0.600"
     assert _clear_words(0.6, {"chance": False, "binding": None}) == "not above chance, p = 0.600"
+
+
+def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: ProbedRun) -> None:
+    """Categories that were not probed lack no signal, and neither do those that nothing was relabelled for."""
+    run = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    results = load_results(run)
+    only = replace(results.settings, categories=("color",), seed=1)
+    curves = {place: curve for place, curve in results.curves.items() if place[0] == "color"}
+    some = replace(results, settings=only, curves=curves, controls=Controls())
+    save_results(some, run.path)
+    table = retention([run])
+    note = {row.category: row.retention_note for row in table.rows}
+    assert note["shape"] == f"n/a (probes {some.key} are of color)"
+    assert f"1 left out: probes {some.key} are of color)" in " ".join(summarise(table.all_rows).sentences)
+    untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
+    save_results(replace(results, settings=replace(results.settings, seed=2), curves=untested), run.path)
+    summary = summarise(retention([run]).all_rows)
+    assert "Retention is not defined: no permutations." in summary.sentences
+    assert summary.headlines[-1].gloss == "no permutations"
 
 
 def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: ProbedRun) -> None:

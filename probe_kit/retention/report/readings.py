@@ -43,14 +43,14 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
         name=model_name(mean).replace(" (random weights)", ""),
         view=mean.view,
         random_weights=mean.random_weights,
-        headlines=tuple(_headlines(mean)),
+        headlines=tuple(_headlines(mean, single)),
         sentences=tuple(_sentences(mean, single)),
         warnings=tuple(_warnings(mean, single)),
         by_category=tuple((spell(row.category), " ".join(read_row(row))) for row in single),
     )
 
 
-def _headlines(mean: RetentionRow) -> list[Headline]:
+def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
     rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
     found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
     if mean.prefix_accuracy is not None:
@@ -60,13 +60,13 @@ def _headlines(mean: RetentionRow) -> list[Headline]:
             Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
         )
     if mean.prefix_accuracy is not None and mean.action_accuracy is not None:
-        found.append(_retention_headline(mean))
+        found.append(_retention_headline(mean, rows))
     return found
 
 
-def _retention_headline(mean: RetentionRow) -> Headline:
+def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
     if not mean.retention_defined or mean.retention_bounded is None:
-        return Headline("n/a", "retention", "no backbone signal to retain")
+        return Headline("n/a", "retention", _why_not(rows))
     return Headline(f"{mean.retention_bounded:.2f}", "retention, bounded", _interval_words(mean))
 
 
@@ -120,12 +120,18 @@ def _judge(rows: Sequence[RetentionRow]) -> str:
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
     counted = [row for row in rows if row.retention_defined]
     if not counted or mean.retention_bounded is None:
-        return "Retention is not defined: where the backbone knows no more than the controls, nothing is retained."
-    left = f" ({len(mean.left_out)} left out for lack of a backbone signal)" if mean.left_out else ""
+        return f"Retention is not defined: {_why_not(rows)}."
+    left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
     return (
         f"Of what can be read in the backbone above chance, a share of {mean.retention_bounded:.2f} can still be "
         f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
     )
+
+
+def _why_not(rows: Sequence[RetentionRow]) -> str:
+    """What keeps categories from having a retention, each reason once."""
+    notes = [row.retention_note for row in rows if not row.retention_defined]
+    return "; ".join(dict.fromkeys(note.removeprefix("n/a (").removesuffix(")") for note in notes))
 
 
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
