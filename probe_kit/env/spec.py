@@ -263,7 +263,7 @@ class SceneSpec:
         """The record that `to_json` wrote, as a run stores it.
 
         files: by field, where the files lie that it names by their hash. Raises SceneError if one is not given or
-        holds something else, and for a field of another version.
+        holds something else, for one that it was made without, and for a field of another version.
         """
         parts = {"camera": CameraSpec, "light": LightSpec, "physics": PhysicsSpec, "limits": LimitSpec}
         unknown = sorted(set(values) - set(cls.__dataclass_fields__))
@@ -273,9 +273,12 @@ class SceneSpec:
                 "version that wrote it"
             )
         given: dict[str, Any] = {name: _as_tuple(value) for name, value in values.items()}
-        for name in ("arm_urdf", "background"):
-            if given.get(name) is not None:
-                given[name] = _file_of(name, str(given[name]), files)
+        named = [name for name in ("arm_urdf", "background") if given.get(name) is not None]
+        if without := sorted(set(files) - set(named)):
+            there = ", ".join(named) or "none"
+            raise SceneError(f"the scene was made without a file as {without[0]}; it has {there}. Leave it out")
+        for name in named:
+            given[name] = _file_of(name, str(given[name]), files)
         given |= {name: part(**_as_tuples(values[name])) for name, part in parts.items() if name in values}
         return cls(**given)
 

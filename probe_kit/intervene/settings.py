@@ -92,10 +92,10 @@ def refuse_unfit(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
     why = None
-    if run.weights_sha256 is None or not run.streams:
-        why = f"{run.model} is scripted: it has no network in which anything could be changed"
-    elif "ask" in settings:
+    if "ask" in settings:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
+    elif run.weights_sha256 is None or not run.streams:
+        why = f"{run.model} is scripted: it has no network in which anything could be changed"
     elif run.listened:
         why = f"{run.model} was only listened to, because its actions cannot move this arm"
     elif settings.get("edits"):

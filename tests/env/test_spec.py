@@ -150,6 +150,10 @@ def test_a_scene_with_a_file_needs_that_file_again(tmp_path: Path) -> None:
         SceneSpec.from_json(stored)
     with pytest.raises(SceneError, match="Give that file"):
         SceneSpec.from_json(stored, {"background": other})
+    with pytest.raises(SceneError, match="made without a file as arm_urdf; it has background"):
+        SceneSpec.from_json(stored, {"background": photo, "arm_urdf": photo})
+    with pytest.raises(SceneError, match="made without a file as background; it has none"):
+        SceneSpec.from_json(SceneSpec().to_json(), {"background": photo})
 
 
 def test_a_scene_of_a_later_version_is_refused() -> None:
