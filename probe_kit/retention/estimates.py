@@ -55,7 +55,7 @@ class Estimate:
         """Of what is paired, unit by unit."""
         value, count = self.value - other.value, min(self.count, other.count)
         if self.units != other.units:
-            return Estimate(value, self.wide - other.wide, self.units, count, bounds=GAINS)
+            return Estimate(value, self.level - other.level, self.units, count, bounds=GAINS)
         each = None if self.each is None or other.each is None else self.each - other.each
         return Estimate(value, self.draws - other.draws, self.units, count, each, GAINS)
 
@@ -73,6 +73,18 @@ class Estimate:
         each, value, wide = each[~np.isnan(each)], np.array([self.value]), self.draws.copy()
         wide[known] = widened(wide[known, None], value, each[:, None], self.units, self.bounds)[:, 0]
         return wide
+
+    @property
+    def level(self) -> NDArray[np.float64]:
+        """`wide`, with its mean at the value, to be added up with others.
+
+        Where units agree at a bound all that nobody has seen lies on one side. For one number that is an interval;
+        of twelve it would be an average that lies beside their average.
+        """
+        if self.each is None:
+            return self.wide
+        known = ~np.isnan(self.draws)
+        return self.wide - (float(self.wide[known].mean()) - self.value if known.any() else 0.0)
 
     @property
     def centred(self) -> "Estimate":
@@ -107,7 +119,9 @@ def average(estimates: Sequence[Estimate]) -> Estimate:
     if len(units) == 1 and len(each) == len(estimates):
         draws = np.mean([estimate.draws for estimate in estimates], axis=0)
         return Estimate(value, draws, units[0], count, np.mean(each, axis=0), estimates[0].bounds)
-    draws = np.mean([estimate.wide for estimate in estimates], axis=0)
+    draws = np.mean([estimate.level for estimate in estimates], axis=0)
+    if len(each) == len(estimates):
+        draws = draws.clip(*estimates[0].bounds)
     return Estimate(value, draws, units[0] if len(units) == 1 else derive_seed(*units), count)
 
 

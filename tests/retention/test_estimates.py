@@ -139,3 +139,23 @@ def test_centring_keeps_draws_without_meaning() -> None:
     draws = np.array([np.nan] * 100 + [1.0] * 900)
     assert Estimate(2.0, draws, 0).centred.ci == (None, None)
     assert np.isnan(Estimate(2.0, draws, 0).centred.draws).sum() == 100
+
+
+@pytest.mark.parametrize("right", [0.99, 0.95, 0.8])
+def test_a_mean_of_categories_that_are_nearly_perfect_covers_the_truth(right: float) -> None:
+    """What nobody has seen of twelve of them lies on one side of each, and not beside their mean."""
+    generator, groups, covered = np.random.default_rng(0), np.arange(24) // 2, []
+    for world in range(60):
+        parts = []
+        for category in range(12):
+            hits = generator.random(12) < right
+            outcome = np.where(hits[groups], "correct", "wrong")
+            table = pd.DataFrame({"item_id": groups.astype(str), "outcome": outcome})
+            parts.append(sr_estimate(table, f"{world} {category}"))
+        mean = average(parts)
+        low, high = mean.ci
+        assert low is not None
+        assert high is not None
+        assert 0 <= low <= mean.value <= high <= 1
+        covered.append(low <= right <= high)
+    assert np.mean(covered) >= 0.9
