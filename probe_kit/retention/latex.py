@@ -141,6 +141,11 @@ def escape(text: str) -> str:
     return "".join(_SPECIAL.get(character, character) for character in text)
 
 
+def _heading(text: str) -> str:
+    """With a capital, and percent close to its number."""
+    return escape(text[:1].upper() + text[1:]).replace(r" \%", r"\,\%")
+
+
 _Column = tuple[str, Callable[[RetentionRow], str], str]
 _COLUMNS: list[_Column] = [
     ("Model", model_name, "l"),
@@ -159,14 +164,14 @@ _COLUMNS: list[_Column] = [
     ("First it.", first_iteration, "r"),
     ("Prefix beats", beats, "l"),
     (r"Retention, bounded [95\,\%]", retention_value, "l"),
-    *((escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FURTHER_RETENTION),
+    *((_heading(heading), cell, "l") for heading, cell in FURTHER_RETENTION),
 ]
 """Heading in LaTeX, content as text, alignment."""
 
 
 def _columns(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[_Column]:
     """Behind the SR, tests of differences and what interventions say, as far as there are any."""
-    more = [(escape(heading[:1].upper() + heading[1:]), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
+    more = [(_heading(heading), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
     place = next(number for number, column in enumerate(_COLUMNS) if column[1] is DIFFERENCE_TEST[1]) + 1
     columns = [*_COLUMNS[:place], *(more if followed(rows) else []), *_COLUMNS[place:]]
     return [column for column in columns if differences or column[1] is not DIFFERENCE_TEST[1]]

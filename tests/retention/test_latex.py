@@ -15,6 +15,7 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
 
 def test_text_is_escaped_and_only_defined_retention_is_coloured(table: RetentionTable) -> None:
     text = table.to_latex()
+    assert r"[95 \%]" not in text, "percent stands close to its number in every heading"
     lines = {line.split(" & ")[3]: line for line in text.splitlines() if line.startswith("pi0-tiny (random")}
     row = table.rows[0]
     assert row.retention_bounded is not None
