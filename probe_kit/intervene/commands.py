@@ -116,7 +116,8 @@ def intervene(
     from probe_kit.hooks.options import read_pairs
     from probe_kit.intervene import Source, intervene_on
     from probe_kit.intervene.intervening import refuse_unsupported
-    from probe_kit.intervene.settings import readout_of, refuse_unfit
+    from probe_kit.intervene.settings import key_of, readout_of, refuse_unfit, settings_of
+    from probe_kit.intervene.stored import is_stored
 
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
@@ -136,11 +137,14 @@ def intervene(
     asked.chosen(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
     source = Source(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
+    is_there = is_stored(opened.location, key_of(settings_of(asked, opened)))
     with progress() as bar:
         learning = counter(bar, "items learnt from") if asked.learns else None
         replayed = counter(bar, "items replayed")
         effects = intervene_on(opened, asked, source, progress=replayed, learning=learning)
     _show(effects, style)
+    if is_there:
+        say("read back: it was stored, so that no policy, suite or device was looked for")
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", effects.key, run))
 
 

@@ -50,6 +50,12 @@ def test_the_table_says_what_follows(run: Run) -> None:
     assert "47 of 48 plain inferences" in said
 
 
+def test_what_was_stored_is_said_to_be_read_back_whatever_policy_was_named(run: Run) -> None:
+    code, _, said = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
+    assert code == 0
+    assert "read back: it was stored, so that no policy, suite or device was looked for" in " ".join(said.split())
+
+
 def test_json_holds_settings_and_effects(run: Run) -> None:
     code, shown, _ = ask(run, "--format", "json")
     found = json.loads(shown)
