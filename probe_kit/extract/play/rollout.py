@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.play.controllers import ActingController, Turn
-from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Ending
+from probe_kit.extract.play.stage import EPISODE_ERRORS, AskableStage, Ending, Question
 from probe_kit.extract.play.staging import EpisodeBuffers, Ring
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
@@ -52,22 +52,30 @@ class Failure:
 
 
 class Seat:
-    """One place in a batch: a stage and the episode on it, if any."""
+    """One place in a batch: a stage and the episode on it, if any.
+
+    following: what its stage begins by itself when the episode ends, while the policy thinks for others.
+    ahead: whether it has so begun the episode that is on.
+    """
 
     def __init__(self, stage: AskableStage) -> None:
         self.stage = stage
         self.planned: PlannedEpisode | None = None
+        self.following: PlannedEpisode | None = None
+        self.ahead = False
         self.seen: Observation | None = None
         self.calls = 0
         self.flagged: int | None = None
         self.instruction_ids: Sequence[int] | None = None
         self.past: list[NDArray[np.float32]] = []
 
-    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, film: bool) -> None:
-        """Begin an episode."""
+    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: Question | None) -> None:
+        """Take an episode up; begin: the question that begins it, None if the stage does so already."""
         self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
         self.flagged, self.instruction_ids, self.past = None, None, []
-        self.stage.ask("begin", planned, film)
+        self.ahead = begin is None
+        if begin is not None:
+            self.stage.ask(begin[0], *begin[1])
 
     def turn(self) -> Turn:
         """The inference that is due."""
@@ -75,19 +83,19 @@ class Seat:
         assert self.seen is not None
         return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
 
-    def go_on(self, actions: NDArray[np.float32], flagged: bool | None) -> None:
+    def go_on(self, actions: NDArray[np.float32], flagged: bool | None, then: Question | None) -> None:
         """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""
         self.seen = None
         self.calls += 1
         if flagged is not None:
             self.flagged = (self.flagged or 0) + flagged
-        self.stage.ask("advance", actions)
+        self.stage.ask("advance", actions, then=then)
 
-    def hear_out(self) -> None:
+    def hear_out(self, then: Question | None) -> None:
         """The model was heard; the episode ends before anything moves."""
         self.seen = None
         self.calls += 1
-        self.stage.ask("dismiss")
+        self.stage.ask("dismiss", then=then)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -125,17 +133,31 @@ class Play:
                 yield from self._settle(group)
                 yield from self._infer(group)
 
-    def _begin_next(self, seat: Seat) -> None:
-        planned = self._next_episode()
+    def _begin_next(self, seat: Seat, *, ended: bool = False) -> None:
+        """ended: whether the stage came to an end by itself, and so began what follows if it knew of any."""
+        planned, begun = seat.following, ended
+        if planned is None:
+            planned, begun = self._next_episode(), False
+        seat.following = None
         if planned is None:
             seat.leave()
         else:
-            seat.sit(planned, self._ring.take(), self._film(planned))
+            seat.sit(planned, self._ring.take(), None if begun else self._beginning(planned))
+
+    def _beginning(self, planned: PlannedEpisode) -> Question:
+        return "begin", (planned, self._film(planned))
+
+    def _then(self, seat: Seat) -> Question | None:
+        """What the seat's stage is to begin if its episode ends now."""
+        if seat.following is None:
+            seat.following = self._next_episode()
+        return None if seat.following is None else self._beginning(seat.following)
 
     def _settle(self, group: list[Seat]) -> Iterator[Rollout | Failure]:
         """Collect answers until the group can take its turn together.
 
-        If all its episodes ended at once, it begins the next ones during the other group's turn.
+        If all its episodes ended at once, and no stage has begun the next one, that is done during the other
+        group's turn.
         """
         while waiting := [seat for seat in group if seat.planned and not seat.seen]:
             for seat in waiting:
@@ -154,8 +176,8 @@ class Play:
                         seat.planned, outcome, seat.buffers, answer.frames, answer.ends, answer.trajectory,
                         seat.instruction_ids,
                     )  # fmt: skip
-                    self._begin_next(seat)
-            if not any(seat.seen for seat in group):
+                    self._begin_next(seat, ended=True)
+            if not any(seat.seen or (seat.planned and seat.ahead) for seat in group):
                 return
 
     def _infer(self, group: list[Seat]) -> Iterator[Failure]:
@@ -175,9 +197,9 @@ class Play:
         flags = self._controller.flagged
         for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
             if self._controller.listens:
-                seat.hear_out()
+                seat.hear_out(self._then(seat))
             else:
-                seat.go_on(actions, None if flags is None else bool(flags[row]))
+                seat.go_on(actions, None if flags is None else bool(flags[row]), self._then(seat))
 
     def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
         assert seat.planned is not None

@@ -189,11 +189,18 @@ def _record(env: Act2AnswerEnv) -> dict[str, Any]:
     }
 
 
+Question = tuple[str, tuple[Any, ...]]
+"""A method of `Stage` and its arguments."""
+
+
 class AskableStage(Protocol):
     """A stage somewhere: asked first, answered later, so that several can work at a time."""
 
-    def ask(self, method: str, *arguments: Any) -> None:
-        """Start `Stage.begin`, `Stage.advance`, `Stage.dismiss` or `Stage.look`."""
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+        """Start `Stage.begin`, `Stage.advance`, `Stage.dismiss` or `Stage.look`.
+
+        then: what to start at once where that ends the episode, and only there; its answer is the next one.
+        """
 
     def answer(self) -> Answer:
         """What the last question gave; raises what it raised."""
@@ -208,14 +215,16 @@ class LocalStage:
     def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
         self._stage = Stage(scene, script, keep_ends)
 
-    def ask(self, method: str, *arguments: Any) -> None:
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
         """Remember the question."""
-        self._question = method, arguments
+        self._question, self._then = (method, arguments), then
 
     def answer(self) -> Answer:
         """Do the work."""
         method, arguments = self._question
         answer: Answer = getattr(self._stage, method)(*arguments)
+        if self._then is not None and isinstance(answer, Ending):
+            self._question, self._then = self._then, None
         return answer
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 from probe_kit.child import Child
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
-from probe_kit.extract.play.stage import Answer, Stage
+from probe_kit.extract.play.stage import Answer, Ending, Question, Stage
 
 
 class ProcessStage:
@@ -20,10 +20,10 @@ class ProcessStage:
         self._child = Child("probe_kit.extract.play.stage_process:serve")
         self._child.connection.send(self._settings)
 
-    def ask(self, method: str, *arguments: Any) -> None:
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
         """Send the question; the child works while this process goes on."""
         try:
-            self._child.connection.send((method, arguments))
+            self._child.connection.send(((method, arguments), then))
         except (BrokenPipeError, ConnectionResetError):
             return  # `answer` finds out and says so
 
@@ -57,11 +57,19 @@ def serve(connection: Connection) -> None:
         return
     try:
         while True:
-            method, arguments = connection.recv()
-            try:
-                answer: Answer | ProbeKitError = getattr(stage, method)(*arguments)
-            except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
-                answer = error
+            question, then = connection.recv()
+            answer = _answered(stage, question)
             connection.send(answer)
+            if then is not None and isinstance(answer, Ending):
+                connection.send(_answered(stage, then))
     finally:
         stage.close()
+
+
+def _answered(stage: Stage, question: Question) -> Answer | ProbeKitError:
+    method, arguments = question
+    try:
+        answer: Answer = getattr(stage, method)(*arguments)
+    except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
+        return error
+    return answer
