@@ -100,7 +100,7 @@ def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: S
     alone = ExtractSettings(model, suite=suite.folder, scene=SHORT, env_workers=0)
     plain = extract_run(alone, tmp_path / "plain").path
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", model, "--suite", str(suite.folder)]
-    command += ["--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out"]
+    command += ["--scene", "bridge", "--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out"]
     for attempt in range(5):  # on a busy machine a run may end before its worker is killed
         run = tmp_path / f"run-{attempt}"
         process = subprocess.Popen([*command, str(run)], stderr=subprocess.PIPE, text=True)
