@@ -12,6 +12,7 @@ from probe_kit.extract.store.pieces import Pieces
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.registry import known_families
 from probe_kit.intervene.bench import Bench, Progress, Source, open_bench
+from probe_kit.intervene.closed_loop import CELL
 from probe_kit.intervene.conditions import Condition, Intervention, Replayed
 from probe_kit.intervene.effects import Effects, effects_csv, load_effects
 from probe_kit.intervene.follow import Follow
@@ -96,9 +97,11 @@ def _carry_out(
 def _refuse_unplayed_roles(bench: Bench, settings: Mapping[str, Any]) -> None:
     """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it."""
     roles, sites = settings.get("roles"), settings.get("sites")
-    if roles and sites:
-        found = [place.stream for pattern in sites for place in places(pattern, bench.policy)]
-        refuse_unplayed(bench.policy, tuple(dict.fromkeys(found)), roles, ROLES)
+    asked = [(sites, roles)] if roles and sites else []
+    asked += [([pattern], [role]) for pattern, role in (cell.split(CELL) for cell in settings.get("cells", ()))]
+    for patterns, wanted in asked:
+        found = [place.stream for pattern in patterns for place in places(pattern, bench.policy)]
+        refuse_unplayed(bench.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
 
 
 def refuse_unsupported(run: Run, asked: Intervention) -> None:

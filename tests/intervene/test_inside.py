@@ -9,6 +9,7 @@ from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks import Site
 from probe_kit.intervene import (
+    ClosedLoop,
     Effects,
     Erase,
     Interchange,
@@ -84,6 +85,7 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
     for asked in (
         Interchange(categories=("color",), items=1, sites=sites, roles=roles),
         Erase(categories=("color",), items=1, sites=sites[:1], roles=roles),
+        ClosedLoop(categories=("color",), items=1, cells=(f"{sites[0]}|{role}",), direction="none", controls=0),
     ):
         with pytest.raises(UsageError, match=f"plays '{role}'; expected one of all, "):
             intervene_on(copy, asked, source, load=lambda *_: twin)
