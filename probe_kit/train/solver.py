@@ -32,6 +32,8 @@ NEAR = 2e-2
 """Relative gradient after which one more step in float32 is made, before a point is looked at exactly."""
 GAIN = 1e-5
 """Share of an exact point's gradient that steps in float32 leave: less would be their rounding."""
+EXACT = 1e-12
+"""Share of an objective that is rounding in float64."""
 SAFETY = 0.3
 """Share of the tolerance that they aim at, so that the exact gradient is below it."""
 
@@ -139,18 +141,32 @@ class LogisticSolver:
                 return solved
             todo, gradient, relative = todo.only(open_), gradient[:, open_], relative[open_]
             if self._narrow is self.samples:
-                steps = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
-                todo = replace(todo, at=self._moved(todo, gradient, *steps))
+                todo = replace(todo, at=self._stepped(todo, gradient, relative))
             else:
-                weights = self._led_nearer(todo, gradient, relative)
-                exact = self._point(todo.samples, todo.signs, weights, todo.samples @ weights)
-                todo = replace(todo, at=exact)
+                todo = replace(todo, at=self._led(todo, gradient, relative))
         raise ProbeNotConvergedError(
             f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
             f"C={todo.strength[0]:g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst "
             f"relative gradient {relative.max():.1e}, expected at most {self.tolerance:.0e}. "
             "Look for extreme feature values."
         )
+
+    def _led(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+        """Exact points behind steps in float32; where those led astray, behind a single one that was looked at."""
+        weights = self._led_nearer(todo, gradient, relative)
+        led = self._point(todo.samples, todo.signs, weights, todo.samples @ weights)
+        before, after = self._objective(todo.strength, todo.at), self._objective(todo.strength, led)
+        astray = ~(after <= before + EXACT * abs(before))
+        if astray.any():
+            led.put(astray, self._stepped(todo.only(astray), gradient[:, astray], relative[astray]))
+        return led
+
+    def _stepped(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+        """The exact points behind one Newton step."""
+        step, change = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
+        if self._narrow is not self.samples:
+            change = todo.samples @ step
+        return self._moved(todo, gradient, step, change, is_exact=True)
 
     def _led_nearer(self, todo: _Problems, gradient: Array, relative: Array) -> Array:
         """(R, K) weights nearer to the optimum, by products in float32 that add to what is known exactly.
@@ -169,7 +185,7 @@ class LogisticSolver:
             todo, goal = todo.only(far), goal[far]
             if not far.all():
                 gradient, step, change = gradient[:, far], step[:, far], change[:, far]
-            todo = replace(todo, at=self._moved(todo, gradient, step, change))
+            todo = replace(todo, at=self._moved(todo, gradient, step, change, is_exact=False))
             gradient, _, relative = self._gradient(todo)
         weights[:, todo.columns] = todo.at.weights
         return weights
@@ -211,22 +227,25 @@ class LogisticSolver:
         hessians[:, diagonal, diagonal] += self.penalty[:, 0]
         return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
-    def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array) -> _Point:
-        """The points along `step`, which is halved per column until the objective falls enough."""
+    def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
+        """The points along `step`, which is halved per column until the objective falls enough.
+
+        is_exact: whether what is known of them is float64; else float32 adds to what is.
+        """
         here = todo.at
-        value, slope = self._objective(todo.strength, here.weights, here.loss), (gradient * step).sum(axis=0)
+        value, slope = self._objective(todo.strength, here), (gradient * step).sum(axis=0)
         length = self.xp.ones_like(slope)
-        noise = (1e-12 if self._narrow is self.samples else 1e-6) * abs(value)
+        noise = (EXACT if is_exact else 1e-6) * abs(value)
         weights, decisions = here.weights + step, here.decisions + change
         while True:
             loss, misfit = _losses(todo.signs * decisions)
             bound = value + 1e-4 * length * slope + noise
-            too_far = self._objective(todo.strength, weights, loss) > bound
+            too_far = self._value(todo.strength, weights, loss) > bound
             if not too_far.any():
                 break
             length[too_far] /= 2
             weights, decisions = here.weights + length * step, here.decisions + length * change
-        if self._narrow is self.samples:
+        if is_exact:
             pulled = todo.samples.gather(todo.signs * misfit)
         else:
             narrow = self._narrow
@@ -239,7 +258,10 @@ class LogisticSolver:
         loss, misfit = _losses(signs * decisions)
         return _Point(weights, decisions, loss, misfit, samples.gather(signs * misfit))
 
-    def _objective(self, strength: Array, weights: Array, loss: Array) -> Array:
+    def _objective(self, strength: Array, at: _Point) -> Array:
+        return self._value(strength, at.weights, at.loss)
+
+    def _value(self, strength: Array, weights: Array, loss: Array) -> Array:
         return strength * loss + 0.5 * self.xp.square(weights[:-1]).sum(axis=0)
 
 

@@ -135,6 +135,21 @@ def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkey
     assert not exact, "conjugate gradients settle in float32 as they do in float64"
 
 
+@pytest.mark.parametrize("seed", [0, 11, 39])
+def test_steps_that_nobody_looked_back_at_never_go_in_circles(seed: int) -> None:
+    """One enormous sample: guessed wrong it has no curvature, and a whole step is far too long."""
+    features = np.random.default_rng(0).standard_normal((1200, 400))
+    features[0] *= 1e4
+    samples = Coordinates.fit(features.astype(np.float32)).train
+    assert samples.narrow() is not samples
+    labels = np.random.default_rng(seed).random((1200, 12)) < 0.5
+    for strength, weights in zip(STRENGTHS, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
+        signs = 2.0 * labels - 1.0
+        misfit = 1 / (1 + np.exp(np.clip(signs * (samples @ weights), -700, 700)))
+        gradient = np.vstack([weights[:-1], 0 * weights[-1:]]) - strength * samples.gather(signs * misfit)
+        assert (np.linalg.norm(gradient, axis=0) < 1e-6 * np.linalg.norm(weights, axis=0)).all()
+
+
 def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Coordinates.fit(NOISE[:, :40]).train
     labels = GENERATOR.random((90, 5)) < 0.5
