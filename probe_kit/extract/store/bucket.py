@@ -297,7 +297,7 @@ class Bucket(Location):
                 )
             self.write(key, content)  # a store kept a part of it and said that all was well
         self.confirm({key: len(content) for key, content in objects.items() if key != last})
-        self.create(last, objects[last])
+        self.create_record(last, objects[last])
 
     @contextmanager
     def held(self, clear: Callable[[], None]) -> Iterator[None]:

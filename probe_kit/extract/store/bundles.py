@@ -145,7 +145,7 @@ def _write_bundle(
     location.confirm(written)
     stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
     whose = {"key": key, "run": _identity(location)}
-    location.write(f"{home}/{key}/{HEAD}", as_record({**head, **whose, "files": stored}))
+    location.write_record(f"{home}/{key}/{HEAD}", as_record({**head, **whose, "files": stored}))
     for name, (actual, _) in kept.items():
         if named[name][0] != actual:
             location.delete(f"{home}/{key}/{actual}")

@@ -112,7 +112,9 @@ def seal_key(stamp: str) -> str:
 def write_seal(root: Root, stamp: str, sums: Mapping[str, Sum]) -> None:
     """Note the hashes of the columns, which makes them count."""
     objects = {key: one.to_json() for key, one in sums.items()}
-    root.location.write(seal_key(stamp), as_record({"run": root.identity, "stamp": stamp, "objects": objects}))
+    root.location.write_record(
+        seal_key(stamp), as_record({"run": root.identity, "stamp": stamp, "objects": objects})
+    )
 
 
 def _read_seal(root: Root, stamp: str) -> dict[str, Sum] | None:

@@ -44,7 +44,7 @@ def crc32c_of(pieces: Iterable[bytes | memoryview]) -> tuple[int, str]:
 
 def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:
     """Write a record under `key` unless it exists; True if this call wrote it. Exclusive and atomic."""
-    return location.create(key, as_record(content))
+    return location.create_record(key, as_record(content))
 
 
 def write_commit(location: Location, number: int, commit: Commit) -> bool:

@@ -13,6 +13,11 @@ from typing import BinaryIO
 
 from zarr.abc.store import Store
 
+from probe_kit.errors import StoreError
+
+TRIES = 5
+"""Times that a record is written to a store which says that all is well, and holds a part of it."""
+
 
 class Location(ABC):
     """Where a run lies. `str()` gives what the user called it."""
@@ -94,6 +99,31 @@ class Location(ABC):
     @abstractmethod
     def write(self, key: str, content: bytes) -> None:
         """Write an object over whatever is there. Whole or not at all."""
+
+    def create_record(self, key: str, record: bytes) -> bool:
+        """`create`, of what nothing written later confirms: where a store kept a part of it, it is written again.
+
+        Raises StoreError, and leaves nothing, if the store keeps no more of it however often it is asked.
+        """
+        created = self.create(key, record)
+        if created:
+            self._ascertain(key, record)
+        return created
+
+    def write_record(self, key: str, record: bytes) -> None:
+        """`write`, in the same way."""
+        self.write(key, record)
+        self._ascertain(key, record)
+
+    def _ascertain(self, key: str, record: bytes) -> None:
+        for _ in range(TRIES):
+            try:
+                return self.confirm({key: len(record)})
+            except StoreError as error:
+                refused = error
+            self.write(key, record)
+        self.delete(key)
+        raise refused
 
     @abstractmethod
     def delete(self, key: str) -> None:
