@@ -16,9 +16,8 @@ import typer.core
 from probe_kit.commands import demo, doctor
 from probe_kit.console import marked, out, say
 from probe_kit.endings import tell
-from probe_kit.errors import UsageError
 from probe_kit.extract.ask_commands import ask
-from probe_kit.extract.commands import MOVED, extract
+from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
@@ -74,9 +73,6 @@ class Commands(typer.core.TyperGroup):
         try:
             return super().invoke(ctx)
         except PARSE_ERROR as error:
-            option = getattr(error, "option_name", None)
-            if option in MOVED:
-                raise UsageError(f"{option} is now {MOVED[option]}") from None
             raise self._told_where(error, ctx) from None
 
     def _told_where(self, error: Any, ctx: Any) -> Exception:

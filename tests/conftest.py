@@ -1,7 +1,9 @@
 """What several test folders share: golden references where present, the embedded policy, one recorded run."""
 
+import contextlib
 import gc
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,8 +22,10 @@ if TYPE_CHECKING:
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: every core has a worker
 
+CHECKOUT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
-SHARED = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[2] / "shared"))
+SHARED = Path(os.environ.get("PROBE_KIT_SHARED", CHECKOUT.parent / "shared"))
+_CHANGED = pytest.StashKey[str]()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -29,6 +33,13 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests neither read nor fill the user's cache; what one process draws for it, the others find."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PROBE_KIT_CACHE", str(shared_folder(tmp_path_factory) / "cache"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Relative paths of commands, such as the default `runs/`, never lead into the checkout."""
+    with contextlib.chdir(tmp_path_factory.mktemp("working")):
         yield
 
 
@@ -54,6 +65,32 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         if config.option.dist == "no":
             config.option.dist = "loadfile"
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Note what differs from the last commit before a test runs."""
+    if not hasattr(session.config, "workerinput"):
+        session.config.stash[_CHANGED] = _changed_files()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run of the whole suite that leaves files in the checkout."""
+    before = session.config.stash.get(_CHANGED, None)
+    if before is None or session.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    after = _changed_files()
+    if after != before:
+        print(f"\nthe tests changed the checkout; before:\n{before}after:\n{after}")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _changed_files() -> str:
+    """What `git status` lists, or nothing outside a git checkout."""
+    command = ["git", "status", "--porcelain"]
+    try:
+        return subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=False).stdout
+    except FileNotFoundError:
+        return ""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

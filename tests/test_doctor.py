@@ -25,7 +25,7 @@ def test_the_command_agrees_with_what_it_found() -> None:
     findings = {row["subject"]: row for row in json.loads(answer.stdout)}
     subjects = "python processor memory disk simulator renderer policy gpu hub tokenizer"
     assert set(subjects.split()) <= set(findings), answer.stdout + answer.stderr
-    assert {"extra ray", "extra remote", "extra widowx"} <= set(findings)
+    assert {"extra ray", "extra remote", "extra export"} <= set(findings)
     assert all(row["state"] == "ok" or row["advice"] for row in findings.values())
     assert answer.returncode == 0, "the tests run here, so the demo does"
 

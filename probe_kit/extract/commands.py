@@ -16,14 +16,6 @@ if TYPE_CHECKING:
     from probe_kit.suite.ladder import Wording
 
 SCENE = "Scene (recorded with the run)"
-MOVED = {
-    "--unnorm-key": "-M unnorm_key=KEY",
-    "--prompt": "-M prompt=NAME",
-    "--centre-crop": "-M centre_crop=true",
-    "--tokenizer": "-M tokenizer=DIR",
-    "--bits": "-M bits=8",
-}
-"""Options of 0.2 and what they are called now."""
 
 
 def extract(

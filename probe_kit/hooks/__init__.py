@@ -48,7 +48,7 @@ __all__ = [
     "pool",
 ]
 
-# These import torch, which takes seconds; reading a run needs only sites. `PolicyCard` is Card's old name.
+# These import torch, which takes seconds; reading a run needs only sites.
 __getattr__ = lazy_names(
     __name__,
     {
@@ -66,6 +66,5 @@ __getattr__ = lazy_names(
         "edit": "capture_context",
         "Roles": "roles",
         "pool": "roles",
-        "PolicyCard": "card:Card",
     },
 )

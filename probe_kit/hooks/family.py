@@ -81,7 +81,7 @@ class Family:
         for option in self.options:
             if not isinstance(option, Option):
                 raise UsageError(
-                    f"the family {self.name} declares its option as {option!r}; since 0.3 options have a type and "
+                    f"the family {self.name} declares its option as {option!r}; an option has a type and "
                     f"help: Option({str(option)!r}, str, 'what it does') from probe_kit.hooks"
                 )
         if self.sizes:

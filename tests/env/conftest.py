@@ -22,7 +22,7 @@ def shared_env() -> Iterator[Act2AnswerEnv]:
 
 @pytest.fixture(scope="session", params=ARMS)
 def arm_env(request: pytest.FixtureRequest) -> Iterator[Act2AnswerEnv]:
-    """The default scene with each arm in turn; the WidowX needs the extra `widowx`."""
+    """The default scene with each arm in turn."""
     if request.param == "widowx":
         pytest.importorskip("rtbdata")
     env = Act2AnswerEnv(SceneSpec(arm=request.param))

@@ -129,7 +129,6 @@ def test_protocols_that_are_not_there_are_refused() -> None:
 
 def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite: Suite, tmp_path: Path) -> None:
     """A tiny checkpoint of the protocol's kind, in the protocol's scene; two actions instead of eighty."""
-    pytest.importorskip("rtbdata", reason="the extra widowx is not installed")
     settings = ExtractSettings(
         "pi0", str(write_intact(tmp_path / "pi0")), options={"statistics": "bridge"}, protocol="act2answer",
         dtype="float32", suite=small_suite.folder, categories=("color",), items=2,

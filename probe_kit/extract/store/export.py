@@ -68,7 +68,8 @@ def _episodes(run: Run) -> dict[str, list[Any]]:
 
 
 def _write_h5(run: Run, out: Path) -> None:
-    h5py = require("h5py", "export")
+    import h5py  # loads its C library, which only this format needs
+
     with h5py.File(out, "w") as file:
         file.attrs["settings"] = json.dumps(run.settings)
         for stream, kind, rows in _arrays(run):

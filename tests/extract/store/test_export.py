@@ -66,6 +66,6 @@ def test_unknown_formats_and_existing_files_are_refused(recorded_run: Run, tmp_p
 
 
 def test_a_missing_library_is_named(recorded_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(MissingExtraError, match="h5py"):
-        export_run(recorded_run.path, "h5", tmp_path / "run.h5")
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(MissingExtraError, match="pyarrow"):
+        export_run(recorded_run.path, "parquet", tmp_path / "run.parquet")
