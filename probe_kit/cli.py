@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from probe_kit.commands import demo, doctor
+from probe_kit.commands import demo
 from probe_kit.console import marked, out, say
+from probe_kit.doctor_command import doctor
 from probe_kit.endings import tell
 from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import extract

@@ -1,14 +1,11 @@
-"""`probe-kit demo` and `probe-kit doctor`, which belong to no package."""
+"""`probe-kit demo`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from probe_kit.console import counter, err, marked, out, print_json, progress
-
-if TYPE_CHECKING:
-    from probe_kit.doctor import Finding
+from probe_kit.console import counter, out, progress
 
 
 def demo(
@@ -44,34 +41,3 @@ def demo(
     out.print(made.story.to_rich())
     out.print(made.table.to_rich())
     out.print(made.next_steps(), soft_wrap=True)
-
-
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
-) -> None:
-    """Say what works on this machine, and what to do about the rest; exit 1 if the demo could not run."""
-    from probe_kit.doctor import examine
-
-    with err.status("looking around"):
-        findings = examine()
-    if as_json:
-        print_json([finding.to_json() for finding in findings])
-    else:
-        _print_findings(findings)
-    raise typer.Exit(1 if any(finding.state == "missing" for finding in findings) else 0)
-
-
-def _print_findings(findings: "list[Finding]") -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    colours = {"ok": "green", "note": "yellow", "missing": "red"}
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        advice = marked("\n[dim]{}[/]", finding.advice) if finding.advice else ""
-        mark = marked(f"[{colours[finding.state]}]{{}}[/]", finding.state)
-        table.add_row(mark, finding.subject, Text.assemble(finding.seen, advice))
-    out.print(table)

@@ -9,8 +9,9 @@ from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.intervene.bench import Bench, Source
+    from probe_kit.intervene.best_targets import best_cells
     from probe_kit.intervene.carried_out import CarriedOut
-    from probe_kit.intervene.closed_loop import ClosedLoop, best_cells
+    from probe_kit.intervene.closed_loop import ClosedLoop
     from probe_kit.intervene.effects import Effects, load_effects
     from probe_kit.intervene.erase import Erase
     from probe_kit.intervene.erased import Erasing
@@ -78,7 +79,7 @@ __getattr__ = lazy_names(
         "Bench": "bench",
         "CarriedOut": "carried_out",
         "ClosedLoop": "closed_loop",
-        "best_cells": "closed_loop",
+        "best_cells": "best_targets",
         "Effects": "effects",
         "Erase": "erase",
         "Erasing": "erased",

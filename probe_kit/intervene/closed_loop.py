@@ -17,16 +17,13 @@ from probe_kit.hooks.sites import Site
 from probe_kit.intervene.bench import Bench
 from probe_kit.intervene.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
 from probe_kit.intervene.directions import MEAN_DIFFERENCE
-from probe_kit.intervene.inside import BACKBONE, stored_passing
 from probe_kit.intervene.interchange import NONE, TakenOver, along, needed
-from probe_kit.intervene.passing import Passing
 from probe_kit.intervene.patching import Kept, Ledger, Tokens, patched
 from probe_kit.intervene.places import ALL, Place, places, token_mask
 from probe_kit.intervene.settings import CHUNK, items_of
 from probe_kit.intervene.stored import PLAIN
 from probe_kit.intervene.tiles import TILES
 from probe_kit.intervene.token_directions import Bases, bases_of, check_direction
-from probe_kit.train.reader import RunReader
 
 CELL = "|"
 KIND = "closed-loop"
@@ -147,31 +144,3 @@ class DoseZero:
             ]
             chunk = bench.act(seen, turn.question.seed)
         return Played(chunk, Ledger.sum(ledgers))
-
-
-def best_cells(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """`PLACE|ROLE`, of each category the last place of the backbone that was located, in its narrowest role.
-
-    The last one is behind everything else through which the answer passes; where none of the backbone was located,
-    the last of what acts or of the memory. Of its roles the one with the largest effect, and all tokens only where
-    no single role carries half of it. Raises UsageError if none was located.
-    """
-    stored = stored_passing(run)
-    found = [_best(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(cell for cell in found if cell is not None))
-    if not cells:
-        raise UsageError(
-            f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
-            "`probe-kit intervene RUN --kind interchange` first, or name --sites and --roles"
-        )
-    return cells
-
-
-def _best(rows: Sequence[Passing]) -> str | None:
-    located = [row for row in rows if row.is_located and not row.direction]
-    if not located:
-        return None
-    deepest = ([row for row in located if row.place.startswith(f"{BACKBONE}.")] or located)[-1]
-    last = [row for row in located if row.place == deepest.place]
-    best = max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
-    return f"{best.place}{CELL}{best.role}"

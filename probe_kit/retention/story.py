@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from probe_kit.intervene.verdict import Verdict
 from probe_kit.retention.cells import model_name, percent
-from probe_kit.retention.displays.style import spell
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
+from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from probe_kit.fitting_tables import FittingTable

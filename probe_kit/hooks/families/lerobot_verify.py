@@ -22,20 +22,6 @@ TOLERANCE = 1e-5
 Arrays = Mapping[str, NDArray[Any]]
 
 
-def verify_pi0(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a pi0 reference."""
-    from probe_kit.hooks.families.pi0.adapter import load_pi0
-
-    return verify_flow(load_pi0, folder, recorded)
-
-
-def verify_smolvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a SmolVLA reference."""
-    from probe_kit.hooks.families.smolvla.adapter import load_smolvla
-
-    return verify_flow(load_smolvla, folder, recorded)
-
-
 def verify_flow(load: Callable[[str], LerobotFlow], folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     """Run the recorded inputs through the adapter and compare everything it can produce.
 

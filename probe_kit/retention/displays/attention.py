@@ -11,7 +11,8 @@ from probe_kit.intervene.places import ALL, TILE_ROLES
 from probe_kit.intervene.weighed import CORRECT, OTHER, Axis, Weighed, stored_attention
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.panelled import Panelled, in_panels
-from probe_kit.retention.displays.style import layer_axis, series, spell
+from probe_kit.retention.displays.style import layer_axis, series
+from probe_kit.retention.text import spell
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from probe_kit.retention.displays.style import (
     panels,
     plain,
     significance_handles,
-    spell,
 )
+from probe_kit.retention.text import spell
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from probe_kit.intervene.places import ALL
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.selection import curve_of, scores_of
-from probe_kit.retention.displays.style import layer_axis, series, spell
+from probe_kit.retention.displays.style import layer_axis, series
+from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 from probe_kit.train.results import ProbeResults

@@ -12,7 +12,8 @@ from probe_kit.intervene.inside import stored_steering
 from probe_kit.intervene.passing import Passing
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.style import GREY, series, spell
+from probe_kit.retention.displays.style import GREY, series
+from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 

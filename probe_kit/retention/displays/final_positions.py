@@ -11,7 +11,8 @@ from probe_kit.env.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOn
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, panels, spell
+from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
+from probe_kit.retention.text import spell
 from probe_kit.train.reader import RunReader
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from probe_kit.retention.displays.style import (
     plain,
     series,
     significance_handles,
-    spell,
 )
 from probe_kit.retention.rows import RetentionRow
 from probe_kit.retention.table import RetentionTable
+from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,9 +17,9 @@ from probe_kit.retention.displays.style import (
     footer,
     legend_above,
     plain,
-    spell,
 )
 from probe_kit.retention.known import KnownUsed
+from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,9 +23,9 @@ from probe_kit.retention.displays.style import (
     mark_below,
     plain,
     significance_handles,
-    spell,
 )
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.text import spell
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:

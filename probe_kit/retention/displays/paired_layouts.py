@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.displays.certificate import Certificate
 from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain, spell
+from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.success import PairedItems, paired_items
+from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.reader import RunReader
 

@@ -21,9 +21,9 @@ from probe_kit.retention.displays.style import (
     plain,
     series,
     significance_handles,
-    spell,
 )
 from probe_kit.retention.measure import Iterations
+from probe_kit.retention.text import spell
 from probe_kit.train.results import ProbeResults
 
 if TYPE_CHECKING:

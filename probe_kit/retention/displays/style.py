@@ -73,11 +73,6 @@ def darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[at : at + 2], 16) * 6 // 10:02X}" for at in (1, 3, 5))
 
 
-def spell(category: str) -> str:
-    """A category's name as people write it."""
-    return category.replace("_", " ")
-
-
 def axes_for(ax: "Axes | None", width: float, height: float) -> "tuple[Axes, Figure | None]":
     """The axes to draw on, and the figure if it was made for them.
 

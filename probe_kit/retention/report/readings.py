@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit.retention.cells import NOT_ACTED, model_name, percent
-from probe_kit.retention.displays.style import spell
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
+from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.controls import Beats
 

@@ -29,7 +29,6 @@ from probe_kit.retention.cells import (
     view_name,
 )
 from probe_kit.retention.differences import Difference
-from probe_kit.retention.displays.style import spell
 from probe_kit.retention.heat import heat_colour
 from probe_kit.retention.lines import (
     Line,
@@ -44,6 +43,7 @@ from probe_kit.retention.plain_tables import PlainTable
 from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.rows import MEAN, RetentionRow
 from probe_kit.retention.success import Regime
+from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 _REGIMES: dict[str | None, str] = {

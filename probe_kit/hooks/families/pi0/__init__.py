@@ -9,7 +9,7 @@ from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.state_layout import OPENNESS
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
-_VERIFIER = "probe_kit.hooks.families.lerobot_verify:verify_pi0"
+_VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
 
 FAMILIES = (
     Family(

@@ -1,9 +1,10 @@
-"""What OpenVLA and Prismatic can be compared in, under the names of their golden references.
+"""What Prismatic models can be compared in, under the names of their golden references.
 
 B batch, P patches, T text tokens, S = P + T positions, L blocks, N output tokens.
 """
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,21 +16,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.hooks.capture_context import Tape, capture
-from probe_kit.hooks.families.openvla.actions import ActionStatistics
-from probe_kit.hooks.families.openvla.adapter import OpenVLA, load_openvla
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, load_prismatic
 from probe_kit.hooks.families.prismatic.verify_asked import verify_asked
 from probe_kit.hooks.sites import Site
 from probe_kit.hooks.verify import Comparison, Produce, compare
-from probe_kit.models.prismatic import PrismaticConfig, prepare_picture
+from probe_kit.models.prismatic import prepare_picture
 
 TOLERANCE = 2e-5
 Arrays = Mapping[str, NDArray[Any]]
-_INPUTS = (
+INPUTS = frozenset({
     "image_uint8", "prompt_ids_without_empty", "attention_mask", "batch_input_ids", "batch_attention_mask",
     "batch_pixel_values",
-)  # fmt: skip
-_ACTION = "action_"
+})  # fmt: skip
+"""What a reference records of what went in, beside the prompt's ids."""
 
 
 def verify_prismatic(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
@@ -38,21 +37,14 @@ def verify_prismatic(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
         return verify_asked(load_prismatic(str(folder / "checkpoint"), dtype="float32"), folder, recorded)
     steps = recorded["generated_ids"].size if "generated_ids" in recorded else 1
     model = load_prismatic(str(folder / "checkpoint"), steps=steps)
-    return _compare(model, recorded, _Reference(model, recorded).produced())
+    prompt: list[int] = recorded["input_ids"].ravel().tolist()
+    return compare_outputs(model, recorded, Reference(model, recorded, prompt).produced(), {*INPUTS, "input_ids"})
 
 
-def verify_openvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a reference of a policy; each recorded `action_<data set>` with that data set's statistics."""
-    checkpoint = folder / "checkpoint"
-    known = PrismaticConfig.from_folder(checkpoint).statistics
-    keys = [key for key in known if _ACTION + key in recorded]
-    policy = load_openvla(str(checkpoint), unnorm_key=next(iter(keys), None))
-    reference = _Reference(policy, recorded)
-    return _compare(policy, recorded, reference.produced() | _actions(policy, reference, keys))
-
-
-def _compare(model: PrismaticModel, recorded: Arrays, produced: Mapping[str, Produce]) -> tuple[Comparison, ...]:
-    inputs = set(_INPUTS) if _makes_prompt(model, recorded) else {*_INPUTS, "input_ids"}
+def compare_outputs(
+    model: PrismaticModel, recorded: Arrays, produced: Mapping[str, Produce], inputs: AbstractSet[str]
+) -> tuple[Comparison, ...]:
+    """Compare everything recorded but `inputs` with what the adapter produced."""
     outputs = {name: values for name, values in recorded.items() if name not in inputs}
     valid: dict[str, NDArray[np.bool_]] = {}
     if "batch_attention_mask" in recorded:
@@ -63,27 +55,14 @@ def _compare(model: PrismaticModel, recorded: Arrays, produced: Mapping[str, Pro
     return compare(outputs, produced, TOLERANCE, valid)
 
 
-def _makes_prompt(model: PrismaticModel, recorded: Arrays) -> bool:
-    """Whether the adapter has something to add to the recorded prompt, rather than only being given it."""
-    return isinstance(model, OpenVLA) and "prompt_ids_without_empty" in recorded
+class Reference:
+    """The recorded inputs, run through the adapter. prompt: ids of its text tokens."""
 
-
-class _Reference:
-    """The recorded inputs, run through the adapter."""
-
-    def __init__(self, model: PrismaticModel, recorded: Arrays) -> None:
-        self.model, self.recorded = model, recorded
-        self.prompt = self._prompt()
+    def __init__(self, model: PrismaticModel, recorded: Arrays, prompt: list[int]) -> None:
+        self.model, self.recorded, self.prompt = model, recorded, prompt
         self.pixels = model.pixel_values([recorded["image_uint8"]])
         with capture(model, [*model.sites(), *model.sites("final_norm")]) as self.tape:
             self.decoded = model.generate(self.pixels, [self.prompt])
-
-    def _prompt(self) -> list[int]:
-        """The recorded ids; where they are recorded without the empty token, the adapter adds it."""
-        if isinstance(self.model, OpenVLA) and _makes_prompt(self.model, self.recorded):
-            return self.model.with_empty_token(self.recorded["prompt_ids_without_empty"].ravel().tolist())
-        ids: list[int] = self.recorded["input_ids"].ravel().tolist()
-        return ids
 
     def produced(self) -> dict[str, Produce]:
         """How to make every output the adapter can make, whether recorded or not."""
@@ -176,16 +155,6 @@ class _Reference:
         for row, length in enumerate(mask.sum(axis=1) + self.model.network.patches):
             states[:, row, length - 1], logits[row, length - 1] = states[:, row, -1], logits[row, -1]
         return states, logits
-
-
-def _actions(policy: OpenVLA, reference: _Reference, keys: list[str]) -> dict[str, Produce]:
-    ids = reference.decoded.ids[0].numpy()
-    tokens, vocabulary = policy.action_tokens, int(policy.config.text.vocab_size)
-    produced: dict[str, Produce] = {"detok_table": lambda: tokens.values(np.arange(vocabulary))}
-    for key in keys:
-        statistics = ActionStatistics.choose(policy.loaded.statistics, key)
-        produced[_ACTION + key] = partial(statistics.restore, tokens.values(ids))
-    return produced
 
 
 def _column(tape: Tape, model: PrismaticModel, stream: str, iteration: int | None) -> Tensor:

@@ -16,7 +16,7 @@ FAMILIES = (
             "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
             "be listened to (--listen); to act here it needs a fine-tune for end-effector deltas"
         ),
-        verifier="probe_kit.hooks.families.lerobot_verify:verify_smolvla",
+        verifier="probe_kit.hooks.families.smolvla.verify:verify_smolvla",
         config_types=("smolvla",),
         full_size="probe_kit.models.smolvla:full_size_smolvla",
         interventions=FLOW,

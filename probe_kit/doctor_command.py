@@ -1,0 +1,41 @@
+"""`probe-kit doctor`."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from probe_kit.console import err, marked, out, print_json
+
+if TYPE_CHECKING:
+    from probe_kit.doctor import Finding
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> None:
+    """Say what works on this machine, and what to do about the rest; exit 1 if the demo could not run."""
+    from probe_kit.doctor import examine
+
+    with err.status("looking around"):
+        findings = examine()
+    if as_json:
+        print_json([finding.to_json() for finding in findings])
+    else:
+        _print_findings(findings)
+    raise typer.Exit(1 if any(finding.state == "missing" for finding in findings) else 0)
+
+
+def _print_findings(findings: "list[Finding]") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    colours = {"ok": "green", "note": "yellow", "missing": "red"}
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        advice = marked("\n[dim]{}[/]", finding.advice) if finding.advice else ""
+        mark = marked(f"[{colours[finding.state]}]{{}}[/]", finding.state)
+        table.add_row(mark, finding.subject, Text.assemble(finding.seen, advice))
+    out.print(table)

@@ -1,0 +1,12 @@
+"""What pi0 can be compared in: see `lerobot_verify`."""
+
+from pathlib import Path
+
+from probe_kit.hooks.families.lerobot_verify import Arrays, verify_flow
+from probe_kit.hooks.families.pi0.adapter import load_pi0
+from probe_kit.hooks.verify import Comparison
+
+
+def verify_pi0(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
+    """Compare a pi0 reference."""
+    return verify_flow(load_pi0, folder, recorded)

@@ -1,0 +1,12 @@
+"""What SmolVLA can be compared in: see `lerobot_verify`."""
+
+from pathlib import Path
+
+from probe_kit.hooks.families.lerobot_verify import Arrays, verify_flow
+from probe_kit.hooks.families.smolvla.adapter import load_smolvla
+from probe_kit.hooks.verify import Comparison
+
+
+def verify_smolvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
+    """Compare a SmolVLA reference."""
+    return verify_flow(load_smolvla, folder, recorded)
