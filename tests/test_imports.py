@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.import_graph import circles, import_graph, upward
+from tests.support.import_graph import children, circles, import_graph, levels, packages, upward
 
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
-TOP = {"__init__", "__main__", "cli", "commands", "demo", "doctor", "organisms"}
-BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP
-ROOMS = {
+TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command"}
+BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system"}
+FOLDERS = {
     **dict.fromkeys(BASE, BASE),
     "statistics": BASE,
     "suite": BASE | {"statistics"},
@@ -26,31 +26,21 @@ ROOMS = {
     "retention": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "statistics"},
     "study": BASE | {"suite", "extract", "train", "intervene", "retention", "statistics"},
 }
-"""What a room may import; what is not named here, such as `cli` and `demo`, stands on top."""
+"""What a folder may import; what is not named here, such as `cli` and `demo`, stands on top."""
 
-EXTRACT = {
-    "store": {"plan", "settings"},
-    "plan": {"store"},
-    "asking": set(),
-    "protocols": set(),
-    "settings": {"store", "asking", "protocols"},
-    "needs": {"store", "plan", "settings"},
-    "early": {"store", "plan", "settings", "asking"},
-    "play": {"store", "plan", "settings", "asking"},
-    "calibration": {"plan", "settings", "play"},
-    "prepared": {"store", "plan", "settings", "early", "calibration", "play", "asking", "protocols"},
-    "crews": {"store", "plan", "settings", "play", "prepared"},
-    "extraction": {"store", "plan", "settings", "needs", "early", "play", "prepared", "crews"},
-}
+MOST_FILES = {"retention.displays": 20}
+"""Files beside subfolders; 15 where a folder is not named."""
+MOST_LEVELS = 12
 
 READS_ONLY = (
     "probe_kit.extract",
     "probe_kit.extract.store",
-    "probe_kit.hooks.sites",
-    "probe_kit.hooks.views",
-    "probe_kit.env.outcome",
-    "probe_kit.env.events",
-    "probe_kit.env.rules",
+    "probe_kit.extract.run_layout",
+    "probe_kit.hooks.contract.sites",
+    "probe_kit.hooks.contract.views",
+    "probe_kit.env.scoring.outcome",
+    "probe_kit.env.scoring.events",
+    "probe_kit.env.scoring.rules",
 )
 """All that probes and tables may know of the rooms that hold models and simulators."""
 
@@ -59,12 +49,18 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
     assert circles(GRAPH) == []
 
 
-def test_no_room_imports_one_that_comes_after_it() -> None:
-    assert upward(GRAPH, ROOMS, "probe_kit") == []
+def test_no_package_imports_one_that_comes_after_it() -> None:
+    assert upward(GRAPH, FOLDERS, "probe_kit") == []
 
 
-def test_inside_extract_the_store_knows_nothing_of_playing_and_playing_nothing_of_crews() -> None:
-    assert upward(GRAPH, EXTRACT, "probe_kit.extract") == []
+@pytest.mark.parametrize("folder", sorted(packages(GRAPH)))
+def test_no_two_children_of_a_folder_import_each_other_and_it_stays_small(folder: str) -> None:
+    """A newcomer reads a folder from the bottom up: at most 15 files on at most 12 levels."""
+    inside = children(GRAPH, folder)
+    assert circles(inside) == []
+    assert levels(inside) <= MOST_LEVELS
+    files = list(PACKAGE.parent.joinpath(*folder.split(".")).glob("*.py"))
+    assert len(files) <= MOST_FILES.get(folder.removeprefix("probe_kit."), 15)
 
 
 @pytest.mark.parametrize("room", ["train", "retention"])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.card import drawing_libraries, new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS, generators_of
@@ -132,7 +132,7 @@ def _cache_key(options: Mapping[str, Any]) -> str:
         "wording",
     )
     sources = [
-        *sorted((folder / "generators").glob("*.py")),
+        *sorted((folder / "generators").rglob("*.py")),
         *(folder / f"{name}.py" for name in own),
         folder / "art" / "NOTICE.md",
     ]

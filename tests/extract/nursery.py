@@ -15,12 +15,12 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from little_run import certify, episode, little_plan, little_settings
 
 from probe_kit.extract import open_run, seal
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.suite import load_suite
 from probe_kit.train import train_probes
