@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from torch import nn
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.play.examples import example_observations
+from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.hooks import Model, Policy, Reader, load_model
-from probe_kit.hooks.model import Question
-from probe_kit.hooks.roles import Roles
+from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.contract.roles import Roles
 
 # The tests' folder is no installed package, and an installed one may have its name.
 sys.modules["tests"] = types.ModuleType("tests")
 sys.modules["tests"].__path__ = [str(Path(__file__).parents[1] / "tests")]
 
-from tests import magma_checkpoints  # noqa: E402
-from tests.every_checkpoint import WRITERS  # noqa: E402
+from tests.support import magma_checkpoints
+from tests.support.every_checkpoint import WRITERS  # noqa: E402
 
 WIDTH, DEPTH, INNER, HEADS, KEYS, HEAD = 768, 12, 3072, 12, 4, 64
 TOWER, TOWER_DEPTH, TOWER_INNER, TOWER_HEADS = 384, 6, 1536, 6

@@ -17,7 +17,7 @@ import argparse
 from dataclasses import dataclass
 from math import ceil
 
-from probe_kit.extract.store.layout import StoredStream
+from probe_kit.extract.run_layout import StoredStream
 
 RESIDUAL = ("residual",)
 FAMILIES: dict[str, tuple[StoredStream, ...]] = {

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
-from probe_kit.extract.play.stage import Ending, Stage
-from probe_kit.extract.store.layout import COMMITS, StoredStream
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.rollout.stage import Ending, Stage
+from probe_kit.extract.run_layout import COMMITS, StoredStream
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite

@@ -25,18 +25,18 @@ import numpy as np
 
 from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
-from probe_kit.extract.play.rollout import Rollout
-from probe_kit.extract.play.staging import EpisodeBuffers
-from probe_kit.extract.store.commits import CHECKSUM, commit_checksum, commit_key, crc32c, write_commit
-from probe_kit.extract.store.hashes import HASH, as_json
-from probe_kit.extract.store.layout import DATA, RUN_FILE, StoredStream
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.run_layout import DATA, RUN_FILE, StoredStream
+from probe_kit.extract.store.format.commits import CHECKSUM, commit_checksum, commit_key, crc32c, write_commit
+from probe_kit.extract.store.format.hashes import HASH, as_json
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 
 BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
 EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
-RECORDING = "probe_kit.extract.store.recording"
+RECORDING = "probe_kit.extract.store.format.recording"
 Seconds = tuple[float, float]
 
 

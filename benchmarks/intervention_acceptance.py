@@ -2,7 +2,7 @@
 
     python benchmarks/intervention_acceptance.py FOLDER [--seed 0] [--items 24] [--steps N] [--loop 4]
 
-Draws a suite of its own seed, has every organism of `probe_kit.organisms` act on it, fits probes, and intervenes.
+Draws a suite of its own seed, has every organism of `probe_kit.demo.organisms` act on it, fits probes, and intervenes.
 What is true of each is taken from there; places and layers from what is found. --steps plays shorter episodes:
 enough for all that is read off first actions, and the closed loop then repeats those. --loop: items per category
 that are played again. Finished work in FOLDER is reused. Exits with 1 if a property does not hold.
@@ -13,7 +13,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from probe_kit.demo import PERMUTATIONS
+from probe_kit.demo.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, probed
+from probe_kit.demo.pipeline import PERMUTATIONS
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract import Run
 from probe_kit.intervene import (
@@ -25,8 +26,7 @@ from probe_kit.intervene import (
     Steer,
     intervene_on,
 )
-from probe_kit.intervene.conditions import Intervention
-from probe_kit.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, probed
+from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite, build_suite
 
 ABSENT = "counting"

@@ -21,7 +21,7 @@ import numpy as np
 from capture_subjects import LARGER, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
-from probe_kit.intervene.patching import Replaced, Tokens, patched
+from probe_kit.intervene.edits.patching import Replaced, Tokens, patched
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"

@@ -22,11 +22,11 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import Answers, Bench, Follow, Interchange, Source
-from probe_kit.intervene.bench import Question, open_bench
-from probe_kit.intervene.conditions import Replayed, replay
-from probe_kit.intervene.following import following
-from probe_kit.intervene.intervening import answers_of
-from probe_kit.intervene.passing import passing
+from probe_kit.intervene.kinds.image_swap.effects import following
+from probe_kit.intervene.kinds.site_effects import passing
+from probe_kit.intervene.replay.conditions import Replayed, replay
+from probe_kit.intervene.replay.session import Question, open_bench
+from probe_kit.intervene.runner import answers_of
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
 

@@ -27,17 +27,24 @@ from numpy.typing import NDArray
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-from probe_kit.train import probe
-from probe_kit.train.features import IN_MEMORY, Coordinates
-from probe_kit.train.joint_probe import can_be_joint, cross_validate_jointly, labels_at_once
-from probe_kit.train.joint_problems import JointProblems
-from probe_kit.train.joint_site import JointSite
-from probe_kit.train.mixed import Point
-from probe_kit.train.nested import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, FittedFold, NestedFold, nested_folds
-from probe_kit.train.permutation import flip_items
-from probe_kit.train.rows import ChosenRows
-from probe_kit.train.samples import Samples
-from probe_kit.train.solver import LogisticSolver
+from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.crossval import site_probe as probe
+from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
+from probe_kit.train.crossval.joint_design import JointSite
+from probe_kit.train.crossval.joint_objective import JointProblems
+from probe_kit.train.crossval.nested_folds import (
+    INNER_FOLDS,
+    OUTER_FOLDS,
+    STRENGTHS,
+    FittedFold,
+    NestedFold,
+    nested_folds,
+)
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.solver.logistic import LogisticSolver
+from probe_kit.train.solver.mixed_precision import Point
+from probe_kit.train.solver.projection import IN_MEMORY, Coordinates
+from probe_kit.train.solver.row_subset import ChosenRows
 
 
 def samples_of(episodes: int, tokens: int, width: int, signal: float) -> Samples:
@@ -152,7 +159,10 @@ def main() -> None:
         f"; probe_kit solves them {'together' if can_be_joint(samples, labels.shape[1]) else 'alone'}"
     )
     seconds, strengths, decisions = 0.0, np.full(labels.shape[1], arguments.strength), None
-    with threadpool_limits(1), patch("probe_kit.train.features.IN_MEMORY", arguments.rival_memory * 2**30):
+    with (
+        threadpool_limits(1),
+        patch("probe_kit.train.solver.projection.IN_MEMORY", arguments.rival_memory * 2**30),
+    ):
         if arguments.part != "alone":
             seconds, found = together(samples, labels, folds, console)
             strengths, decisions = found[0].strengths, found[0].decisions
@@ -180,7 +190,7 @@ def together(
     once = processor_seconds(lambda: sites.append(JointSite.of(samples, folds)))
     console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64; {once:.1f} s once")
     found: list[FittedFold] = []
-    with patch("probe_kit.train.joint_probe.JointProblems", Counted):  # every product is made, and counted
+    with patch("probe_kit.train.crossval.joint.JointProblems", Counted):  # every product is made, and counted
         solving = processor_seconds(lambda: found.extend(cross_validate_jointly(sites[0], samples, labels, folds)))
     count, width = samples.features.shape
     moments = 4 * count * width**2 / 1e9

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.plan import make_plan
-from probe_kit.extract.play.stage import Stage
+from probe_kit.extract.rollout.stage import Stage
 from probe_kit.suite import build_suite
 
 

@@ -27,11 +27,11 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import Fold, grouped_folds
-from probe_kit.train.paired import better_than_best, better_than_reference
-from probe_kit.train.permutation import family_p, flip_groups, flip_items, site_p
-from probe_kit.train.probe import OUTER_FOLDS, nested_folds, probe_site
-from probe_kit.train.samples import Samples
-from probe_kit.train.scores import correctness
+from probe_kit.statistics.label_permutations import family_p, flip_groups, flip_items, site_p
+from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.site_probe import OUTER_FOLDS, nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
 
 SITES, WIDTH, RELABELLINGS = 2, 6, 39
 LEVEL = 0.05

@@ -23,8 +23,8 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 PARITY = (
-    "tests/hooks/test_on_device.py", "tests/extract/test_extraction.py", "tests/extract/play/test_staging.py",
-    "tests/train/test_sweep.py",
+    "tests/hooks/test_on_device.py", "tests/extract/test_extraction.py", "tests/extract/rollout/test_episode_buffers.py",
+    "tests/train/test_probe_sweep.py",
 )  # fmt: skip
 ON_DEVICE = "device_changes and cuda or gpu"
 GOLDEN = "reproduces or reproduced or every_recorded or everything_recorded"
@@ -42,7 +42,7 @@ def parts(device: str, checkpoint: str | None) -> dict[str, list[str]]:
         listening += ["--families", "qwen3-vl", "--repeats", "1"]
     return {
         "parity": [*pytest, *PARITY, "-k", "device_changes and cpu and not vl or gpu" if small else ON_DEVICE],
-        "golden": [*pytest, "tests/hooks/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
+        "golden": [*pytest, "tests/hooks/verification/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
         "listening": _benchmark("capture.py", "--host", *listening),
         "probes": _benchmark(
             "probes.py", "--device", device, "--sizes", "60" if small else "300,3440",

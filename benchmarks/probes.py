@@ -20,11 +20,11 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
-from probe_kit.extract.store.rows import TokenBlock
-from probe_kit.train.features import Coordinates
-from probe_kit.train.permutation import flip_items
-from probe_kit.train.probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site
-from probe_kit.train.samples import Samples
+from probe_kit.extract.store.format.rows import TokenBlock
+from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.crossval.site_probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.solver.projection import Coordinates
 
 WIDTH = 2048
 SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold

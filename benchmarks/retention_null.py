@@ -23,15 +23,15 @@ from rich.table import Table
 from scipy.special import ndtri
 from scipy.stats import binomtest
 
-from probe_kit.retention.crossfit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
-from probe_kit.retention.estimates import Estimate, average, retention_draws
-from probe_kit.retention.measure import retention_interval
+from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
+from probe_kit.retention.estimators.cross_fit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
+from probe_kit.retention.estimators.retention import retention_interval
 from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.label_permutations import family_p, flip_items, site_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.permutation import family_p, flip_items, site_p
-from probe_kit.train.probe import nested_folds, probe_site
-from probe_kit.train.samples import Samples
-from probe_kit.train.scores import correctness
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
 
 LAYERS, ITERATIONS, ITEMS = 19, 10, 150
 RETENTIONS = (0.0, 0.25, 0.5, 0.8, 1.0)

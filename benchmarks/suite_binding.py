@@ -17,14 +17,14 @@ from rich.progress import track
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from probe_kit.identity import derive_seed
+from probe_kit.hashing import derive_seed
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeSettings
-from probe_kit.train.binding import LAYERS, BindingInputs
-from probe_kit.train.problem import category_problem
-from probe_kit.train.results import episodes_sha256
-from probe_kit.train.samples import Samples
-from probe_kit.train.scores import correctness
+from probe_kit.train.controls.random_features import LAYERS, BindingInputs
+from probe_kit.train.crossval.category_problem import category_problem
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.results.probe_results import episodes_sha256
 
 
 def main() -> None:

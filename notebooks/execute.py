@@ -15,7 +15,7 @@ from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
-from probe_kit.notebook import PROGRESS_MARK
+from probe_kit._terminal.notebook import PROGRESS_MARK
 
 FOLDER = Path(__file__).parent
 UNASKED = "TqdmWarning"

@@ -10,7 +10,7 @@ Data flows one way: suite → env → hooks → extract → train → intervene 
 
 from typing import TYPE_CHECKING
 
-from probe_kit.lazy import lazy_names
+from probe_kit._system.lazy import lazy_names
 from probe_kit.version import __version__ as __version__
 
 if TYPE_CHECKING:

@@ -13,10 +13,11 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from probe_kit.commands import demo
-from probe_kit.console import marked, out, say
+from probe_kit._terminal.console import marked, out, say
+from probe_kit._terminal.error_reporting import tell
+from probe_kit._terminal.plain_text import visible
+from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
-from probe_kit.endings import tell
 from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
@@ -25,9 +26,8 @@ from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import intervene
 from probe_kit.intervene.show_command import show
-from probe_kit.plain_text import visible
 from probe_kit.retention.commands import retention
-from probe_kit.retention.join_commands import join
+from probe_kit.retention.known_used_command import join
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.power_commands import power

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from probe_kit.console import err, marked, out, print_json
+from probe_kit._terminal.console import err, marked, out, print_json
 
 if TYPE_CHECKING:
     from probe_kit.doctor import Finding

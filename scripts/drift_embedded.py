@@ -14,10 +14,10 @@ import typer
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
-from probe_kit.console import counter, progress
+from probe_kit._terminal.console import counter, progress
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, Run, extract_run
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.suite import build_suite
 

@@ -15,11 +15,11 @@ from pathlib import Path
 from docs_tables import DATA, PAGES, README, ROOT, filled
 from readme_picture import draw_picture
 
-from probe_kit.console import counter, progress
-from probe_kit.demo import PERMUTATIONS, compare_organisms, run_demo
-from probe_kit.organisms import TRAINED, Finding, NamedProgress, verdict
+from probe_kit._terminal.console import counter, progress
+from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress, verdict
+from probe_kit.demo.pipeline import PERMUTATIONS, compare_organisms, run_demo
 from probe_kit.retention import RetentionRow
-from probe_kit.retention.rows import MEAN
+from probe_kit.retention.rows.row import MEAN
 
 SHOWN = {"report.html": "sample-report.html", "episode.gif": "episode.gif"}
 """What the docs show as the demo made it."""

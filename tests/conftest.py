@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from tests.made_once import made_once, shared_folder
+from tests.support.made_once import made_once, shared_folder
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -185,7 +185,7 @@ def small_suite(tmp_path_factory: pytest.TempPathFactory) -> "Suite":
 @pytest.fixture(scope="session")
 def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of two runs without a model, `run` and `other`, of other seeds, with everything a run can hold."""
-    from tests.little_run import intervene_on_little_run, probe_little_run, write_little_run
+    from tests.support.little_run import intervene_on_little_run, probe_little_run, write_little_run
 
     def make(folder: Path) -> None:
         for seed, name in enumerate(("run", "other")):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.import_graph import circles, import_graph, upward
+from tests.support.import_graph import circles, import_graph, upward
 
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
@@ -46,11 +46,11 @@ EXTRACT = {
 READS_ONLY = (
     "probe_kit.extract",
     "probe_kit.extract.store",
-    "probe_kit.hooks.sites",
-    "probe_kit.hooks.views",
-    "probe_kit.env.outcome",
-    "probe_kit.env.events",
-    "probe_kit.env.rules",
+    "probe_kit.hooks.contract.sites",
+    "probe_kit.hooks.contract.views",
+    "probe_kit.env.scoring.outcome",
+    "probe_kit.env.scoring.events",
+    "probe_kit.env.scoring.rules",
 )
 """All that probes and tables may know of the rooms that hold models and simulators."""
 

@@ -8,10 +8,10 @@ import pytest
 import zarr
 
 from probe_kit.extract import Run, open_run
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import retention
 from probe_kit.train import train_probes
-from tests.rehashing import rehash
+from tests.support.rehashing import rehash
 
 PLANTED = Site("backbone", 2)
 

@@ -8,11 +8,11 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from probe_kit.env.camera import Frame, Picture
-from probe_kit.env.controller import check_action
-from probe_kit.env.outcome import Outcome
 from probe_kit.env.question import Question
+from probe_kit.env.robot.controller import check_action
 from probe_kit.env.scene import Scene
+from probe_kit.env.scoring.outcome import Outcome
+from probe_kit.env.simulation.camera import Frame, Picture
 from probe_kit.env.spec import SceneSpec
 from probe_kit.env.trial import Trial
 from probe_kit.errors import EpisodeOverError, SceneError

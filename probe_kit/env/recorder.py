@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from probe_kit.env.act2answer import Act2AnswerEnv
 from probe_kit.env.rotations import Array
 from probe_kit.env.scene import SIDES, Scene
-from probe_kit.env.trajectory import LED_TO, Trajectory
+from probe_kit.env.scoring.trajectory import LED_TO, Trajectory
 
 
 class Recorder:

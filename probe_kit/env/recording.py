@@ -5,7 +5,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from probe_kit.env.camera import Picture
+from probe_kit.env.simulation.camera import Picture
 
 
 def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:

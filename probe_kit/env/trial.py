@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from probe_kit.env.controller import DeltaController
-from probe_kit.env.outcome import REST_SPEED, Ending, Outcome, distance, zone
 from probe_kit.env.question import Question
+from probe_kit.env.robot.controller import DeltaController
 from probe_kit.env.rotations import Array
 from probe_kit.env.scene import Scene
+from probe_kit.env.scoring.outcome import REST_SPEED, Ending, Outcome, distance, zone
 from probe_kit.env.spec import XY
 from probe_kit.suite.items import other_side
 

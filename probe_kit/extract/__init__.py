@@ -2,15 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit.lazy import lazy_names
+from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
     from probe_kit.extract.settings import AskSettings, ExtractSettings
-    from probe_kit.extract.store.audit import Audit, verify_run
     from probe_kit.extract.store.export import export_run
-    from probe_kit.extract.store.locate import locate
-    from probe_kit.extract.store.location import Location
+    from probe_kit.extract.store.integrity.audit import Audit, verify_run
+    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.extract.store.locations.location import Location
     from probe_kit.extract.store.run import Run, open_run
     from probe_kit.extract.store.sealing import seal
 
@@ -43,12 +43,12 @@ __getattr__ = lazy_names(
         "extract_run": "extraction",
         "prepare": "extraction",
         "prepare_asks": "extraction",
-        "Location": "store.location",
-        "locate": "store.locate",
+        "Location": "store.locations.location",
+        "locate": "store.locations.locate",
         "Run": "store.run",
         "open_run": "store.run",
         "seal": "store.sealing",
-        "Audit": "store.audit",
-        "verify_run": "store.audit",
+        "Audit": "store.integrity.audit",
+        "verify_run": "store.integrity.audit",
     },
 )

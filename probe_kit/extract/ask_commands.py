@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from probe_kit.console import counter, err, marked, out, progress, say, split
+from probe_kit._terminal.console import counter, err, marked, out, progress, say, split
 from probe_kit.errors import UsageError
 from probe_kit.extract.commands import print_plan, read_size
 
@@ -115,12 +115,12 @@ def ask(
 
     The same command continues interrupted runs; other settings in the same folder are refused.
     """
-    from probe_kit.extract.asking.templates import find_template
     from probe_kit.extract.extraction import prepare_asks
     from probe_kit.extract.protocols import scene_of
     from probe_kit.extract.settings import AskSettings
-    from probe_kit.extract.store.locate import locate
-    from probe_kit.hooks.options import read_pairs
+    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.extract.vqa.templates import find_template
+    from probe_kit.hooks.contract.options import read_pairs
 
     templates = [find_template(name) for name in _several(prompt, "--prompt")]
     sizes = [read_size(text) for text in _several(picture_size, "--picture-size")]

@@ -14,12 +14,12 @@ import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.play.controllers import PolicyController
-from probe_kit.extract.play.examples import example_observations
-from probe_kit.extract.play.stage import Ending, Stage
-from probe_kit.extract.play.worker import torch_threads
+from probe_kit.extract.rollout.controllers import PolicyController
+from probe_kit.extract.rollout.examples import example_observations
+from probe_kit.extract.rollout.stage import Ending, Stage
+from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import RunSettings
-from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.contract.observation import Observation
 
 LARGEST = 64
 """Observations per call that are tried at most."""

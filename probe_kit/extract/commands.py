@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, err, marked, out, progress, say, split, whole_number
+from probe_kit._terminal.console import counter, err, marked, out, progress, say, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction, Run
-    from probe_kit.extract.store.location import Location
+    from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite.ladder import Wording
 
 SCENE = "Scene (recorded with the run)"
@@ -141,8 +141,8 @@ def extract(
     """
     from probe_kit.extract import ExtractSettings, prepare
     from probe_kit.extract.protocols import scene_of
-    from probe_kit.extract.store.locate import locate
-    from probe_kit.hooks.options import read_pairs
+    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.hooks.contract.options import read_pairs
     from probe_kit.suite.ladder import check_wordings
 
     asked = {
@@ -221,7 +221,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from rich.table import Table
 
     from probe_kit.extract.needs import space_needed
-    from probe_kit.extract.store.disk import in_units
+    from probe_kit.extract.store.locations.disk import in_units
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     needed = in_units(sum(space_needed(plan, extraction.settings).values()))

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
+from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, RunSettings, refuse_other_settings
-from probe_kit.extract.store.layout import RUN_FILE
-from probe_kit.identity import canonical_json
+from probe_kit.hashing import canonical_json
 
 if TYPE_CHECKING:
-    from probe_kit.extract.store.location import Location
+    from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite import Suite
 
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "weights_seed")
@@ -53,7 +53,7 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     Raises UsageError, DiskSpaceError for a read-only disk, SettingsMismatchError, or RunDamagedError if what lies
     there was changed.
     """
-    from probe_kit.extract.store.root import read_root
+    from probe_kit.extract.store.format.root import read_root
 
     _check_writable(location)
     with location.in_words():

@@ -6,23 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, StoreError
-from probe_kit.extract.crews.here import run_here
-from probe_kit.extract.crews.processes import run_in_processes
-from probe_kit.extract.crews.ray import run_on_ray
-from probe_kit.extract.crews.scheduler import Scheduler
 from probe_kit.extract.needs import space_needed
-from probe_kit.extract.play.events import Done, Event
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_reader
+from probe_kit.extract.rollout.events import Done, Event
+from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
-from probe_kit.extract.store.disk import refuse_if_full
-from probe_kit.extract.store.layout import RUN_FILE
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.locations.disk import refuse_if_full
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
 from probe_kit.extract.store.sealing import seal
 from probe_kit.extract.store.writer import RunWriter
-from probe_kit.notebook import notebook_progress
+from probe_kit.extract.workers.local import run_here
+from probe_kit.extract.workers.processes import run_in_processes
+from probe_kit.extract.workers.ray import run_on_ray
+from probe_kit.extract.workers.scheduler import Scheduler
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Reader

@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import marked, out, print_json
+from probe_kit._terminal.console import marked, out, print_json
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.family import Family
+    from probe_kit.hooks.contract.family import Family
 
 
 def models(
@@ -53,7 +53,7 @@ def _ready(family: "Family") -> str:
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
-    from probe_kit.extract.play.controllers import SCRIPTED
+    from probe_kit.extract.rollout.controllers import SCRIPTED
     from probe_kit.hooks.registry import find_family, known_families
 
     chosen = list(known_families().values())

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.layout import StoredStream
-from probe_kit.identity import derive_seed, sha256_json
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.suite import Episode, Suite
 from probe_kit.suite.ladder import Wording, in_words
 

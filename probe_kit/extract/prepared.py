@@ -5,21 +5,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.asking.phrases import phrases
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import check_model, check_place
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
-from probe_kit.extract.play.ask_controller import AskController
-from probe_kit.extract.play.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
-from probe_kit.extract.play.examples import example_observations, refuse_unfit
-from probe_kit.extract.play.refusals import refuse_meaningless, refuse_misfit, refuse_unreachable
-from probe_kit.extract.play.rehearsal import rehearse
 from probe_kit.extract.protocols import protocol_identity
+from probe_kit.extract.rollout.answer_controller import AskController
+from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
+from probe_kit.extract.rollout.examples import example_observations, refuse_unfit
+from probe_kit.extract.rollout.preflight import rehearse
+from probe_kit.extract.rollout.settings_checks import refuse_meaningless, refuse_misfit, refuse_unreachable
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.extract.store.writer import RunWriter
-from probe_kit.identity import sha256_json
+from probe_kit.extract.vqa.phrases import phrases
+from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
 if TYPE_CHECKING:

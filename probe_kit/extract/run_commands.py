@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from probe_kit.console import err, out, print_json
+from probe_kit._terminal.console import err, out, print_json
 
 app = typer.Typer(help="Look after runs.", no_args_is_help=True)
 DAMAGED = 1
@@ -20,7 +20,7 @@ def verify(
 ) -> None:
     """Compare a run with what it says of itself; exit 1 if anything is missing or changed."""
     from probe_kit.extract import verify_run
-    from probe_kit.extract.store.summary import NOT_PROTECTED
+    from probe_kit.extract.store.locations.summary import NOT_PROTECTED
 
     found = verify_run(run, deep)
     if as_json:
@@ -59,7 +59,7 @@ def export(
     """Write a run as one ordinary file, with its sha256 beside it."""
     from probe_kit.extract import export_run
     from probe_kit.extract.store.export import check_format
-    from probe_kit.extract.store.locate import locate
+    from probe_kit.extract.store.locations.locate import locate
 
     check_format(style)
     location = locate(run)

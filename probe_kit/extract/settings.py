@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Self
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
-from probe_kit.extract.asking.phrases import ASKED, Asked
-from probe_kit.extract.asking.templates import P1, Template
 from probe_kit.extract.protocols import deviations, protocol_row, scene_of
-from probe_kit.extract.store.layout import CODECS
-from probe_kit.hooks.edits import Edit, Vectors
-from probe_kit.identity import sha256_json
+from probe_kit.extract.run_layout import CODECS
+from probe_kit.extract.vqa.phrases import ASKED, Asked
+from probe_kit.extract.vqa.templates import P1, Template
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.suite.ladder import Wording, check_wordings
 
 TOKENS = ("pooled", "all")

@@ -2,23 +2,23 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit.hooks.card import Card
-from probe_kit.hooks.edits import Edit
-from probe_kit.hooks.family import Family
-from probe_kit.hooks.interventions import Interventions
-from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.options import Option
+from probe_kit._system.lazy import lazy_names
+from probe_kit.hooks.capturing.edits import Edit
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.registry import known_families, load_model, load_policy
-from probe_kit.hooks.sites import Site, Stream
-from probe_kit.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.attention import AttentionMass
-    from probe_kit.hooks.capture_context import capture, edit
-    from probe_kit.hooks.editing import applied
-    from probe_kit.hooks.model import Model, Policy, Question, Reader, Reading, Rows, Tap
-    from probe_kit.hooks.roles import Roles, pool
-    from probe_kit.hooks.tape import Tape
+    from probe_kit.hooks.capturing.activation_cache import Tape
+    from probe_kit.hooks.capturing.apply_edits import applied
+    from probe_kit.hooks.capturing.attention import AttentionMass
+    from probe_kit.hooks.capturing.capture_context import capture, edit
+    from probe_kit.hooks.contract.model import Model, Policy, Question, Reader, Reading, Rows, Tap
+    from probe_kit.hooks.contract.roles import Roles, pool
 
 __all__ = [
     "AttentionMass",
@@ -52,19 +52,19 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "AttentionMass": "attention",
-        "Model": "model",
-        "Policy": "model",
-        "Question": "model",
-        "Reader": "model",
-        "Reading": "model",
-        "Rows": "model",
-        "Tap": "model",
-        "Tape": "tape",
-        "applied": "editing",
-        "capture": "capture_context",
-        "edit": "capture_context",
-        "Roles": "roles",
-        "pool": "roles",
+        "AttentionMass": "capturing.attention",
+        "Model": "contract.model",
+        "Policy": "contract.model",
+        "Question": "contract.model",
+        "Reader": "contract.model",
+        "Reading": "contract.model",
+        "Rows": "contract.model",
+        "Tap": "contract.model",
+        "Tape": "capturing.activation_cache",
+        "applied": "capturing.apply_edits",
+        "capture": "capturing.capture_context",
+        "edit": "capturing.capture_context",
+        "Roles": "contract.roles",
+        "pool": "contract.roles",
     },
 )

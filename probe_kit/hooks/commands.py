@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit.console import err, marked, out, print_json
+from probe_kit._terminal.console import err, marked, out, print_json
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.verify import Verification
+    from probe_kit.hooks.verification.verify import Verification
 
 
 def verify(
@@ -22,7 +22,7 @@ def verify(
 
     Exit code 1 if anything is over its tolerance. What the adapter cannot produce is listed, never passed.
     """
-    from probe_kit.hooks.reference_files import check_key_list, check_reference
+    from probe_kit.hooks.verification.reference_files import check_key_list, check_reference
 
     if (folder is None) == (keys is None):
         raise UsageError("give either a golden reference folder or --keys FILE")
@@ -30,7 +30,7 @@ def verify(
         check_key_list(family, keys)
     else:
         check_reference(family, cast("Path", folder))
-    from probe_kit.hooks.verify import verify_keys, verify_reference
+    from probe_kit.hooks.verification.verify import verify_keys, verify_reference
 
     verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))
     if as_json:

@@ -13,16 +13,16 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
-from probe_kit.hooks.attention import attention
-from probe_kit.hooks.capture_context import capture, edit
-from probe_kit.hooks.editing import applied
-from probe_kit.hooks.edits import Edit, Vectors, vector_hash
-from probe_kit.hooks.interventions import InterventionKind
-from probe_kit.hooks.model import Policy
-from probe_kit.hooks.observation import Observation
+from probe_kit.hooks.capturing.activation_cache import Tape
+from probe_kit.hooks.capturing.apply_edits import applied
+from probe_kit.hooks.capturing.attention import attention
+from probe_kit.hooks.capturing.capture_context import capture, edit
+from probe_kit.hooks.capturing.edits import Edit, Vectors, vector_hash
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.model import Policy
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import MEMORY, Site, Stream, memory_stream
 from probe_kit.hooks.registry import find_family
-from probe_kit.hooks.sites import MEMORY, Site, Stream, memory_stream
-from probe_kit.hooks.tape import Tape
 
 
 class InterventionContract:

@@ -11,10 +11,10 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownModelError, UsageError
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.contract.family import Family
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.model import Model, Policy
+    from probe_kit.hooks.contract.model import Model, Policy
 
 ENTRY_POINTS = "probe_kit.policies"
 FOLDERS = (
@@ -114,7 +114,7 @@ def load_policy(
     **options: Any,
 ) -> "Policy":
     """Load a model that acts; as `load_model`. Raises UsageError for one that answers only."""
-    from probe_kit.hooks.model import Policy
+    from probe_kit.hooks.contract.model import Policy
 
     if not find_family(name).acts:
         raise UsageError(f"{name} answers and does not act; load it with load_model")

@@ -5,29 +5,29 @@ Needs the run's policy and pictures again; what is stored needs neither to be re
 
 from typing import TYPE_CHECKING
 
-from probe_kit.lazy import lazy_names
+from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.bench import Bench, Source
-    from probe_kit.intervene.best_targets import best_cells
-    from probe_kit.intervene.carried_out import CarriedOut
-    from probe_kit.intervene.closed_loop import ClosedLoop
-    from probe_kit.intervene.effects import Effects, load_effects
-    from probe_kit.intervene.erase import Erase
-    from probe_kit.intervene.erased import Erasing
-    from probe_kit.intervene.follow import Follow
-    from probe_kit.intervene.following import Following, stored_following
-    from probe_kit.intervene.inside import stored_passing
-    from probe_kit.intervene.interchange import Interchange
-    from probe_kit.intervene.intervening import intervene_on
-    from probe_kit.intervene.passing import Passing
-    from probe_kit.intervene.sensitivity import Sensitivity
-    from probe_kit.intervene.steer import Steer
-    from probe_kit.intervene.stored import Answers, stored_interventions
-    from probe_kit.intervene.verdict import Judgement, Verdict, judge, judgements
-    from probe_kit.intervene.weigh import Attention
-    from probe_kit.intervene.weighed import Attending, Weighed, stored_attention
-    from probe_kit.intervene.words import Words
+    from probe_kit.intervene.kinds.attention.attention_mass import Attending, Weighed, stored_attention
+    from probe_kit.intervene.kinds.attention.intervention import Attention
+    from probe_kit.intervene.kinds.closed_loop.effects import CarriedOut
+    from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
+    from probe_kit.intervene.kinds.erase.effects import Erasing
+    from probe_kit.intervene.kinds.erase.intervention import Erase
+    from probe_kit.intervene.kinds.image_swap.effects import Following, stored_following
+    from probe_kit.intervene.kinds.image_swap.intervention import Follow
+    from probe_kit.intervene.kinds.image_swap.verdict import Judgement, Verdict, judge, judgements
+    from probe_kit.intervene.kinds.instruction_swap.effects import Sensitivity
+    from probe_kit.intervene.kinds.instruction_swap.intervention import Words
+    from probe_kit.intervene.kinds.interchange.intervention import Interchange
+    from probe_kit.intervene.kinds.site_effects import Passing
+    from probe_kit.intervene.kinds.steer.intervention import Steer
+    from probe_kit.intervene.replay.session import Bench, Source
+    from probe_kit.intervene.results.best_targets import best_cells
+    from probe_kit.intervene.results.results import Effects, load_effects
+    from probe_kit.intervene.results.site_maps import stored_passing
+    from probe_kit.intervene.runner import intervene_on
+    from probe_kit.intervene.store.answers import Answers, stored_interventions
 
 __all__ = [
     "Answers",
@@ -65,34 +65,34 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "Sensitivity": "sensitivity",
-        "Words": "words",
-        "stored_passing": "inside",
-        "Passing": "passing",
-        "Steer": "steer",
-        "Interchange": "interchange",
-        "Answers": "stored",
-        "Attending": "weighed",
-        "Attention": "weigh",
-        "Weighed": "weighed",
-        "stored_attention": "weighed",
-        "Bench": "bench",
-        "CarriedOut": "carried_out",
-        "ClosedLoop": "closed_loop",
-        "best_cells": "best_targets",
-        "Effects": "effects",
-        "Erase": "erase",
-        "Erasing": "erased",
-        "Follow": "follow",
-        "Following": "following",
-        "Judgement": "verdict",
-        "Source": "bench",
-        "Verdict": "verdict",
-        "intervene_on": "intervening",
-        "judge": "verdict",
-        "judgements": "verdict",
-        "load_effects": "effects",
-        "stored_following": "following",
-        "stored_interventions": "stored",
+        "Sensitivity": "kinds.instruction_swap.effects",
+        "Words": "kinds.instruction_swap.intervention",
+        "stored_passing": "results.site_maps",
+        "Passing": "kinds.site_effects",
+        "Steer": "kinds.steer.intervention",
+        "Interchange": "kinds.interchange.intervention",
+        "Answers": "store.answers",
+        "Attending": "kinds.attention.attention_mass",
+        "Attention": "kinds.attention.intervention",
+        "Weighed": "kinds.attention.attention_mass",
+        "stored_attention": "kinds.attention.attention_mass",
+        "Bench": "replay.session",
+        "CarriedOut": "kinds.closed_loop.effects",
+        "ClosedLoop": "kinds.closed_loop.intervention",
+        "best_cells": "results.best_targets",
+        "Effects": "results.results",
+        "Erase": "kinds.erase.intervention",
+        "Erasing": "kinds.erase.effects",
+        "Follow": "kinds.image_swap.intervention",
+        "Following": "kinds.image_swap.effects",
+        "Judgement": "kinds.image_swap.verdict",
+        "Source": "replay.session",
+        "Verdict": "kinds.image_swap.verdict",
+        "intervene_on": "runner",
+        "judge": "kinds.image_swap.verdict",
+        "judgements": "kinds.image_swap.verdict",
+        "load_effects": "results.results",
+        "stored_following": "kinds.image_swap.effects",
+        "stored_interventions": "store.answers",
     },
 )

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, marked, out, print_json_text, print_text, progress, say, split
+from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say, split
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
-    from probe_kit.intervene.conditions import Intervention
-    from probe_kit.intervene.effects import Effects
+    from probe_kit.intervene.replay.conditions import Intervention
+    from probe_kit.intervene.results.results import Effects
 
 KINDS = ("follow", "words", "interchange", "steer", "closed-loop", "erase", "attention")
 INSIDE = "Inside the network (interchange, steer, closed-loop, erase, attention)"
@@ -113,11 +113,11 @@ def intervene(
     The same command continues what was interrupted, and reads back what is there.
     """
     from probe_kit.extract import open_run
-    from probe_kit.hooks.options import read_pairs
+    from probe_kit.hooks.contract.options import read_pairs
     from probe_kit.intervene import Source, intervene_on
-    from probe_kit.intervene.intervening import refuse_unsupported
-    from probe_kit.intervene.settings import key_of, readout_of, refuse_unfit, settings_of
-    from probe_kit.intervene.stored import is_stored
+    from probe_kit.intervene.runner import refuse_unsupported
+    from probe_kit.intervene.store.answers import is_stored
+    from probe_kit.intervene.store.settings import key_of, readout_of, refuse_unfit, settings_of
 
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}; expected one of {', '.join(KINDS)}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from probe_kit.console import out, print_json
+from probe_kit._terminal.console import out, print_json
 
 
 def show(
@@ -14,9 +14,9 @@ def show(
 ) -> None:
     """List what a run holds: episodes, streams, and every set of probes and intervention by its key."""
     from probe_kit.extract import open_run
-    from probe_kit.intervene.inventory import listed_interventions, unfinished_interventions
+    from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
     from probe_kit.train.commands import facts_table
-    from probe_kit.train.inventory import inventory
+    from probe_kit.train.results.inventory import inventory
 
     opened = open_run(run, allow_partial=True)
     found, interventions = inventory(opened), listed_interventions(opened)

@@ -5,11 +5,18 @@ Reads runs and probe results; needs no simulator and no model.
 
 from typing import TYPE_CHECKING
 
-from probe_kit.lazy import lazy_names
+from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.retention.call_curves import event_calls
-    from probe_kit.retention.differences import Difference
+    from probe_kit.retention.behaviour.success_rate import (
+        PairedItems,
+        Regime,
+        SuccessRate,
+        normalised_score,
+        sensitivity,
+        success_rate,
+    )
+    from probe_kit.retention.compare.differences import Difference
     from probe_kit.retention.displays import (
         CallCurveDisplay,
         FinalPositionsDisplay,
@@ -25,16 +32,9 @@ if TYPE_CHECKING:
         SuccessTableDisplay,
         layer_curve,
     )
-    from probe_kit.retention.measure import Peak, Retention, best_site, measure_retention
-    from probe_kit.retention.rows import RetentionRow
-    from probe_kit.retention.success import (
-        PairedItems,
-        Regime,
-        SuccessRate,
-        normalised_score,
-        sensitivity,
-        success_rate,
-    )
+    from probe_kit.retention.estimators.by_call import event_calls
+    from probe_kit.retention.estimators.retention import Peak, Retention, best_site, measure_retention
+    from probe_kit.retention.rows.row import RetentionRow
     from probe_kit.retention.table import RetentionTable, retention
     from probe_kit.statistics.significance import chance_margin
 
@@ -75,33 +75,33 @@ __getattr__ = lazy_names(
     __name__,
     {
         "CallCurveDisplay": "displays",
-        "event_calls": "call_curves",
-        "Difference": "differences",
+        "event_calls": "estimators.by_call",
+        "Difference": "compare.differences",
         "FinalPositionsDisplay": "displays",
         "IterationMapDisplay": "displays",
         "KnowledgeActionDisplay": "displays",
         "LayerCurveDisplay": "displays",
         "ModelDepthDisplay": "displays",
         "OutcomeRulesDisplay": "displays",
-        "PairedItems": "success",
+        "PairedItems": "behaviour.success_rate",
         "PairedLayoutsDisplay": "displays",
-        "Peak": "measure",
-        "Regime": "success",
-        "Retention": "measure",
-        "RetentionRow": "rows",
+        "Peak": "estimators.retention",
+        "Regime": "behaviour.success_rate",
+        "Retention": "estimators.retention",
+        "RetentionRow": "rows.row",
         "RetentionTable": "table",
         "RetentionTableDisplay": "displays",
         "RoleCurvesDisplay": "displays",
         "SideTableDisplay": "displays",
-        "SuccessRate": "success",
+        "SuccessRate": "behaviour.success_rate",
         "SuccessTableDisplay": "displays",
-        "best_site": "measure",
+        "best_site": "estimators.retention",
         "chance_margin": "probe_kit.statistics.significance",
         "layer_curve": "displays",
-        "measure_retention": "measure",
-        "normalised_score": "success",
+        "measure_retention": "estimators.retention",
+        "normalised_score": "behaviour.success_rate",
         "retention": "table",
-        "sensitivity": "success",
-        "success_rate": "success",
+        "sensitivity": "behaviour.success_rate",
+        "success_rate": "behaviour.success_rate",
     },
 )

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit.console import err, marked, out, print_json_text, print_text, say, split, whole_number
+from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.retention import RetentionTable
-    from probe_kit.retention.measure import Iterations
-    from probe_kit.train.reader import RunReader
+    from probe_kit.retention.estimators.retention import Iterations
+    from probe_kit.train.data.run_reader import RunReader
 
 
 ASKED = "Asked runs"
@@ -80,12 +80,12 @@ def retention(
     partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action expert."""
-    from probe_kit.env.outcome import SENSITIVITY_RADII
-    from probe_kit.env.rules import check_rule
+    from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
+    from probe_kit.env.scoring.rules import check_rule
     from probe_kit.extract import open_run
     from probe_kit.retention import retention as make_table
-    from probe_kit.retention.asked import scored
-    from probe_kit.retention.ruled import check_epsilons
+    from probe_kit.retention.behaviour.vlm_answers import scored
+    from probe_kit.retention.rows.outcome_rules import check_epsilons
 
     check_epsilons(check_rule(rule), epsilons is not None)
     if last_steps < 1:
@@ -121,7 +121,7 @@ def retention(
     if figures is not None:
         _save_figures(shown, table, figures)
     if html is not None:
-        from probe_kit.extract.store.disk import in_units
+        from probe_kit.extract.store.locations.disk import in_units
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):

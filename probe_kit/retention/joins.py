@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from itertools import product
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.retention.asked import ask_of
-from probe_kit.retention.known import KnownUsed, join
-from probe_kit.retention.ruled import by_rule, can_be_judged
-from probe_kit.retention.success import listened
+from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.compare.known_used import KnownUsed, join
+from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 
 @dataclass(frozen=True)

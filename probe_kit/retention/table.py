@@ -4,28 +4,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from probe_kit.env.outcome import SENSITIVITY_RADII
-from probe_kit.env.rules import DEFAULT_RULE, check_rule
+from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
+from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
-from probe_kit.retention.asked import ask_of, left_out, scored
-from probe_kit.retention.comparisons import Compared, compare_runs
-from probe_kit.retention.differences import Difference, group_differences
-from probe_kit.retention.frames import frame_of
-from probe_kit.retention.gap import VlmGap, vlm_gaps
-from probe_kit.retention.mean_row import mean_row
-from probe_kit.retention.measure import Iterations
-from probe_kit.retention.mixtures import chosen_wordings, mixed_episodes, mixed_settings
-from probe_kit.retention.names import distinct_labels
-from probe_kit.retention.plain_tables import ANSWERS, PlainTable, answer_table, gap_tables, size_table
-from probe_kit.retention.rows import RetentionRow
-from probe_kit.retention.ruled import by_rule, can_be_judged, check_epsilons
-from probe_kit.retention.run_rows import Drawn, RowSettings, run_rows
-from probe_kit.retention.success import listened
-from probe_kit.retention.table_json import table_json
-from probe_kit.retention.wordings import WordingPair, wording_pairs
-from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults
-from probe_kit.train.store import is_current, load_results
+from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_episodes, mixed_settings
+from probe_kit.retention.behaviour.run_labels import distinct_labels
+from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
+from probe_kit.retention.behaviour.wordings import WordingPair, wording_pairs
+from probe_kit.retention.columns.text_table import ANSWERS, PlainTable, answer_table, gap_tables, size_table
+from probe_kit.retention.compare.differences import Difference, group_differences
+from probe_kit.retention.compare.pairing import Compared, compare_runs
+from probe_kit.retention.compare.vlm_vla import VlmGap, vlm_gaps
+from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.retention.formats.dataframe import frame_of
+from probe_kit.retention.formats.json import table_json
+from probe_kit.retention.rows.build import Drawn, RowSettings, run_rows
+from probe_kit.retention.rows.category_mean import mean_row
+from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged, check_epsilons
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import is_current, load_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,12 +55,12 @@ class RetentionTable:
     unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        from probe_kit.retention.notebook import table_text
+        from probe_kit.retention.formats.notebook import table_text
 
         return table_text(self.rows)
 
     def _repr_html_(self) -> str:
-        from probe_kit.retention.notebook import table_html
+        from probe_kit.retention.formats.notebook import table_html
 
         return table_html(self.all_rows, self.differences)
 
@@ -114,7 +114,7 @@ class RetentionTable:
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables."""
-        from probe_kit.retention.markdown import markdown
+        from probe_kit.retention.formats.markdown import markdown
 
         return markdown(
             self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
@@ -122,8 +122,8 @@ class RetentionTable:
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
-        from probe_kit.retention.conditions import condition_tables
-        from probe_kit.retention.latex import latex
+        from probe_kit.retention.columns.conditions import condition_tables
+        from probe_kit.retention.formats.latex import latex
 
         wordings = condition_tables([], self.wordings)
         further = [*wordings, *self.further_tables]
@@ -131,7 +131,7 @@ class RetentionTable:
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""
-        from probe_kit.retention.console import rich_tables
+        from probe_kit.retention.formats.terminal import rich_tables
 
         further = [table for table in self.further_tables if table.title != ANSWERS]  # its blocks say the same
         return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further, self.unpaired)
@@ -166,7 +166,7 @@ def retention(
     by default. iterations: which expert iterations take part.
     keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
     metres at which SR is scored again, for the rule `disc`. rule: by which episodes are judged, a name of
-    `probe_kit.env.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
+    `probe_kit.env.scoring.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
     trajectories has no success rate by another rule than `disc`. A run without activations or probes shows success
     rates only.
     score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count

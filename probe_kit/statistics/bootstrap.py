@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.identity import derive_seed
+from probe_kit.hashing import derive_seed
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Matrix = NDArray[np.float64]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.card import drawing_libraries, new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS, generators_of

@@ -5,9 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from probe_kit.console import counter, err, out, print_json, progress, split
+from probe_kit._system.bounded_json import parse_json
+from probe_kit._terminal.console import counter, err, out, print_json, progress, split
 from probe_kit.errors import UsageError
-from probe_kit.foreign_json import parse_json
 
 app = typer.Typer(help="Build, convert, check and look at suites of questions.", no_args_is_help=True)
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.items import Item
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NotRequired, TypedDict, Unpack
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.pictures import picture_file_name

@@ -17,8 +17,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from probe_kit._system.bounded_json import MOST_BYTES
 from probe_kit.errors import SuiteError, UsageError
-from probe_kit.foreign_json import MOST_BYTES
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.validation.findings import Finding, error, listing

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.identity import canonical_json, sha256_text
+from probe_kit.hashing import canonical_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories, in_order
 from probe_kit.suite.items import LAYOUTS, Episode, Item
 

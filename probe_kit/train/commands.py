@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from rich.text import Text
 
-from probe_kit.console import counter, marked, out, progress, say, split
+from probe_kit._terminal.console import counter, marked, out, progress, say, split
+from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
 from probe_kit.errors import UsageError
-from probe_kit.fitting_tables import Cell, FittingTable, Part
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
     from probe_kit.train import Baseline, FoldUnit, Incomplete, ProbeResults, RunReader, Target
-    from probe_kit.train.inventory import Inventory, StoredProbes
+    from probe_kit.train.results.inventory import Inventory, StoredProbes
 
 
 def train(
@@ -80,7 +80,7 @@ def train(
     """
     from probe_kit.extract import open_run
     from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes
-    from probe_kit.train.baselines import embedded_suite_of
+    from probe_kit.train.controls.baselines import embedded_suite_of
 
     asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
     units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
@@ -119,7 +119,7 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
     """A run and what is stored with it. further: lines below, by name."""
     from rich.table import Table
 
-    from probe_kit.extract.store.summary import NOT_PROTECTED
+    from probe_kit.extract.store.locations.summary import NOT_PROTECTED
 
     missing = found.planned - found.episodes
     outcomes = ", ".join(f"{name} {count}" for name, count in found.outcomes.items())
@@ -177,7 +177,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
 
 def _calls(text: str, run: "RunReader") -> list[int]:
     """The captured inferences that were asked for, each once."""
-    from probe_kit.train.at_call import captured_calls
+    from probe_kit.train.data.captured_call import captured_calls
 
     if text == "all":
         return list(range(captured_calls(run)))
@@ -209,7 +209,7 @@ def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
-    from probe_kit.train.summary import SITE_HEADINGS, best_sites
+    from probe_kit.train.results.summary import SITE_HEADINGS, best_sites
 
     mark = ", RANDOM WEIGHTS" if random_weights else ""
     mark += f", call {results.settings.call}"
@@ -229,7 +229,7 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
 
 
 def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
-    from probe_kit.train.summary import site_cells
+    from probe_kit.train.results.summary import site_cells
 
     return tuple(map(Cell, (*site_cells(row), _beats(row), str(row["n"]))))
 

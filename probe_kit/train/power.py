@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.paired import better_than_best, better_than_reference
 
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""

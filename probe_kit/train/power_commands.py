@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from probe_kit.console import err, out, print_json, split, whole_number
+from probe_kit._terminal.console import err, out, print_json, split, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def power(
 
 
 def _print(found: "list[Power]") -> None:
-    from probe_kit.fitting_tables import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
     from probe_kit.statistics.significance import detectable
 
     headings = (

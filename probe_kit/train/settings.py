@@ -2,9 +2,9 @@
 
 from dataclasses import asdict, dataclass
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.targets import Incomplete, Target
+from probe_kit.train.data.labels import Incomplete, Target
 
 FORMAT = 4  # raise when settings have other fields or would give other numbers
 

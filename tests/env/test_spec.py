@@ -7,7 +7,7 @@ import pytest
 from probe_kit.env import LimitSpec, SceneSpec
 from probe_kit.env.spec import PRESETS
 from probe_kit.errors import SceneError
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 
 
 @pytest.mark.parametrize(("side", "radius"), [(0.11, 0.065), (0.154, 0.087), (0.088, 0.054)])

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.s3_server import BadServer, S3Server, empty_bucket, server_elsewhere, without_conditions
+from tests.support.s3_server import BadServer, S3Server, empty_bucket, server_elsewhere, without_conditions
 
 
 @contextmanager

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from probe_kit.extract import open_run
-from probe_kit.extract.store.layout import COLUMNS
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.run_layout import COLUMNS
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
 
 
 def objects(run: str | Path | Location) -> dict[str, bytes]:

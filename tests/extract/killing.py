@@ -16,12 +16,13 @@ from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from probe_kit.extract.plan import Plan, make_plan
-from probe_kit.extract.play.rollout import Rollout
-from probe_kit.extract.play.staging import EpisodeBuffers
-from probe_kit.extract.store import commits, sealing, writer
-from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.store import sealing, writer
+from probe_kit.extract.store.format import commits
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.suite import load_suite
 
 STREAMS = [

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from little_run import certify, episode, little_plan, little_settings
 
 from probe_kit.extract import open_run, seal
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.suite import load_suite
 from probe_kit.train import train_probes

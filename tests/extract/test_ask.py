@@ -21,17 +21,17 @@ from probe_kit.extract import (
     prepare_asks,
     verify_run,
 )
-from probe_kit.extract.asking.templates import P1, P2, SEEN, Template
 from probe_kit.extract.plan import plan_episodes
-from probe_kit.extract.play.ask_controller import AskController, AskTurn
-from probe_kit.extract.play.examples import example_observations
-from probe_kit.extract.play.staging import EpisodeBuffers
 from probe_kit.extract.prepared import load_reader
+from probe_kit.extract.rollout.answer_controller import AskController, AskTurn
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.examples import example_observations
+from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
 from probe_kit.hooks import Question, Reader, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.suite import Suite, load_suite
-from tests.position_readers import PositionReader, always, likes
-from tests.prismatic_checkpoints import write_checkpoint
+from tests.support.position_readers import PositionReader, always, likes
+from tests.support.prismatic_checkpoints import write_checkpoint
 
 NOWHERE = EpisodeBuffers([], 1, with_tokens=False, pinned=False)
 SMALL = SceneSpec(picture_size=(224, 224))

@@ -7,7 +7,7 @@ from typer.testing import CliRunner, Result
 
 from probe_kit.cli import app
 from probe_kit.suite import Suite
-from tests.prismatic_checkpoints import write_checkpoint
+from tests.support.prismatic_checkpoints import write_checkpoint
 
 
 @pytest.fixture(scope="module")

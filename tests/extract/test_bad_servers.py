@@ -16,16 +16,16 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import ProbeKitError, StoreError
 from probe_kit.extract import Run, open_run, seal, verify_run
-from probe_kit.extract.store import bucket as buckets
-from probe_kit.extract.store.layout import COLUMNS
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.run_layout import COLUMNS
+from probe_kit.extract.store.locations import bucket as buckets
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from tests.extract.contents import objects
-from tests.little_run import episode, little_plan, little_writer
-from tests.s3_server import BadServer, now_and_then
+from tests.support.little_run import episode, little_plan, little_writer
+from tests.support.s3_server import BadServer, now_and_then
 
 EPISODES = 2
 SITE = Site("expert", 0, iteration=1)

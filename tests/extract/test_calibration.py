@@ -11,7 +11,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, calibration, extract_run, open_run, prepare
 from probe_kit.extract.calibration import choose, inference_times, largest_batch
-from probe_kit.extract.play.controllers import PolicyController
+from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.suite import Suite
 
 SHORT = SceneSpec(max_steps=2)

@@ -9,18 +9,18 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, seal, verify_run
 from probe_kit.extract.plan import make_plan
-from probe_kit.extract.play.rollout import Rollout
-from probe_kit.extract.play.staging import EpisodeBuffers
-from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
-from probe_kit.retention.call_curves import CallCurves
 from probe_kit.retention.displays import gallery
+from probe_kit.retention.estimators.by_call import CallCurves
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from probe_kit.train.calls import load_calls
+from probe_kit.train.results.by_call import load_calls
 
 STREAM = StoredStream("backbone", 2, 8, None, 6, ("mean", "last", "mean:language"))
 CALLS = 3

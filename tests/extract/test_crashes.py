@@ -15,7 +15,7 @@ import pytest
 
 from probe_kit.errors import DiskSpaceError
 from probe_kit.extract import open_run, verify_run
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.suite import Suite, build_suite
 
 KILLING = Path(__file__).with_name("killing.py")

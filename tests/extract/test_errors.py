@@ -21,12 +21,12 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import Extraction, ExtractSettings, extract_run, open_run, prepare
-from probe_kit.extract.crews.ray import RayActor
-from probe_kit.extract.play.stage import LocalStage
-from probe_kit.extract.play.stage_process import ProcessStage
+from probe_kit.extract.rollout.stage import LocalStage
+from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.extract.store.certificates import write_certificate
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.provenance import provenance_here
+from probe_kit.extract.workers.ray import RayActor
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
@@ -61,7 +61,7 @@ def test_a_stage_raises_the_same_error_wherever_it_stands(
 def test_an_arm_without_its_extra_is_said_before_anything_is_played(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("probe_kit.env.widowx.find_spec", lambda _name: None)
+    monkeypatch.setattr("probe_kit.env.robot.widowx.find_spec", lambda _name: None)
     settings = ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(arm="widowx"), env_workers=0)
     with pytest.raises(SceneError, match=r"Install `rtb-data") as caught:
         extract_run(settings, tmp_path / "run")

@@ -13,8 +13,8 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, SettingsMismatchError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
 from probe_kit.extract.store import provenance
-from probe_kit.extract.store.hashes import HASH
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.format.hashes import HASH
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.retention import retention
 from probe_kit.retention.report import report_html
 from probe_kit.suite import Suite, build_suite

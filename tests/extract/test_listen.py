@@ -13,15 +13,15 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
 from probe_kit.retention import retention
-from probe_kit.retention.differences import group_differences
-from probe_kit.retention.displays.gallery import gallery
+from probe_kit.retention.behaviour.success_rate import success_rate
+from probe_kit.retention.compare.differences import group_differences
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
+from probe_kit.retention.displays.report_figures import gallery
 from probe_kit.retention.report import write_report
-from probe_kit.retention.run_rows import RowSettings, run_rows
-from probe_kit.retention.success import success_rate
+from probe_kit.retention.rows.build import RowSettings, run_rows
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from tests.pi0_checkpoints import write_intact
+from tests.support.pi0_checkpoints import write_intact
 
 ACTING = ExtractSettings(
     "pi0-tiny", random_weights=True, categories=("color",), scene=SceneSpec(max_steps=4), env_workers=0

@@ -12,7 +12,7 @@ from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
-from tests.magma_checkpoints import write_checkpoint
+from tests.support.magma_checkpoints import write_checkpoint
 
 STEPS = 2
 

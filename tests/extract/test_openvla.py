@@ -11,7 +11,7 @@ from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite
-from tests.prismatic_checkpoints import config_values, write_checkpoint
+from tests.support.prismatic_checkpoints import config_values, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 

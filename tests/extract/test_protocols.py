@@ -11,11 +11,11 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.protocols import check_protocol, deviations, protocol_identity, protocol_scene
 from probe_kit.extract.settings import run_label
-from probe_kit.hooks.options import check_options
+from probe_kit.hooks.contract.options import check_options
 from probe_kit.hooks.registry import known_families
 from probe_kit.retention.report.provenance import provenance
 from probe_kit.suite import Suite
-from tests.pi0_checkpoints import write_intact
+from tests.support.pi0_checkpoints import write_intact
 
 # Section 4 of what is known of the release, in the words of the command line.
 RELEASED = {

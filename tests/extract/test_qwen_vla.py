@@ -13,7 +13,7 @@ from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
-from tests import internvla_checkpoints, xiaomi_checkpoints
+from tests.support import internvla_checkpoints, xiaomi_checkpoints
 
 EPISODES = 8
 

@@ -12,9 +12,9 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import MissingExtraError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
-from probe_kit.extract.crews.lost import WorkerLostWarning
-from probe_kit.extract.store.layout import COMMITS
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.run_layout import COMMITS
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.suite import build_suite
 from tests.extract.contents import objects
 from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for

@@ -11,7 +11,7 @@ import zarr
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.store.run import NotSealedWarning
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 
 SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))
 
@@ -123,7 +123,7 @@ def test_reading_a_run_needs_neither_torch_nor_simulator(recorded_run: Run) -> N
     code = f"""
 import sys
 from probe_kit.extract import open_run
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 run = open_run({str(recorded_run.path)!r})
 run.column(Site("backbone", 1)), run.tokens(Site("backbone", 1), "language"), run.gram(Site("backbone", 1))
 print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])

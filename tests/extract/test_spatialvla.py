@@ -13,8 +13,8 @@ from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
-from tests.prismatic_checkpoints import write_checkpoint as write_openvla
-from tests.spatialvla_checkpoints import write_checkpoint
+from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
+from tests.support.spatialvla_checkpoints import write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 

@@ -12,7 +12,7 @@ from probe_kit.extract.plan import plan_episodes
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import build_suite
-from probe_kit.train.inventory import inventory
+from probe_kit.train.results.inventory import inventory
 
 SHORT = SceneSpec(max_steps=2)
 LADDER = ("knowledge", "named", "side", "neutral")

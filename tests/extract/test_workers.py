@@ -13,8 +13,8 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
-from probe_kit.extract.play.stage_process import ProcessStage
-from probe_kit.hooks.observation import Observation
+from probe_kit.extract.rollout.stage_process import ProcessStage
+from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -71,7 +71,7 @@ def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -
 def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from probe_kit.extract.play.controllers import PolicyController
+    from probe_kit.extract.rollout.controllers import PolicyController
 
     poison = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[5]
     act = PolicyController.act

@@ -8,8 +8,8 @@ from probe_kit.hooks import Model, Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.smolvla.adapter import SmolVLA, load_smolvla
 from probe_kit.hooks.testing import AdapterContract
-from probe_kit.models.embedded import embedded_checkpoint
-from tests.smolvla_checkpoints import write_smolvla
+from probe_kit.models.embedded.folder import embedded_checkpoint
+from tests.support.smolvla_checkpoints import write_smolvla
 
 
 class TestPi0Tiny(AdapterContract):

@@ -13,16 +13,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, MissingExtraError, ProbeKitError, WeightsError
-from probe_kit.hooks.foreign_code import acting
+from probe_kit.hooks.checkpoints.third_party import acting
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
-from probe_kit.models.embedded import embedded_checkpoint
-from tests.internvla_checkpoints import write_checkpoint as write_internvla
-from tests.magma_checkpoints import write_checkpoint as write_magma
-from tests.prismatic_checkpoints import write_checkpoint as write_openvla
-from tests.prismatic_checkpoints import write_tokenizer
-from tests.spatialvla_checkpoints import write_checkpoint as write_spatialvla
-from tests.xiaomi_checkpoints import write_checkpoint as write_xiaomi
+from probe_kit.models.embedded.folder import embedded_checkpoint
+from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
+from tests.support.magma_checkpoints import write_checkpoint as write_magma
+from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
+from tests.support.prismatic_checkpoints import write_tokenizer
+from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
+from tests.support.xiaomi_checkpoints import write_checkpoint as write_xiaomi
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 FOLDERS = {
@@ -220,8 +220,8 @@ def test_counts_without_bound_are_refused_before_anything_is_built(family: str, 
 
 @pytest.mark.parametrize("name", ["../elsewhere.safetensors", "/etc/passwd", "", 7, None, ["a"], "a/b"])
 def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> None:
-    from probe_kit.hooks.checkpoint import missing_weights
-    from probe_kit.hooks.weights import INDEX_FILE, read_weights
+    from probe_kit.hooks.checkpoints.checkpoint import missing_weights
+    from probe_kit.hooks.checkpoints.weights import INDEX_FILE, read_weights
 
     (tmp_path / INDEX_FILE).write_text(json.dumps({"weight_map": {"a": name}}))
     assert "damaged" in missing_weights(tmp_path)

@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.play.examples import example_observations
+from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.hooks import Policy, Reader, capture, load_model
-from probe_kit.hooks.model import Question
-from tests.every_checkpoint import WRITERS
+from probe_kit.hooks.contract.model import Question
+from tests.support.every_checkpoint import WRITERS
 
 OF_LARGEST = 2e-3
 """Difference allowed, as a share of a site's largest value: other kernels, other roundings, layer after layer."""

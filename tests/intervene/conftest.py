@@ -8,7 +8,7 @@ import pytest
 
 from probe_kit.extract import Run, open_run
 from probe_kit.intervene import Source
-from probe_kit.intervene.bench import Bench, open_bench
+from probe_kit.intervene.replay.session import Bench, open_bench
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.extract import Run
 from probe_kit.intervene import Follow
-from probe_kit.intervene.effects import effects_csv
-from probe_kit.intervene.settings import key_of, settings_of
-from probe_kit.intervene.stored import save
+from probe_kit.intervene.results.results import effects_csv
+from probe_kit.intervene.store.answers import save
+from probe_kit.intervene.store.settings import key_of, settings_of
 from tests.intervene.answers import answers_of, follower, habit
 
 

@@ -27,11 +27,11 @@ from probe_kit.intervene import (
     intervene_on,
 )
 from probe_kit.suite import Suite
-from tests.internvla_checkpoints import write_checkpoint as write_internvla
-from tests.magma_checkpoints import write_checkpoint as write_magma
-from tests.prismatic_checkpoints import write_checkpoint as write_openvla
-from tests.spatialvla_checkpoints import write_checkpoint as write_spatialvla
-from tests.xiaomi_checkpoints import write_checkpoint as write_xiaomi
+from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
+from tests.support.magma_checkpoints import write_checkpoint as write_magma
+from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
+from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
+from tests.support.xiaomi_checkpoints import write_checkpoint as write_xiaomi
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
 ITEMS = 6

@@ -8,7 +8,7 @@ import pandas as pd
 
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings
-from probe_kit.train.results import episodes_sha256
+from probe_kit.train.results.probe_results import episodes_sha256
 
 SUITE = "suite@1#0123456789ab"
 ASK = {"prompt": "p1", "picture": "frame", "picture_size": "224x224", "object": "target"}

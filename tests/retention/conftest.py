@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site
-from probe_kit.identity import derive_seed
 from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings, save_results
-from probe_kit.train.results import episodes_sha256
+from probe_kit.train.results.probe_results import episodes_sha256
 
 
 def outcomes(correct: int, wrong: int, oob: int, category: str = "color") -> pd.DataFrame:

@@ -8,9 +8,9 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import Weighed
-from probe_kit.intervene.effects import effects_csv
-from probe_kit.intervene.settings import FORMAT, key_of
-from probe_kit.intervene.stored import WEIGHED, save
+from probe_kit.intervene.results.results import effects_csv
+from probe_kit.intervene.store.answers import WEIGHED, save
+from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.retention import retention
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, gallery
 from probe_kit.train import ArrayRun

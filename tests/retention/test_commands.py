@@ -10,7 +10,7 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.retention.commands import _keys
 from probe_kit.train import ArrayRun
-from probe_kit.train.inventory import inventory
+from probe_kit.train.results.inventory import inventory
 
 PATHS = ["runs/pi0", "elsewhere/smolvla/", "s3://bucket/study/run"]
 

@@ -34,9 +34,9 @@ from probe_kit.retention.displays import (
     role_curves,
     save_figures,
 )
+from probe_kit.retention.displays.base.label_placement import place_labels
+from probe_kit.retention.displays.base.style import FILLED, OPEN
 from probe_kit.retention.displays.heat_table import heat_colour
-from probe_kit.retention.displays.labels import place_labels
-from probe_kit.retention.displays.style import FILLED, OPEN
 from probe_kit.train import ArrayRun, load_results
 
 ProbedRun = Callable[..., ArrayRun]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.effects import effects_csv
-from probe_kit.intervene.settings import FORMAT, key_of
-from probe_kit.intervene.stored import save
+from probe_kit.intervene.results.results import effects_csv
+from probe_kit.intervene.store.answers import save
+from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.retention import retention
 from probe_kit.retention.displays import DoseResponseDisplay, dose_response, gallery
 from probe_kit.train import ArrayRun

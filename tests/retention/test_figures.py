@@ -23,8 +23,8 @@ from probe_kit.retention.displays import (
     gallery,
     save_figures,
 )
-from probe_kit.retention.displays.style import FILLED, OPEN
-from probe_kit.retention.heat import HEAT
+from probe_kit.retention.displays.base.style import FILLED, OPEN
+from probe_kit.retention.formats.heat import HEAT
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
 from tests.retention.conftest import runs_in
 

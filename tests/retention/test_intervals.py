@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy.special import stdtrit
 
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import (
     Difference,
     RetentionRow,
@@ -18,13 +18,13 @@ from probe_kit.retention import (
     measure_retention,
     retention,
 )
-from probe_kit.retention.bounded import area_fit, bounded_fit
-from probe_kit.retention.crossfit import GroupScores, crossfit
 from probe_kit.retention.displays import LayerCurveDisplay
-from probe_kit.retention.estimates import average, probe_estimates, sr_estimate
+from probe_kit.retention.estimators.bootstrap_draws import average, probe_estimates, sr_estimate
+from probe_kit.retention.estimators.combined import area_fit, bounded_fit
+from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train import ArrayRun, Curve, load_results
-from probe_kit.train.add_controls import add_twin
+from probe_kit.train.controls.fit_controls import add_twin
 
 ProbedRun = Callable[..., ArrayRun]
 PERFECT = ([1.0, 1.0], [[1.0, 1.0]])

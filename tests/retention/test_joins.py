@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.retention import retention
-from probe_kit.retention.asked import scored
+from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.columns.known_used_table import join_tables
+from probe_kit.retention.compare.known_used import join
 from probe_kit.retention.displays import KnownUsedDisplay, gallery
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.known import join
-from probe_kit.retention.known_tables import join_tables
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 

@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention
-from probe_kit.retention.differences import Difference
-from probe_kit.retention.report.readings import read_row, summarise
-from probe_kit.retention.report.tables import HtmlTable, behaviour_table, retention_table
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.formats.html import HtmlTable, behaviour_table, retention_table
+from probe_kit.retention.report.summaries import read_row, summarise
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]

@@ -15,19 +15,19 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention
-from probe_kit.retention.displays.gallery import gallery
+from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.displays.report_figures import gallery
+from probe_kit.retention.formats.html import behaviour_table, control_table, retention_table
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
-from probe_kit.retention.report.glossary import GLOSSARY
 from probe_kit.retention.report.provenance import citation
-from probe_kit.retention.report.readings import _clear_words, summarise
-from probe_kit.retention.report.tables import behaviour_table, control_table, retention_table
+from probe_kit.retention.report.summaries import _clear_words, summarise
 from probe_kit.train import ArrayRun, load_results
-from probe_kit.train.controls import Controls
-from probe_kit.train.store import save_results
+from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.store import save_results
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
@@ -119,8 +119,8 @@ from pathlib import Path
 import pandas as pd
 from probe_kit.retention.report import write_report
 from probe_kit.train import ArrayRun, load_results
-from probe_kit.train.controls import Controls
-from probe_kit.train.store import save_results
+from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.store import save_results
 episodes = pd.read_json({str(tmp_path / "episodes.json")!r})
 write_report([ArrayRun(Path({str(tmp_path)!r}), "pi0", "suite", episodes, {{}})], {str(tmp_path / "r.html")!r})
 print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])

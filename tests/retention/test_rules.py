@@ -10,15 +10,15 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.env.rules import RULES
-from probe_kit.env.trajectory import Trajectory
+from probe_kit.env.scoring.rules import RULES
+from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
-from probe_kit.extract.store.trajectories import Trajectories
+from probe_kit.extract.store.format.trajectories import Trajectories
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention, success_rate
 from probe_kit.retention.displays import gallery
 from probe_kit.retention.report import report_html
-from probe_kit.retention.ruled import rule_sentence
+from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.statistics.bootstrap import bootstrap_means, bootstrap_ratios
 from probe_kit.suite import build_suite
 from probe_kit.train import ArrayRun

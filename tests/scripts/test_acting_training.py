@@ -20,8 +20,8 @@ from vlm_tiny_training.training import Stage, Trainer
 
 from probe_kit.env.expert import MAX_SHIFT, OPEN
 from probe_kit.env.question import Question
-from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
+from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
 
 SURFACE = "sheet"
 

@@ -16,7 +16,7 @@ from vlm_tiny_training.window import seen
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.env.question import Question
 from probe_kit.env.scene import SIDES
-from probe_kit.models.vlm_tiny import new_vlm_tiny, write_vlm_tiny
+from probe_kit.models.embedded.vlm_tiny import new_vlm_tiny, write_vlm_tiny
 
 PRESETS = ("bridge", "act2answer")
 LETTERS = {("A", True): 0, ("A", False): 1, ("B", True): 1, ("B", False): 0}

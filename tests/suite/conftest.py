@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from probe_kit.suite import Suite, build_suite, load_suite
-from tests.made_once import made_once
+from tests.support.made_once import made_once
 
 
 @pytest.fixture(scope="session")

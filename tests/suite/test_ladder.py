@@ -4,7 +4,7 @@ import pytest
 
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite import Episode, build_suite, validate_suite
-from probe_kit.suite.generators.pictograms import PICTOGRAMS
+from probe_kit.suite.generators.drawing.pictograms import PICTOGRAMS
 from probe_kit.suite.items import Item
 from probe_kit.suite.ladder import WORDINGS, check_wordings, in_words
 from probe_kit.suite.validation.records import check_record

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from threadpoolctl import threadpool_limits
 
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site, Stream
-from probe_kit.identity import derive_seed
 from probe_kit.train import ArrayRun
 
 PlantedRun = Callable[..., ArrayRun]

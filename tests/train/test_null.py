@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from probe_kit.train.permutation import family_p, flip_groups, site_p
-from probe_kit.train.probe import nested_folds, probe_site
-from probe_kit.train.samples import Samples
-from probe_kit.train.scores import correctness
+from probe_kit.statistics.label_permutations import family_p, flip_groups, site_p
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
 
 ITEMS = np.repeat(np.arange(20), 2)
 LABELS = np.tile([True, False], 20)

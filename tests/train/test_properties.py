@@ -5,9 +5,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe_kit.train.features import Coordinates
-from probe_kit.train.probe import STRENGTHS
-from probe_kit.train.solver import LogisticSolver
+from probe_kit.train.crossval.site_probe import STRENGTHS
+from probe_kit.train.solver.logistic import LogisticSolver
+from probe_kit.train.solver.projection import Coordinates
 
 SHAPES = {"count": st.integers(8, 40), "width": st.integers(1, 60), "seed": st.integers(0, 2**31)}
 

@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.commits import create_once
-from probe_kit.extract.store.hashes import HASH, read_plain, read_record
-from probe_kit.extract.store.layout import CERTIFICATE_FILE, CERTIFICATES
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.run_layout import CERTIFICATE_FILE, CERTIFICATES
+from probe_kit.extract.store.format.commits import create_once
+from probe_kit.extract.store.format.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.format.root import RESTORE, Root
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import Provenance, name_of
-from probe_kit.extract.store.root import RESTORE, Root
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 
 Record = dict[str, Any]
 DIGITS = 16

@@ -13,12 +13,12 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.rows import Rows
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.store.format.rows import Rows
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
-from probe_kit.extras import require
 
 
 def export_run(path: Path | str | Location, style: str, out: Path, allow_partial: bool = False) -> Path:

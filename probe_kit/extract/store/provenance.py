@@ -16,12 +16,12 @@ from typing import Any
 
 import probe_kit.version
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
-from probe_kit.extract.store.commits import create_once
-from probe_kit.extract.store.hashes import HASH, read_plain, read_record
-from probe_kit.extract.store.layout import PROVENANCE
-from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.root import Root
-from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.extract.run_layout import PROVENANCE
+from probe_kit.extract.store.format.commits import create_once
+from probe_kit.extract.store.format.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.hashing import sha256_json, sha256_text
 
 Provenance = Mapping[str, Any]
 

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from zarr.abc.store import Store
 
-from probe_kit.env.rules import DEFAULT_RULE, check_rule
+from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
     RunDamagedError,
@@ -20,11 +20,12 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract.store.arrays import open_array
+from probe_kit.extract.run_layout import DATA, PROVENANCE, RUN_FILE, StoredStream
 from probe_kit.extract.store.certificates import read_certificate
-from probe_kit.extract.store.checking import CheckedStore
-from probe_kit.extract.store.columns import Columns, find_columns
-from probe_kit.extract.store.commits import (
+from probe_kit.extract.store.format.arrays import open_array
+from probe_kit.extract.store.format.checking import CheckedStore
+from probe_kit.extract.store.format.columns import Columns, find_columns
+from probe_kit.extract.store.format.commits import (
     Commit,
     committed_sums,
     read_commits,
@@ -32,24 +33,23 @@ from probe_kit.extract.store.commits import (
     redo,
     stamp_of,
 )
-from probe_kit.extract.store.hashes import Sum
-from probe_kit.extract.store.judging import Watched, judged, watch, with_outcomes
-from probe_kit.extract.store.layout import DATA, PROVENANCE, RUN_FILE, StoredStream
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.format.hashes import Sum
+from probe_kit.extract.store.format.root import RESTORE, read_root
+from probe_kit.extract.store.format.rows import Rows, TokenBlock, role_mask, token_blocks
+from probe_kit.extract.store.format.trajectories import NAME as TRAJECTORY
+from probe_kit.extract.store.format.trajectories import Trajectories, has_trajectories, names_trajectory
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.locations.summary import run_html, run_text
+from probe_kit.extract.store.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.extract.store.provenance import Provenance, differences, read_provenances
-from probe_kit.extract.store.root import RESTORE, read_root
-from probe_kit.extract.store.rows import Rows, TokenBlock, role_mask, token_blocks
-from probe_kit.extract.store.summary import run_html, run_text
-from probe_kit.extract.store.trajectories import NAME as TRAJECTORY
-from probe_kit.extract.store.trajectories import Trajectories, has_trajectories, names_trajectory
-from probe_kit.hooks.sites import Site, Stream
-from probe_kit.hooks.views import resolve_view
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import resolve_view
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from probe_kit.env.trajectory import Trajectory
+    from probe_kit.env.scoring.trajectory import Trajectory
 
 
 _OUTCOME = ("outcome", "side_placed")
@@ -294,7 +294,7 @@ class Run:
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
         """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
-        rule: a name of `probe_kit.env.rules.RULES`. last_steps: control steps at the end that count; the released
+        rule: a name of `probe_kit.env.scoring.rules.RULES`. last_steps: control steps at the end that count; the released
         evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
         if last_steps == 1:
@@ -312,7 +312,7 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.behaviour`.
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.behaviour`.
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """

@@ -8,14 +8,14 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from probe_kit.extract.store.arrays import codecs
-from probe_kit.extract.store.columns import write_seal
-from probe_kit.extract.store.layout import COLUMNS, SEALED
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
-from probe_kit.extract.store.recording import RecordingStore
+from probe_kit.extract.run_layout import COLUMNS, SEALED
+from probe_kit.extract.store.format.arrays import codecs
+from probe_kit.extract.store.format.columns import write_seal
+from probe_kit.extract.store.format.recording import RecordingStore
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run
-from probe_kit.hooks.views import PADDING
+from probe_kit.hooks.contract.views import PADDING
 
 EPISODES_PER_CHUNK = 1024
 # What is held in memory at a time; all rows are read once more for every further slab.

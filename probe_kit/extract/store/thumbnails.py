@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.store.commits import read_pictures, redo_picture
-from probe_kit.extract.store.layout import FRAMES
-from probe_kit.extract.store.locate import locate
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.run_layout import FRAMES
+from probe_kit.extract.store.format.commits import read_pictures, redo_picture
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
 
 HEIGHT = 120
 """Pixels; a pair of 4:3 frames is 320 wide and takes about 2 kB."""

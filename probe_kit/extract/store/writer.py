@@ -16,13 +16,16 @@ from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.extract.plan import Plan, PlannedEpisode
+from probe_kit.extract.run_layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
 from probe_kit.extract.settings import refuse_other_plan, refuse_other_settings
-from probe_kit.extract.store.arrays import create_arrays
 from probe_kit.extract.store.certificates import write_certificate
-from probe_kit.extract.store.commits import read_commits, write_commit, write_failure
-from probe_kit.extract.store.hashes import Sum, as_json
-from probe_kit.extract.store.layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
-from probe_kit.extract.store.location import Location
+from probe_kit.extract.store.format.arrays import create_arrays
+from probe_kit.extract.store.format.commits import read_commits, write_commit, write_failure
+from probe_kit.extract.store.format.hashes import Sum, as_json
+from probe_kit.extract.store.format.recording import RecordingStore
+from probe_kit.extract.store.format.root import Root, new_root, read_root
+from probe_kit.extract.store.format.trajectories import create_trajectories, has_trajectories, write_trajectory
+from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import (
     Provenance,
     keep_provenance,
@@ -31,10 +34,7 @@ from probe_kit.extract.store.provenance import (
     read_provenances,
     refuse_other_provenance,
 )
-from probe_kit.extract.store.recording import RecordingStore
-from probe_kit.extract.store.root import Root, new_root, read_root
-from probe_kit.extract.store.trajectories import create_trajectories, has_trajectories, write_trajectory
-from probe_kit.identity import canonical_json
+from probe_kit.hashing import canonical_json
 
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
 # a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.

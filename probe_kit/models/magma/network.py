@@ -16,7 +16,7 @@ from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
 from probe_kit.models.magma.pictures import Grid, Picture
 from probe_kit.models.magma.vision import Projector, VisionTower, map_size, stitched, whole_picture
-from probe_kit.models.memory import Memory
+from probe_kit.models.prompt_kv import Memory
 
 Choose = Callable[[Tensor], Tensor]
 """Ids (B,) from logits (B, V)."""

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import CheckpointError
-from probe_kit.extras import require
 from probe_kit.models.magma.config import VisionConfig
 from probe_kit.models.magma.pictures import Grid, Picture
 

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from transformers import AutoModelForCausalLM, DynamicCache
 
 from probe_kit.models.building import build_empty
-from probe_kit.models.memory import Memory
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
+from probe_kit.models.prompt_kv import Memory
 
 
 class Projector(nn.Module):

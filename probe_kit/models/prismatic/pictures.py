@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import CheckpointError
-from probe_kit.extras import require
 from probe_kit.models.prismatic.config import RESIZE_STRATEGIES, PrismaticConfig
 
 Colour = tuple[float, float, float]

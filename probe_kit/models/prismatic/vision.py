@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from probe_kit.extras import require
+from probe_kit._system.optional_dependencies import require
 from probe_kit.models.prismatic.config import TowerConfig
 
 

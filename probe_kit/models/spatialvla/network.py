@@ -13,7 +13,7 @@ from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, Zoe
 
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.models.building import build_empty
-from probe_kit.models.memory import Memory
+from probe_kit.models.prompt_kv import Memory
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, estimate_depth, fill_depth_buffers
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 
-from probe_kit.models.memory import Memory
+from probe_kit.models.prompt_kv import Memory
 from probe_kit.models.qwen import QwenInputs, build_empty, fill_rotary
 from probe_kit.models.xiaomi.config import FlowConfig, XiaomiConfig
 from probe_kit.models.xiaomi.transformer import Cache, FlowTransformer, Projector, TimeEmbedder

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations
 
 DEFAULT_ROBOT = "bridge_delta"

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.places import ALL, TILE_ROLES
-from probe_kit.intervene.weighed import CORRECT, OTHER, Axis, Weighed, stored_attention
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.panelled import Panelled, in_panels
-from probe_kit.retention.displays.style import layer_axis, series
+from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
+from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Axis, Weighed, stored_attention
+from probe_kit.retention.displays.base.panels import Panelled, in_panels
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,14 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.env.events import EVENTS
+from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
-from probe_kit.hooks.sites import label_of
-from probe_kit.retention.call_curves import AlignedLine, CallCurves, CallLine, EventCalls, EventTimes
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.selection import known_view
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import known_view
+from probe_kit.retention.displays.base.style import (
     PARTS,
     accuracy_axis,
     axes_for,
@@ -22,8 +21,9 @@ from probe_kit.retention.displays.style import (
     plain,
     significance_handles,
 )
+from probe_kit.retention.estimators.by_call import AlignedLine, CallCurves, CallLine, EventCalls, EventTimes
 from probe_kit.retention.text import spell
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.hooks.sites import MEMORY_STREAM
-from probe_kit.intervene.inside import BACKBONE, stored_passing
-from probe_kit.intervene.passing import Passing
-from probe_kit.intervene.places import ALL
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.selection import curve_of, scores_of
-from probe_kit.retention.displays.style import layer_axis, series
+from probe_kit.hooks.contract.sites import MEMORY_STREAM
+from probe_kit.intervene.edits.sites import ALL
+from probe_kit.intervene.kinds.site_effects import Passing
+from probe_kit.intervene.results.site_maps import BACKBONE, stored_passing
+from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import curve_of, scores_of
+from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

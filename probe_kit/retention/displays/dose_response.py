@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.inside import stored_steering
-from probe_kit.intervene.passing import Passing
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.panelled import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.style import GREY, series
+from probe_kit.intervene.kinds.site_effects import Passing
+from probe_kit.intervene.results.site_maps import stored_steering
+from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import GREY, series
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

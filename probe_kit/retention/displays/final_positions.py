@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
+from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

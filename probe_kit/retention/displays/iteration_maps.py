@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import FILLED, PARTS, axes_for, caption, legend_above, panels
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.cells import model_name
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.labels import place_labels
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.label_placement import place_labels
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import (
     axes_for,
     caption,
     darker,
@@ -18,7 +18,7 @@ from probe_kit.retention.displays.style import (
     series,
     significance_handles,
 )
-from probe_kit.retention.rows import RetentionRow
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
 

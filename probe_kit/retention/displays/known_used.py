@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.compare.known_used import KnownUsed
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.style import (
     BLUE,
     GREEN,
     GREY,
@@ -18,7 +19,6 @@ from probe_kit.retention.displays.style import (
     legend_above,
     plain,
 )
-from probe_kit.retention.known import KnownUsed
 from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class KnownUsedDisplay(Shown):
 
     @classmethod
     def from_join(cls, joined: KnownUsed) -> Self:
-        """From what `probe_kit.retention.known.join` gives."""
+        """From what `probe_kit.retention.compare.known_used.join` gives."""
         seen = f"probes in view {joined.view}" if joined.view else "no probes"
         return cls(
             title=f"{joined.asked} (by {joined.score}) · {joined.acted}",

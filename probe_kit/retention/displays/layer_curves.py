@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.selection import curve_of, known_view, scores_of
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.base.style import (
     DPI,
     PARTS,
     Line,
@@ -24,9 +23,10 @@ from probe_kit.retention.displays.style import (
     plain,
     significance_handles,
 )
-from probe_kit.retention.measure import Iterations
+from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
+from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -134,7 +134,7 @@ def _pairs(displays: Sequence[LayerCurveDisplay], own: bool = False) -> "tuple[F
     """
     from matplotlib import pyplot as plt
 
-    from probe_kit.retention.displays.shown_figure import ShownFigure
+    from probe_kit.retention.displays.base.shown_figure import ShownFigure
 
     streams = max(len(display.streams) for display in displays)
     across = 1 if len(displays) == 1 else max(1, 4 // streams)

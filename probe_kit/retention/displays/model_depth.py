@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.sites import label_of
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.selection import known_view, of_iterations, scores_of
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import (
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.behaviour.run_labels import full_name
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import known_view, of_iterations, scores_of
+from probe_kit.retention.displays.base.style import (
     ABOVE_CHANCE,
     axes_for,
     caption,
@@ -21,9 +22,8 @@ from probe_kit.retention.displays.style import (
     plain,
     series,
 )
-from probe_kit.retention.measure import Iterations
-from probe_kit.retention.names import full_name
-from probe_kit.train.results import ProbeResults
+from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -114,7 +114,7 @@ def model_depths(
     names: Sequence[str] | None = None,
 ) -> "Figure":
     """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
-    from probe_kit.retention.displays.shown_figure import ShownFigure
+    from probe_kit.retention.displays.base.shown_figure import ShownFigure
 
     found = {
         (str(part), str(name))

@@ -4,15 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.env.rules import DEFAULT_RULE, RULES
+from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
-from probe_kit.retention.names import full_names
-from probe_kit.retention.ruled import Judged
-from probe_kit.retention.success import shares_of
-from probe_kit.train.reader import RunReader
+from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.behaviour.success_rate import shares_of
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
+from probe_kit.retention.rows.outcome_rules import Judged
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
-from probe_kit.retention.success import PairedItems, paired_items
+from probe_kit.retention.behaviour.success_rate import PairedItems, paired_items
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,13 +5,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks.sites import label_of
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.layer_curves import draw_line
-from probe_kit.retention.displays.selection import curve_of, scores_of
-from probe_kit.retention.displays.showing import Shown
-from probe_kit.retention.displays.stream_curve import StreamCurve
-from probe_kit.retention.displays.style import (
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import curve_of, scores_of
+from probe_kit.retention.displays.base.style import (
     accuracy_axis,
     axes_for,
     caption,
@@ -22,9 +20,11 @@ from probe_kit.retention.displays.style import (
     series,
     significance_handles,
 )
-from probe_kit.retention.measure import Iterations
+from probe_kit.retention.displays.layer_curves import draw_line
+from probe_kit.retention.displays.stream_curve import StreamCurve
+from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

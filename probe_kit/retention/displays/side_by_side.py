@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, draw_legend, draw_map, draw_scale
-from probe_kit.retention.displays.layer_curves import draw_line
-from probe_kit.retention.displays.selection import scores_of
-from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.selection import scores_of
+from probe_kit.retention.displays.base.style import (
     accuracy_axis,
     caption,
     layer_axis,
@@ -22,9 +19,12 @@ from probe_kit.retention.displays.style import (
     series,
     significance_handles,
 )
-from probe_kit.retention.measure import Iterations
+from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, draw_legend, draw_map, draw_scale
+from probe_kit.retention.displays.layer_curves import draw_line
+from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
+from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
-from probe_kit.train.results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

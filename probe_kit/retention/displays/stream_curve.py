@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hooks.sites import label_of
-from probe_kit.retention.displays.selection import of_iterations
-from probe_kit.retention.measure import Iterations
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.displays.base.selection import of_iterations
+from probe_kit.retention.estimators.retention import Iterations
 
 if TYPE_CHECKING:
     import pandas as pd

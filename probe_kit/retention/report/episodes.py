@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from probe_kit.extract.store.thumbnails import read_thumbnail
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 
 PICTURES = 4000
 """Episodes a report shows with pictures, over all runs; one full suite of 3,440 makes about 10 MB of them."""

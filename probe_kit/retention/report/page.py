@@ -7,28 +7,28 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.cells import model_name
-from probe_kit.retention.conditions import condition_tables, rule_sentences
-from probe_kit.retention.displays.gallery import Exhibit, gallery
-from probe_kit.retention.heat import heat_key
-from probe_kit.retention.joins import joins_of
-from probe_kit.retention.known_tables import join_tables
-from probe_kit.retention.report.episodes import PICTURES, episode_grid
-from probe_kit.retention.report.glossary import GLOSSARY
-from probe_kit.retention.report.pictures import data_uri
-from probe_kit.retention.report.provenance import citation, provenance
-from probe_kit.retention.report.readings import Summary, summarise
-from probe_kit.retention.report.tables import (
+from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
+from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.columns.known_used_table import join_tables
+from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.displays.report_figures import Exhibit, gallery
+from probe_kit.retention.formats.heat import heat_key
+from probe_kit.retention.formats.html import (
     behaviour_table,
     control_table,
     more_behaviour_table,
     plain_tables,
     retention_table,
 )
-from probe_kit.retention.ruled import by_rule
-from probe_kit.retention.story import stories
+from probe_kit.retention.joins import joins_of
+from probe_kit.retention.report.category_summary import stories
+from probe_kit.retention.report.episodes import PICTURES, episode_grid
+from probe_kit.retention.report.pictures import data_uri
+from probe_kit.retention.report.provenance import citation, provenance
+from probe_kit.retention.report.summaries import Summary, summarise
+from probe_kit.retention.rows.outcome_rules import by_rule
 from probe_kit.retention.table import RetentionTable, retention
-from probe_kit.train.reader import RunReader
+from probe_kit.train.data.run_reader import RunReader
 from probe_kit.version import __version__
 
 _HERE = Path(__file__).parent

@@ -3,7 +3,7 @@
 from base64 import b64encode
 from io import BytesIO
 
-from probe_kit.retention.displays.gallery import Exhibit, caption_of
+from probe_kit.retention.displays.report_figures import Exhibit, caption_of
 
 SVG_LIMIT = 600_000
 """Bytes; a figure of more is kept as pixels."""
@@ -13,7 +13,7 @@ def data_uri(exhibit: Exhibit) -> tuple[str, str]:
     """The drawn figure as SVG, or PNG if that would be large, with its caption. A figure gives the same bytes."""
     import matplotlib as mpl
 
-    from probe_kit.retention.displays.shown_figure import PRINT_DPI
+    from probe_kit.retention.displays.base.shown_figure import PRINT_DPI
 
     with exhibit.drawn() as figure, mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "path"}):
         svg = BytesIO()

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from probe_kit.extract.store.summary import NOT_PROTECTED
-from probe_kit.retention.displays.certificate import Certificate
-from probe_kit.train.reader import RunReader
-from probe_kit.train.results import ProbeResults
+from probe_kit.extract.store.locations.summary import NOT_PROTECTED
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
 
 PAPER = "arXiv:2606.19297"

@@ -8,7 +8,7 @@ from typing import Any
 
 from PIL import Image
 
-from probe_kit.identity import sha256_text
+from probe_kit.hashing import sha256_text
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Any
 
 from PIL import Image
 
+from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import SuiteError
-from probe_kit.foreign_json import parse_json
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
 from probe_kit.suite.wording import instruction_for

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.converters.candidates import Reading, SourcePicture
 from probe_kit.suite.converters.pairing import Bundle, Proposal
 from probe_kit.suite.items import Item, Side, other_side

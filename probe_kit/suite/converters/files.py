@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import SuiteError
-from probe_kit.foreign_json import parse_json
 from probe_kit.suite.pictures import WHITE, decode_picture
 
 MARGIN = 0.08  # of the longer side, around trimmed art

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import SuiteError, UsageError
-from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.converters.candidates import Candidate, Wording
 from probe_kit.suite.converters.options import ConvertOptions
 from probe_kit.suite.wording import instruction_for

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.converters.candidates import Candidate, SourcePicture, Wording
 from probe_kit.suite.wording import instruction_for
 

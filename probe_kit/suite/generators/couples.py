@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.identity import derive_seed
+from probe_kit.hashing import derive_seed
 from probe_kit.suite.generators.generator import Concept, Generator, Tile
 
 SUITE_NAME = "a2a-embedded"

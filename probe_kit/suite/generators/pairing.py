@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.generators.generator import Concept
 
 

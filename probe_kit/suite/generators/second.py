@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.suite.generators.attribute import ATTRIBUTE
-from probe_kit.suite.generators.canvas import Placement
-from probe_kit.suite.generators.color import COLOR
-from probe_kit.suite.generators.figure import Figure
+from probe_kit.suite.generators.categories.attribute import ATTRIBUTE
+from probe_kit.suite.generators.categories.color import COLOR
+from probe_kit.suite.generators.categories.shape import SHAPE
+from probe_kit.suite.generators.categories.traffic import TRAFFIC
+from probe_kit.suite.generators.drawing.canvas import Placement
+from probe_kit.suite.generators.drawing.figure import Figure
+from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, RGB, jittered, lightness
 from probe_kit.suite.generators.generator import Concept, Generator
-from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, RGB, jittered, lightness
-from probe_kit.suite.generators.shape import SHAPE
-from probe_kit.suite.generators.traffic import TRAFFIC
 
 _LEAST_LIGHTNESS = 110
 """Of a background: dark edges must stand out from it."""

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Any
 
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.generators import generators_of
 from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUITE_VERSIONS, Couple, draw_couples

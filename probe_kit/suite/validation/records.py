@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
-from probe_kit.foreign_json import parse_json
-from probe_kit.plain_text import visible
+from probe_kit._system.bounded_json import parse_json
+from probe_kit._terminal.plain_text import visible
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
 from probe_kit.suite.ladder import WORDINGS

@@ -12,10 +12,10 @@ from PIL import Image
 
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
 from probe_kit.suite.items import Item
-from probe_kit.suite.looks import NEAR_DUPLICATE_BITS, Look, look_of
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite, count_by_category
 from probe_kit.suite.validation.findings import Finding, warning
+from probe_kit.suite.validation.near_duplicates import NEAR_DUPLICATE_BITS, Look, look_of
 from probe_kit.suite.validation.rules import SIDES
 
 LEAST_ROLE_BALANCE = 0.4

@@ -9,7 +9,7 @@ from safetensors import safe_open
 
 from probe_kit.errors import MissingExtraError, RunDamagedError, UsageError
 from probe_kit.extract import Run, export_run
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 
 SITE = Site("expert", 3, iteration=7)
 

@@ -16,12 +16,12 @@ from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
-from probe_kit.train.inventory import inventory
+from probe_kit.train.results.inventory import inventory
 
 STORED = Path(__file__).parents[2] / "golden" / "run-schema-1"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((STORED / "expected.json").read_text())

@@ -9,8 +9,8 @@ import zarr
 
 from probe_kit.errors import RunDamagedError, RunNotFoundError, UnknownSiteError
 from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.arrays import decode_bfloat16
-from probe_kit.hooks.sites import Site
+from probe_kit.extract.store.format.arrays import decode_bfloat16
+from probe_kit.hooks.contract.sites import Site
 
 
 @pytest.fixture

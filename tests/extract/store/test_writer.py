@@ -5,12 +5,12 @@ import pytest
 
 from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.plan import make_plan
-from probe_kit.extract.play.rollout import Rollout
-from probe_kit.extract.play.staging import EpisodeBuffers
-from probe_kit.extract.store.layout import StoredStream
-from probe_kit.extract.store.locate import locate
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
-from probe_kit.hooks.sites import Site
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.suite import Suite
 
 STREAM = StoredStream("backbone", 2, 8, None, 300, ("mean", "last"))

@@ -7,7 +7,7 @@ import yaml
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.internvla import InternVLAConfig, find_config
-from tests.internvla_checkpoints import COT, config, dims_values, run_values, vlm_values
+from tests.support.internvla_checkpoints import COT, config, dims_values, run_values, vlm_values
 
 
 def named(**framework: Any) -> InternVLAConfig:

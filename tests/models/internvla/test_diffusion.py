@@ -5,7 +5,7 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.models.internvla import InternVLANetwork, Schedule
-from tests.internvla_checkpoints import network
+from tests.support.internvla_checkpoints import network
 
 
 @pytest.fixture(scope="module")

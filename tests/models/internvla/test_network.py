@@ -16,8 +16,8 @@ from probe_kit.models.internvla import (
     full_size_internvla,
 )
 from probe_kit.models.qwen import QwenInputs, pack_inputs
-from tests.internvla_checkpoints import config, network, vlm_values
-from tests.qwen_checkpoints import ID
+from tests.support.internvla_checkpoints import config, network, vlm_values
+from tests.support.qwen_checkpoints import ID
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import torch
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.magma import MagmaConfig, build_magma
-from tests.magma_checkpoints import IDS, config_values
+from tests.support.magma_checkpoints import IDS, config_values
 
 
 def test_everything_comes_from_the_file() -> None:

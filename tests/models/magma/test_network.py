@@ -13,7 +13,7 @@ from probe_kit.models.magma import (
     full_size_magma,
     prepare_picture,
 )
-from tests.magma_checkpoints import IDS, action_ids, config_values, small_network, weights
+from tests.support.magma_checkpoints import IDS, action_ids, config_values, small_network, weights
 
 IMAGE = IDS["<image>"]
 SHORT, LONG = [3, 40, IMAGE, 50, 9], [3, 41, 42, 43, IMAGE, 51, 52, 9]

@@ -16,7 +16,7 @@ from probe_kit.models.magma import (
     prepare_picture,
     shrink_picture,
 )
-from tests.magma_checkpoints import config_values
+from tests.support.magma_checkpoints import config_values
 
 SETTINGS = PictureSettings(64, 4)
 

@@ -3,7 +3,7 @@ from pathlib import Path
 from tokenizers import Tokenizer
 
 from probe_kit.models.magma import ACTION_QUESTION, chat_text, conversation, picture_question
-from tests.magma_checkpoints import IDS, write_tokenizer
+from tests.support.magma_checkpoints import IDS, write_tokenizer
 
 
 def question(start_end: bool = True) -> str:

@@ -6,7 +6,7 @@ import torch
 
 from probe_kit.models.ovis2_5 import PICTURE, PICTURE_BEGINS, PICTURE_ENDS, OvisConfig, OvisNetwork, build_ovis2_5
 from probe_kit.models.ovis2_5.vision import word_order
-from tests.vlm_checkpoints import write_ovis2_5
+from tests.support.vlm_checkpoints import write_ovis2_5
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.prismatic import PrismaticConfig
-from tests.prismatic_checkpoints import config_values
+from tests.support.prismatic_checkpoints import config_values
 
 
 def test_a_short_config_is_completed_from_the_table_and_transformers_defaults() -> None:

@@ -10,7 +10,7 @@ from probe_kit.models.prismatic import (
     full_size_openvla,
     full_size_prismatic,
 )
-from tests.prismatic_checkpoints import FUSED, config_values
+from tests.support.prismatic_checkpoints import FUSED, config_values
 
 VISION = [FUSED, "dinoclip-vit-l-336px", "clip-vit-l", "siglip-vit-so400m", "dinov2-vit-l", "in1k-vit-l"]
 LANGUAGE = ["llama2-7b-pure", "vicuna-v15-7b", "mistral-v0.1-7b-pure", "phi-2-3b"]

@@ -11,7 +11,7 @@ from torchvision.transforms.functional import InterpolationMode
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.prismatic import PictureSettings, PrismaticConfig, centre_crop, prepare_picture
-from tests.prismatic_checkpoints import config_values
+from tests.support.prismatic_checkpoints import config_values
 
 SHAPES = [(48, 64), (65, 40), (28, 28), (29, 90), (90, 29)]
 

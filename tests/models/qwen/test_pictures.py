@@ -9,7 +9,7 @@ from PIL import Image
 
 from probe_kit.errors import CheckpointError, ObservationError
 from probe_kit.models.qwen import QwenPictures, merged_tokens
-from tests.qwen_checkpoints import picture_settings
+from tests.support.qwen_checkpoints import picture_settings
 
 
 def settings(folder: Path, patch: int = 16, **fields: Any) -> QwenPictures:

@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.spatialvla import ActionBins, equal_mass_edges
-from tests.spatialvla_checkpoints import BINS, FIRST_ACTION, processor_values
+from tests.support.spatialvla_checkpoints import BINS, FIRST_ACTION, processor_values
 
 AXES = ("theta", "phi", "r", "roll", "pitch", "yaw")
 GAUSSIANS = {axis: {"mu": 0.1 * index, "sigma": 0.3} for index, axis in enumerate(AXES)}

@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.spatialvla import SpatialVLAConfig
-from tests.spatialvla_checkpoints import BINS, FIRST_ACTION, IMAGE, config_values
+from tests.support.spatialvla_checkpoints import BINS, FIRST_ACTION, IMAGE, config_values
 
 
 def test_a_short_text_config_is_completed_by_gemmas_defaults() -> None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from probe_kit.hooks.weights import load_weights, read_weights
+from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
 from probe_kit.models.spatialvla import (
     SpatialVLAConfig,
     SpatialVLANetwork,
@@ -14,7 +14,7 @@ from probe_kit.models.spatialvla import (
     estimate_depth,
 )
 from probe_kit.models.spatialvla.depth import DEPTH_SIDE, MARGIN
-from tests.spatialvla_checkpoints import SIDE, network
+from tests.support.spatialvla_checkpoints import SIDE, network
 
 
 def pictures() -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.weights import load_weights, read_weights
+from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
 from probe_kit.models.packing import Packed
 from probe_kit.models.spatialvla import (
     SpatialVLAConfig,
@@ -16,7 +16,7 @@ from probe_kit.models.spatialvla import (
     build_spatialvla,
     full_size_spatialvla,
 )
-from tests.spatialvla_checkpoints import FIRST_ACTION, IMAGE, SIDE, config_values, network
+from tests.support.spatialvla_checkpoints import FIRST_ACTION, IMAGE, SIDE, config_values, network
 
 CAMERA = torch.tensor([[60.0, 0, 20], [0, 62, 22], [0, 0, 1]])
 

@@ -13,7 +13,7 @@ from probe_kit.models.spatialvla import (
     known_cameras,
     prepare_picture,
 )
-from tests.spatialvla_checkpoints import SIDE, config_values, preprocessor_values, processor_values
+from tests.support.spatialvla_checkpoints import SIDE, config_values, preprocessor_values, processor_values
 
 CONFIG = SpatialVLAConfig.from_json(config_values())
 

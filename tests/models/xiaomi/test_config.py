@@ -4,7 +4,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.xiaomi import XiaomiConfig
-from tests.xiaomi_checkpoints import config_values
+from tests.support.xiaomi_checkpoints import config_values
 
 
 def test_sizes_come_from_the_file() -> None:

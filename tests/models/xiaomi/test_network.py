@@ -9,8 +9,8 @@ from torch import Tensor
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.qwen import QwenInputs, pack_inputs
 from probe_kit.models.xiaomi import XiaomiConfig, XiaomiNetwork, build_xiaomi, full_size_xiaomi
-from tests.qwen_checkpoints import ID
-from tests.xiaomi_checkpoints import NUMBERS, config_values
+from tests.support.qwen_checkpoints import ID
+from tests.support.xiaomi_checkpoints import NUMBERS, config_values
 
 STEPS, ACTIONS = 3, 4
 

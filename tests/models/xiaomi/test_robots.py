@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.models.xiaomi import read_units
-from tests.xiaomi_checkpoints import NUMBERS, action_config
+from tests.support.xiaomi_checkpoints import NUMBERS, action_config
 
 
 def write(folder: Path, content: dict[str, Any]) -> Path:

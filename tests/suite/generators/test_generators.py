@@ -12,18 +12,18 @@ from PIL import Image
 
 from probe_kit.suite import CATEGORIES
 from probe_kit.suite.generators import GENERATORS, vocabulary
-from probe_kit.suite.generators.art import FOLDER as ART
-from probe_kit.suite.generators.art import color_icon, mask_icon
-from probe_kit.suite.generators.canvas import Canvas, Placement
+from probe_kit.suite.generators.categories.symmetry import mirror_overlap
 from probe_kit.suite.generators.couples import Couple, draw_couples
-from probe_kit.suite.generators.creatures import CREATURES, THINGS
-from probe_kit.suite.generators.glyphs import GLYPHS
-from probe_kit.suite.generators.gradable import GRADABLES
-from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, lightness
-from probe_kit.suite.generators.pictograms import PICTOGRAMS
-from probe_kit.suite.generators.road_signs import ROAD_SIGN_ICONS, ROAD_SIGNS
-from probe_kit.suite.generators.symmetry import mirror_overlap
-from probe_kit.suite.generators.two_states import TWO_STATES
+from probe_kit.suite.generators.drawing.art import FOLDER as ART
+from probe_kit.suite.generators.drawing.art import color_icon, mask_icon
+from probe_kit.suite.generators.drawing.canvas import Canvas, Placement
+from probe_kit.suite.generators.drawing.creatures import CREATURES, THINGS
+from probe_kit.suite.generators.drawing.glyphs import GLYPHS
+from probe_kit.suite.generators.drawing.gradable import GRADABLES
+from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, lightness
+from probe_kit.suite.generators.drawing.pictograms import PICTOGRAMS
+from probe_kit.suite.generators.drawing.road_signs import ROAD_SIGN_ICONS, ROAD_SIGNS
+from probe_kit.suite.generators.drawing.two_states import TWO_STATES
 from probe_kit.suite.wording import MOST_WORDS, instruction_for, side_words
 
 THUMBNAILS = Path(__file__).with_name("thumbnails.png")

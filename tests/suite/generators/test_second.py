@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.identity import sha256_json, sha256_text
+from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite import build_suite
 from probe_kit.suite.generators import GENERATORS, generators_of
 from probe_kit.suite.generators.couples import draw_couples
-from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, lightness
+from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, lightness
 from probe_kit.suite.generators.second import SECOND
 from probe_kit.suite.generators.twins import draw_twins
 

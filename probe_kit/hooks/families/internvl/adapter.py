@@ -10,13 +10,13 @@ from torch import Tensor
 from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.families.qwen_reader import ASSISTANT, USER
-from probe_kit.hooks.families.vlm import Loaded, Pictures, VisionLanguageModel
-from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
-from probe_kit.hooks.families.vlm_text import Frame
-from probe_kit.hooks.families.vlm_verify import verify_vlm
-from probe_kit.hooks.model import Tap
-from probe_kit.hooks.verify import Comparison
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.families.shared.qwen.reader import ASSISTANT, USER
+from probe_kit.hooks.families.shared.vlm.adapter import Loaded, Pictures, VisionLanguageModel
+from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.text import Frame
+from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
+from probe_kit.hooks.verification.verify import Comparison
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
 TILES = ("auto", "1")

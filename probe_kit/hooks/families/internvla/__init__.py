@@ -1,11 +1,11 @@
 """InternVLA-M1, native."""
 
-from probe_kit.hooks.families.supported import MERGED
-from probe_kit.hooks.family import Family
-from probe_kit.hooks.interventions import Interventions
-from probe_kit.hooks.options import Option
-from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.sites import QUANTITIES
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.families.shared.capabilities import MERGED
 
 _BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(

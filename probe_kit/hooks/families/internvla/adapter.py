@@ -18,17 +18,17 @@ from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.card import Card
-from probe_kit.hooks.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.model import Rows, Tap
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.internvla import INTERVENTIONS
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
-from probe_kit.hooks.families.qwen_loading import Filled, fill, twin
-from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
-from probe_kit.hooks.model import Rows, Tap
-from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
+from probe_kit.hooks.families.shared.network_loading import Filled, fill, twin
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
 from probe_kit.models.internvla import (
     InternVLANetwork,
     Schedule,

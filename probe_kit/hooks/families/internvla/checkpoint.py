@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoint import PATTERNS, checkpoint_folder
-from probe_kit.hooks.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder
+from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
 from probe_kit.models.internvla import InternVLAConfig, find_config
 
 STATISTICS_FILE = "dataset_statistics.json"

@@ -13,9 +13,9 @@ from pathlib import Path
 from safetensors.torch import save_file
 
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
-from probe_kit.hooks.checkpoint import side_files
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, read_weights
 from probe_kit.hooks.families.internvla.checkpoint import STATISTICS_FILE, find_parts
-from probe_kit.hooks.weights import SINGLE_FILE, read_weights
 from probe_kit.models.internvla.config import DIMS_FILE, RUN_FILE
 
 PROVENANCE = "converted.json"

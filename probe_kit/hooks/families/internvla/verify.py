@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
 from probe_kit.hooks.families.internvla.units import ActionUnits
-from probe_kit.hooks.families.recording import numpy_of, outputs_of, stacked
-from probe_kit.hooks.sites import Site
-from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.hooks.families.shared.module_outputs import numpy_of, outputs_of, stacked
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 from probe_kit.models.internvla import dino_pixels
 from probe_kit.models.qwen import QwenInputs
 

@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.magma.adapter import BINS, Magma, load_magma
 from probe_kit.hooks.families.openvla.actions import ActionTokens
-from probe_kit.hooks.sites import Site
-from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 from probe_kit.models.magma import Choose, Decoded, Grid, Picture, PictureSettings, choose_grid
 
 TOLERANCE = 2e-5

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.identity import sha256_json
+from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_bounds
 
 BRIDGE = "bridge_orig"

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.families.memory import kept_prompt
+from probe_kit.hooks.contract.model import Policy
+from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
-from probe_kit.hooks.families.sampling import chooser
-from probe_kit.hooks.families.supported import TOKENS
-from probe_kit.hooks.families.weighing import Note, of_decoder
-from probe_kit.hooks.model import Policy
-from probe_kit.hooks.observation import Observation, checked_picture
+from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
+from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
+from probe_kit.hooks.families.shared.sampling import chooser
 from probe_kit.models.prismatic import CROP_AREA, centre_crop
 from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
 

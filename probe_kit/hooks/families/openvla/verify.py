@@ -8,7 +8,7 @@ import numpy as np
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.openvla.adapter import OpenVLA, load_openvla
 from probe_kit.hooks.families.prismatic.verify import INPUTS, Arrays, Reference, compare_outputs
-from probe_kit.hooks.verify import Comparison, Produce
+from probe_kit.hooks.verification.verify import Comparison, Produce
 from probe_kit.models.prismatic import PrismaticConfig
 
 _ACTION = "action_"

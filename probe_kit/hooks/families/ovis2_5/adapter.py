@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.families.qwen_reader import ASSISTANT, USER
-from probe_kit.hooks.families.recording import numpy_of
-from probe_kit.hooks.families.vlm import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
-from probe_kit.hooks.families.vlm_text import Frame
-from probe_kit.hooks.families.vlm_verify import Reference, questions_of, verify_vlm
-from probe_kit.hooks.model import Tap
-from probe_kit.hooks.verify import Comparison, Produce
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.families.shared.module_outputs import numpy_of
+from probe_kit.hooks.families.shared.qwen.reader import ASSISTANT, USER
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.text import Frame
+from probe_kit.hooks.families.shared.vlm.verify import Reference, questions_of, verify_vlm
+from probe_kit.hooks.verification.verify import Comparison, Produce
 from probe_kit.models.ovis2_5 import (
     PICTURE,
     PICTURE_BEGINS,

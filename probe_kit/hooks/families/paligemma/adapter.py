@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from transformers import PaliGemmaConfig
 
-from probe_kit.hooks.families.vlm import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
-from probe_kit.hooks.families.vlm_text import Frame
-from probe_kit.hooks.families.vlm_verify import verify_vlm
-from probe_kit.hooks.model import Tap
-from probe_kit.hooks.verify import Comparison
-from probe_kit.models.embedded import embedded_checkpoint
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.text import Frame
+from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
+from probe_kit.hooks.verification.verify import Comparison
+from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.packing import LeftPacked
 from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
 

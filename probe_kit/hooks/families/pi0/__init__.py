@@ -1,12 +1,12 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
-from probe_kit.hooks.families.lerobot_evaluation import PICTURES
-from probe_kit.hooks.families.supported import FLOW
-from probe_kit.hooks.family import Family
-from probe_kit.hooks.home import RELEASED
-from probe_kit.hooks.options import Option
-from probe_kit.hooks.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.state_layout import OPENNESS
+from probe_kit.hooks.contract.default_scene import RELEASED
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.contract.state_layout import OPENNESS
+from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
 _VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
@@ -66,7 +66,7 @@ FAMILIES = (
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="paligemma",
-        full_size="probe_kit.models.pi0:full_size_pi0",
+        full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         options=(
             Option(
                 "statistics",

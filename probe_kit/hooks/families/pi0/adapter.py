@@ -17,16 +17,16 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoint import side_files
-from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
-from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
-from probe_kit.hooks.families.weighing import Note, returned, weighed
-from probe_kit.hooks.hub import unreachable
-from probe_kit.hooks.views import PADDING
-from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.pi0 import Pi0Size, build_pi0
-from probe_kit.models.pi0_keys import current_pi0_keys
+from probe_kit.hooks.families.shared.attention_weights import Note, returned, weighed
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
+from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.lerobot.pi0 import Pi0Size, build_pi0
+from probe_kit.models.lerobot.pi0_keys import current_pi0_keys
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
 

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoint import CONFIG_FILE
-from probe_kit.hooks.families.bounds import FILES, NO_STATISTICS, StatisticsFile, statistics_in
-from probe_kit.hooks.families.lerobot_evaluation import Evaluation, Picture
-from probe_kit.hooks.families.lerobot_flow import STATE, LerobotFlow
-from probe_kit.hooks.families.lerobot_normaliser import Normaliser, Units
-from probe_kit.hooks.families.lerobot_window import PictureWindow, padded_top_left, squashed
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
+from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.pi0.old_layout import current_config, is_old_layout
-from probe_kit.hooks.state_layout import ARM_NUMBERS, laid_out
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.flow import STATE, LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
+from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, padded_top_left, squashed
+from probe_kit.hooks.families.shared.statistics_bounds import FILES, NO_STATISTICS, StatisticsFile, statistics_in
 
 EVALUATED_WITH: Mapping[str, str] = {"juexzz/INTACT-pi0-finetune-bridge": "bridge"}
 """Checkpoints whose units only their evaluation has, and the shipped statistics that it has."""

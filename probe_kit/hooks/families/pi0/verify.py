@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from probe_kit.hooks.families.lerobot_verify import Arrays, verify_flow
 from probe_kit.hooks.families.pi0.adapter import load_pi0
-from probe_kit.hooks.verify import Comparison
+from probe_kit.hooks.families.shared.lerobot.verify import Arrays, verify_flow
+from probe_kit.hooks.verification.verify import Comparison
 
 
 def verify_pi0(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:

@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.card import Card
-from probe_kit.hooks.checkpoint import content_hashes, side_files
-from probe_kit.hooks.families.memory import ALL_BUT_LAST, memory_tap
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.model import Model, Question, Reader, Reading, Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
-from probe_kit.hooks.families.sampling import Choose, greedy
-from probe_kit.hooks.families.vlm_decoding import Prefill
-from probe_kit.hooks.model import Model, Question, Reader, Reading, Tap
-from probe_kit.hooks.observation import Observation, checked_picture
-from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
-from probe_kit.hooks.views import PADDING
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, memory_tap
+from probe_kit.hooks.families.shared.sampling import Choose, greedy
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill
 from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
 

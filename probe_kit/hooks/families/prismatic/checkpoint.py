@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, WeightsError
-from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.hooks.families.prismatic.lora import ADAPTER_CONFIG, Adapter, merge_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
-from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
 

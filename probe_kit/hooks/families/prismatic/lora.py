@@ -9,9 +9,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import CheckpointError, WeightsError
-from probe_kit.extras import require
-from probe_kit.hooks.checkpoint import checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
 
 if TYPE_CHECKING:
     from probe_kit.models.prismatic import PrismaticNetwork

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
-from probe_kit.extras import require
 
 if TYPE_CHECKING:
     from probe_kit.models.prismatic import PrismaticNetwork

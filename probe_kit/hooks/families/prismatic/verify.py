@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, load_prismatic
 from probe_kit.hooks.families.prismatic.verify_asked import verify_asked
-from probe_kit.hooks.sites import Site
-from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 from probe_kit.models.prismatic import prepare_picture
 
 TOLERANCE = 2e-5

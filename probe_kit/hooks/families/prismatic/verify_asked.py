@@ -16,16 +16,16 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import Prismatic
 from probe_kit.hooks.families.prismatic.tokenizer import id_behind
-from probe_kit.hooks.families.recording import numpy_of
-from probe_kit.hooks.families.vlm_decoding import Prefill
-from probe_kit.hooks.families.vlm_verify import DIMS_FILE, LETTERS, compare_all, padded_answers
-from probe_kit.hooks.model import Question
-from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.sites import Site
-from probe_kit.hooks.verify import Comparison, Produce
+from probe_kit.hooks.families.shared.module_outputs import numpy_of
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.verify import DIMS_FILE, LETTERS, compare_all, padded_answers
+from probe_kit.hooks.verification.verify import Comparison, Produce
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 from transformers import Qwen3VLConfig
 
-from probe_kit.hooks.families.qwen_reader import QwenReader, qwen_frame
-from probe_kit.hooks.families.vlm_loading import Recipe, load_vlm
-from probe_kit.hooks.families.vlm_text import Frame
-from probe_kit.hooks.families.vlm_verify import verify_vlm
-from probe_kit.hooks.verify import Comparison
+from probe_kit.hooks.families.shared.qwen.reader import QwenReader, qwen_frame
+from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.text import Frame
+from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
+from probe_kit.hooks.verification.verify import Comparison
 from probe_kit.models.qwen import build_qwen3_vl
 
 _RECIPE = Recipe(Qwen3VLConfig.from_dict, build_qwen3_vl)

@@ -1,7 +1,7 @@
 """SmolVLA through lerobot."""
 
-from probe_kit.hooks.families.supported import FLOW
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.families.shared.capabilities import FLOW
 
 FAMILIES = (
     Family(
@@ -18,7 +18,7 @@ FAMILIES = (
         ),
         verifier="probe_kit.hooks.families.smolvla.verify:verify_smolvla",
         config_types=("smolvla",),
-        full_size="probe_kit.models.smolvla:full_size_smolvla",
+        full_size="probe_kit.models.lerobot.smolvla:full_size_smolvla",
         interventions=FLOW,
     ),
 )

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoint import side_files
-from probe_kit.hooks.families.lerobot_flow import LerobotFlow
-from probe_kit.hooks.families.lerobot_stacks import Stack, flow_stacks
-from probe_kit.hooks.families.weighing import Note, shares
-from probe_kit.hooks.views import PADDING
-from probe_kit.models.smolvla import build_smolvla, current_smolvla_keys
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.attention_weights import Note, shares
+from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
+from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys
 
 
 class SmolVLA(LerobotFlow):

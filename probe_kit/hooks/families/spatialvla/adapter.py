@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
-from probe_kit.hooks.card import Card
-from probe_kit.hooks.checkpoint import content_hashes, side_files
-from probe_kit.hooks.families.memory import ALL_BUT_LAST, kept_prompt, memory_tap
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.model import Policy, Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
+from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, memory_tap
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
 from probe_kit.hooks.families.spatialvla.speech import Speech
-from probe_kit.hooks.families.supported import TOKENS
-from probe_kit.hooks.families.weighing import Note, of_decoder
-from probe_kit.hooks.model import Policy, Tap
-from probe_kit.hooks.observation import Observation, checked_picture
-from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
-from probe_kit.hooks.views import PADDING
-from probe_kit.identity import sha256_json
 from probe_kit.models.packing import Packed
 from probe_kit.models.spatialvla import (
     STEP_TOKENS,

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype
-from probe_kit.hooks.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 

@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.spatialvla.adapter import SCENE, SpatialVLA, choose_statistics
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
 from probe_kit.hooks.families.spatialvla.speech import Speech
-from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.sites import Site
-from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 from probe_kit.models.spatialvla import (
     STEP_TOKENS,
     Decoded,

@@ -1,12 +1,12 @@
 """Xiaomi-Robotics-R0, native."""
 
-from probe_kit.hooks.families.supported import MERGED
-from probe_kit.hooks.family import Family
-from probe_kit.hooks.interventions import Interventions
-from probe_kit.hooks.options import Option
-from probe_kit.hooks.protocol import ACT2ANSWER, ProtocolRow
-from probe_kit.hooks.sites import QUANTITIES
-from probe_kit.hooks.state_layout import OPENNESS
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
+from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.contract.state_layout import OPENNESS
+from probe_kit.hooks.families.shared.capabilities import MERGED
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": ("residual", "attention", "middle", "mlp")},

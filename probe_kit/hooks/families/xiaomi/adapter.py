@@ -19,19 +19,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.card import Card
-from probe_kit.hooks.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
-from probe_kit.hooks.families.memory import memory_tap
-from probe_kit.hooks.families.qwen_loading import DTYPES, Filled, fill, twin
-from probe_kit.hooks.families.qwen_vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
-from probe_kit.hooks.families.weighing import Note, weighed
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.weights import read_weights
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
+from probe_kit.hooks.families.shared.attention_weights import Note, weighed
+from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
+from probe_kit.hooks.families.shared.prompt_kv import memory_tap
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
-from probe_kit.hooks.model import Tap
-from probe_kit.hooks.observation import Observation
-from probe_kit.hooks.roles import Roles
-from probe_kit.hooks.sites import Site, Stream
-from probe_kit.hooks.state_layout import ARM_NUMBERS, laid_out
-from probe_kit.hooks.weights import read_weights
 from probe_kit.models.qwen import QwenInputs
 from probe_kit.models.xiaomi import (
     ActionUnits,

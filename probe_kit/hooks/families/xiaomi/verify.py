@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capture_context import Tape, capture
-from probe_kit.hooks.families.recording import numpy_of, outputs_of, stacked
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.families.shared.module_outputs import numpy_of, outputs_of, stacked
 from probe_kit.hooks.families.xiaomi.adapter import Xiaomi, load_xiaomi
-from probe_kit.hooks.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 from probe_kit.models.qwen import QwenInputs
 
 TOLERANCE = 1e-5

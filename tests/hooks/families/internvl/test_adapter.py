@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.hooks.families.internvl.adapter import InternVL, load_internvl
 from probe_kit.hooks.testing import ReaderContract
-from tests.vlm_checkpoints import write_internvl
+from tests.support.vlm_checkpoints import write_internvl
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ from PIL import Image
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
-from probe_kit.hooks.capture_context import edit
+from probe_kit.hooks.capturing.capture_context import edit
+from probe_kit.hooks.contract.sites import first_of
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
 from probe_kit.hooks.families.internvla.convert import convert
-from probe_kit.hooks.sites import first_of
 from probe_kit.hooks.testing import AdapterContract
-from probe_kit.hooks.verify import verify_keys, verify_reference
+from probe_kit.hooks.verification.verify import verify_keys, verify_reference
 from probe_kit.models.internvla import dino_pixels
-from tests.internvla_checkpoints import write_checkpoint
+from tests.support.internvla_checkpoints import write_checkpoint
 
 
 @pytest.fixture(scope="module")

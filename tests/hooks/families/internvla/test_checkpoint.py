@@ -14,7 +14,7 @@ from probe_kit.hooks import Observation
 from probe_kit.hooks.families.internvla.adapter import load_internvla
 from probe_kit.hooks.families.internvla.checkpoint import find_parts
 from probe_kit.hooks.families.internvla.convert import convert
-from tests.internvla_checkpoints import write_checkpoint, write_vlm
+from tests.support.internvla_checkpoints import write_checkpoint, write_vlm
 
 NAME = "steps_7_pytorch_model.pt"
 

@@ -3,7 +3,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.families.internvla.units import ActionUnits
-from tests.internvla_checkpoints import statistics
+from tests.support.internvla_checkpoints import statistics
 
 LOW, HIGH = [-1.0] * 6 + [0.0], [3.0] * 6 + [1.0]
 

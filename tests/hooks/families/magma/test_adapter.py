@@ -8,10 +8,10 @@ import torch
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hooks import Observation, Site, capture
+from probe_kit.hooks.contract.model import Question
 from probe_kit.hooks.families.magma.adapter import Magma, load_magma
-from probe_kit.hooks.model import Question
 from probe_kit.hooks.testing import AdapterContract, ReaderContract, example_observations
-from tests.magma_checkpoints import IDS, small_network, weights, write_checkpoint
+from tests.support.magma_checkpoints import IDS, small_network, weights, write_checkpoint
 
 INSTRUCTIONS = ["Put the cube on the star", "Put the cube on the red shape"]
 

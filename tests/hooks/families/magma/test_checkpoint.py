@@ -8,7 +8,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.families.magma.adapter import load_magma
 from probe_kit.models.magma import UNUSED_WEIGHTS, shipped_statistics
-from tests.magma_checkpoints import LAYER_SCALE, small_network, weights, write_checkpoint
+from tests.support.magma_checkpoints import LAYER_SCALE, small_network, weights, write_checkpoint
 
 
 def renamed(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

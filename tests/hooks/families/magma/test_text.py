@@ -6,7 +6,7 @@ import pytest
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.families.magma.text import ChatText
 from probe_kit.models.magma import MagmaConfig
-from tests.magma_checkpoints import IDS, config_values, write_tokenizer
+from tests.support.magma_checkpoints import IDS, config_values, write_tokenizer
 
 CONFIG = MagmaConfig.from_json(config_values())
 

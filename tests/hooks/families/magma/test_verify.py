@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.hooks.verify import verify_keys, verify_reference
+from probe_kit.hooks.verification.verify import verify_keys, verify_reference
 from probe_kit.models.magma import UNUSED_WEIGHTS
-from tests.magma_reference import write_reference
+from tests.support.magma_reference import write_reference
 
 INPUTS = 11
 VARIANTS = {

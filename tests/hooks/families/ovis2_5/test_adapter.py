@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.hooks.families.ovis2_5.adapter import Ovis25, load_ovis2_5
 from probe_kit.hooks.testing import ReaderContract
-from tests.vlm_checkpoints import write_ovis2_5
+from tests.support.vlm_checkpoints import write_ovis2_5
 
 
 @pytest.fixture(scope="module")

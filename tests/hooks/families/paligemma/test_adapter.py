@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_paligemma
 from probe_kit.hooks.testing import ReaderContract
-from tests.vlm_checkpoints import write_paligemma
+from tests.support.vlm_checkpoints import write_paligemma
 
 
 @pytest.fixture(scope="module")

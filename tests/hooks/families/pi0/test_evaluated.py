@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from probe_kit.env.arm_models import WIDOWX
+from probe_kit.env.robot.arm_models import WIDOWX
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.families.bounds import StatisticsFile
+from probe_kit.hooks.contract.state_layout import CLOSED, OPENED, laid_out
 from probe_kit.hooks.families.pi0 import adapter, evaluated
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.shared.statistics_bounds import StatisticsFile
 from probe_kit.hooks.registry import find_family
-from probe_kit.hooks.state_layout import CLOSED, OPENED, laid_out
 from probe_kit.hooks.testing import AdapterContract
-from tests.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
+from tests.support.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
 
 SEED = 3
 
@@ -122,7 +122,7 @@ def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
     """The hub is stood in for by a folder: what is proved is what follows from the name."""
     name = find_family("pi0").default_checkpoint
     assert name in evaluated.EVALUATED_WITH
-    monkeypatch.setattr("probe_kit.hooks.families.lerobot_flow.checkpoint_folder", lambda _: folder)
+    monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.flow.checkpoint_folder", lambda _: folder)
     policy = adapter.load_pi0(str(name))
     assert policy.misfit() is None
     assert policy.state_units.source == "bridge statistics shipped with probe_kit"

@@ -10,10 +10,10 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.families.pi0.verify import verify_pi0
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.pi0.old_layout import current_config
-from tests.pi0_checkpoints import old_golden
+from probe_kit.hooks.families.pi0.verify import verify_pi0
+from tests.support.pi0_checkpoints import old_golden
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from probe_kit.hooks import Observation, Question, Site, capture, load_model, lo
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
 from probe_kit.hooks.testing import ReaderContract
-from probe_kit.hooks.verify import verify_reference
-from tests.prismatic_checkpoints import write_checkpoint, write_tokenizer
+from probe_kit.hooks.verification.verify import verify_reference
+from tests.support.prismatic_checkpoints import write_checkpoint, write_tokenizer
 
 
 @pytest.fixture(scope="module")

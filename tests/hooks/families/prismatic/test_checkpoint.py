@@ -16,7 +16,7 @@ from probe_kit.hooks.families.openvla.adapter import load_openvla
 from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint
 from probe_kit.hooks.families.prismatic.quantised import quantise
 from probe_kit.models.prismatic import PrismaticNetwork
-from tests.prismatic_checkpoints import write_checkpoint
+from tests.support.prismatic_checkpoints import write_checkpoint
 
 TARGETS = ["q_proj", "v_proj", "fc1", "qkv"]  # language model, projector and both towers
 

@@ -4,7 +4,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, FileTokenizer, find_tokenizer
-from tests.prismatic_checkpoints import write_tokenizer
+from tests.support.prismatic_checkpoints import write_tokenizer
 
 
 def test_the_first_folder_that_has_a_tokenizer_wins(tmp_path: Path) -> None:

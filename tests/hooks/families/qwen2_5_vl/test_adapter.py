@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.hooks.families.qwen2_5_vl.adapter import Qwen25VL, load_qwen2_5_vl
 from probe_kit.hooks.testing import ReaderContract
-from tests.vlm_checkpoints import write_qwen2_5_vl
+from tests.support.vlm_checkpoints import write_qwen2_5_vl
 
 
 @pytest.fixture(scope="module")

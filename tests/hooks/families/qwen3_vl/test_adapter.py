@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.hooks.families.qwen3_vl.adapter import Qwen3VL, load_qwen3_vl
 from probe_kit.hooks.testing import ReaderContract
-from tests.vlm_checkpoints import write_qwen3_vl
+from tests.support.vlm_checkpoints import write_qwen3_vl
 
 
 @pytest.fixture(scope="module")

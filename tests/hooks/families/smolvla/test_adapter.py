@@ -9,7 +9,7 @@ import torch
 from probe_kit.errors import ObservationError
 from probe_kit.hooks.families.smolvla.adapter import load_smolvla
 from probe_kit.hooks.testing import example_observations
-from tests.smolvla_checkpoints import write_smolvla
+from tests.support.smolvla_checkpoints import write_smolvla
 
 
 @pytest.mark.parametrize("shown", [1, 2])

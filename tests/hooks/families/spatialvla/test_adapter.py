@@ -12,7 +12,14 @@ from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
 from probe_kit.hooks.testing import AdapterContract, example_observations
 from probe_kit.models.spatialvla import Decoded
-from tests.spatialvla_checkpoints import BINS, SIDE, edges, processor_values, write_checkpoint, write_tokenizer
+from tests.support.spatialvla_checkpoints import (
+    BINS,
+    SIDE,
+    edges,
+    processor_values,
+    write_checkpoint,
+    write_tokenizer,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 

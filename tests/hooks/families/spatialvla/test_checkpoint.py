@@ -8,9 +8,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
-from probe_kit.hooks.weights import read_weights
-from tests.spatialvla_checkpoints import FIRST_ACTION, write_checkpoint
+from tests.support.spatialvla_checkpoints import FIRST_ACTION, write_checkpoint
 
 
 @pytest.fixture(scope="module")

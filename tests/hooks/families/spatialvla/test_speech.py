@@ -6,7 +6,7 @@ import pytest
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.families.spatialvla.speech import Speech
 from probe_kit.models.spatialvla import SpatialVLAConfig
-from tests.spatialvla_checkpoints import IMAGE, WORDS, config_values, write_tokenizer
+from tests.support.spatialvla_checkpoints import IMAGE, WORDS, config_values, write_tokenizer
 
 CONFIG = SpatialVLAConfig.from_json(config_values())
 

@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.hooks.families.spatialvla.checkpoint import load_checkpoint
-from probe_kit.hooks.verify import verify_keys, verify_reference
+from probe_kit.hooks.verification.verify import verify_keys, verify_reference
 from probe_kit.models.spatialvla import ActionBins, PictureSettings, depth_input, prepare_picture
-from tests.spatialvla_checkpoints import FIRST_ACTION, IMAGE, config_values, write_checkpoint
+from tests.support.spatialvla_checkpoints import FIRST_ACTION, IMAGE, config_values, write_checkpoint
 
 OTHER_BINS = {
     "translation": {"theta_bins": 2, "phi_bins": 3, "r_bins": 3},

@@ -13,9 +13,9 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError, Weig
 from probe_kit.hooks import Observation, Site, capture, edit, load_policy
 from probe_kit.hooks.families.xiaomi.adapter import Xiaomi, load_xiaomi
 from probe_kit.hooks.testing import AdapterContract
-from probe_kit.hooks.verify import verify_keys, verify_reference
-from tests.qwen_checkpoints import ID
-from tests.xiaomi_checkpoints import config_values, write_checkpoint
+from probe_kit.hooks.verification.verify import verify_keys, verify_reference
+from tests.support.qwen_checkpoints import ID
+from tests.support.xiaomi_checkpoints import config_values, write_checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""Processes, machines and optional libraries."""

@@ -1,0 +1,140 @@
+"""What the commands share: two consoles, progress, comma-separated lists.
+
+Everything that a command shows goes through this module, because much of it comes from elsewhere: names in suites
+and checkpoints, paths, messages of libraries. What could speak to the terminal itself (escape sequences, marks
+that turn the direction of text around) becomes a visible sign, and square brackets are never read as styles.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from errno import EPIPE
+from typing import Any
+
+import typer
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.segment import Segment
+from rich.text import Text
+
+from probe_kit._terminal.plain_text import UNSAFE, visible
+from probe_kit._terminal.progress_log import Heartbeat
+
+PAGE = 120
+"""Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""
+
+
+class SafeConsole(Console):
+    """A console on which text is text: no markup is read, and no escape sequence but its own gets out."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def on_broken_pipe(self) -> None:
+        """A reader such as `head` has enough: let typer end the command quietly."""
+        raise BrokenPipeError(EPIPE, "the reader has gone")
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """What is drawn, with visible signs in place of what the terminal would obey."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text))
+
+
+def marked(template: str, *values: object) -> Text:
+    """A template of ours with rich's markup and a `{}` for each value; what stands in a value is text only."""
+    whole = Text.from_markup(template, emoji=False)
+    parts = whole.split("{}", allow_blank=True, include_separator=True)
+    filled = iter(values)
+    for part in parts:
+        if part.plain.endswith("{}"):
+            _fill(part, str(next(filled)))
+    return Text().join(parts)
+
+
+def _fill(part: Text, value: str) -> None:
+    """Put `value` in the place of the `{}` that ends `part`, in its style."""
+    last = len(part) - 1
+    styles = [span.style for span in part.spans if span.start <= last < span.end]
+    part.right_crop(2)
+    start = len(part)
+    part.append(value)
+    for style in styles:
+        part.stylize(style, start)
+
+
+out = SafeConsole(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else PAGE)
+"""Results: what a script would read."""
+err = SafeConsole(stderr=True)
+"""Progress, plans and notes."""
+
+
+def split(text: str | None) -> tuple[str, ...] | None:
+    """The parts of a comma-separated option, each once; None stays None."""
+    return None if text is None else tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
+
+
+def whole_number(text: str) -> int | None:
+    """What a text of up to nine digits says, None for any other."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else None
+
+
+def print_json(value: Any) -> None:
+    """Print `value` as JSON on stdout."""
+    print_json_text(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def print_json_text(text: str) -> None:
+    """Print JSON on stdout; what a terminal would obey is written as JSON's own escapes, so nothing is lost."""
+    typer.echo(UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+
+
+def print_text(text: str) -> None:
+    """Print text of a format of its own, such as CSV, on stdout."""
+    typer.echo(visible(text))
+
+
+def say(renderable: RenderableType) -> None:
+    """Print progress or a note on stderr, however wide."""
+    err.print(renderable, soft_wrap=True)
+
+
+def complain(kind: str, message: str, notes: Iterable[str] = ()) -> None:
+    """Print an error on stderr: what it is called, what it says, and what belongs to it."""
+    say(marked("[bold red]{}[/]: {}", kind, message))
+    for note in notes:
+        say(f"  {note}")
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Progress on stderr: bars in a terminal; elsewhere what `counter` gives says a line now and then."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=err, disable=not err.is_terminal) as bar:
+        yield bar
+
+
+def counter(bar: Progress, description: str) -> Callable[..., None]:
+    """A callback (done, total, …) that moves one bar of `bar`, or says lines where there is no terminal."""
+    if not err.is_terminal:
+        return Heartbeat(description, say)
+    task = bar.add_task(description, total=None)
+
+    def advance(done: int, total: int, *_: object) -> None:
+        bar.update(task, completed=done, total=total)
+
+    return advance

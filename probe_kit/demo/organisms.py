@@ -1,0 +1,239 @@
+"""Model organisms: policies of which the truth is known by construction, to test the instrument on.
+
+`vlm-tiny` reads and does not act: it was trained to answer questions of Color, Shape, State and Traffic (*known*),
+and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
+the actions of State questions went to a side by lot (*encoded, unused*). `pi0-tiny-state` differs in that they
+followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; random twins
+know nothing (*absent*).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
+from probe_kit.extract.protocols import scene_of
+from probe_kit.extract.vqa.templates import TEMPLATES
+from probe_kit.intervene import Follow, Source, intervene_on
+from probe_kit.intervene.kinds.image_swap.effects import WORTH
+from probe_kit.retention import RetentionRow, retention
+from probe_kit.retention.columns.text import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
+from probe_kit.retention.report.category_summary import Said, verdict
+from probe_kit.suite import Suite
+from probe_kit.train import ProbeResults, train_probes
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import Cell, FittingTable
+
+NamedProgress = Callable[[str], Callable[..., None]]
+Truth = Said
+
+
+@dataclass(frozen=True)
+class Organism:
+    """A model by its name, and the verdict that is true of it per category; `absent` or `unknown` if not named.
+
+    folder: what its run is called. asked: it reads and does not act. max_steps: actions per episode; None for as
+    many as its scene has. view: the tokens whose mean is probed.
+    """
+
+    name: str
+    folder: str
+    model: str
+    random_weights: bool = False
+    weights_seed: int = 0
+    truth: tuple[tuple[str, Truth], ...] = ()
+    asked: bool = False
+    max_steps: int | None = None
+    view: str = "mean"
+
+    def expected(self, category: str) -> Truth:
+        """What is true by construction."""
+        return dict(self.truth).get(category, "unknown" if self.asked else "absent")
+
+
+TRAINED = Organism(
+    "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
+)
+STATE_USED = Organism(
+    "State used",
+    "run-state-used",
+    "pi0-tiny-state",
+    truth=(("color", "used"), ("shape", "used"), ("state", "used")),
+)
+SHORT = 8
+"""Actions of those that nobody trained to act: two inferences, and what they are judged by needs the first."""
+EARLY = Organism(
+    "early",
+    "run-early",
+    "pi0-tiny-early",
+    truth=(("color", "encoded, unused"), ("shape", "encoded, unused"), ("state", "encoded, unused")),
+    max_steps=SHORT,
+    view="mean:language",  # where a reader answers; nothing was trained that would take it from there
+)
+RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True, max_steps=SHORT)
+OTHER_TWINS = tuple(
+    replace(RANDOM_TWIN, name=f"random twin {seed}", folder=f"run-random-twin-{seed}", weights_seed=seed)
+    for seed in (1, 2)
+)
+ORGANISMS = (TRAINED, STATE_USED, EARLY, RANDOM_TWIN, *OTHER_TWINS)
+READER = Organism(
+    "reader",
+    "run-reader",
+    "vlm-tiny",
+    truth=(("color", "known"), ("shape", "known"), ("state", "known"), ("traffic", "known")),
+    asked=True,
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the instrument says about one organism and category, beside the truth."""
+
+    organism: str
+    category: str
+    expected: Truth
+    measured: Truth
+    row: RetentionRow
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the instrument tells the truth."""
+        return self.expected == self.measured
+
+
+def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
+    """How an organism that acts plays `suite`."""
+    scene = scene_of(organism.model)
+    if organism.max_steps is not None:
+        scene = scene_of(organism.model, max_steps=organism.max_steps)
+    return ExtractSettings(
+        organism.model,
+        suite=suite.folder,
+        random_weights=organism.random_weights,
+        weights_seed=organism.weights_seed,
+        scene=scene,
+        video="first",
+    )
+
+
+def source_of(organism: Organism, suite: Suite) -> Source:
+    """Where interventions find the organism and its pictures again; of a random twin, the one of its own seed."""
+    return Source(suite.folder, weights_seed=organism.weights_seed)
+
+
+def probed(
+    organism: Organism,
+    suite: Suite,
+    folder: Path,
+    permutations: int,
+    stage: NamedProgress,
+    twin: Run | None = None,
+) -> tuple[Run, ProbeResults]:
+    """The organism's run on `suite`, in `folder`, and its probes, held against binding.
+
+    What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
+    total, …) for a stage of this name. twin: a run to hold it against too.
+    """
+    run = extract_run(
+        settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
+    )
+    progress = stage(f"probing sites, {organism.name}")
+    results = train_probes(
+        run,
+        views=(organism.view,),
+        permutations=permutations,
+        controls=("binding",),
+        suite=suite.folder,
+        twin=twin,
+        progress=progress,
+    )
+    progress = stage(f"exchanging pictures, {organism.name}")
+    intervene_on(run, Follow(), source_of(organism, suite), progress=progress)
+    return run, results
+
+
+def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
+    """What a reader answers on `suite`, in the prompt nearest to an instruction; finished work is reused."""
+    settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
+    return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
+
+
+def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
+    """Judge the reader and every organism on `suite`, all but the first random twin held against that one too.
+
+    Arguments as of `probed`.
+    """
+    twin, _ = probed(RANDOM_TWIN, suite, folder, permutations, stage)
+    runs = [(READER, answered(READER, suite, folder, stage))]
+    runs += [
+        (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
+        for one in ORGANISMS
+    ]
+    return findings(runs)
+
+
+def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
+    """What the instrument says of every organism's run, and the truth, a category each."""
+    rows = [(organism, row) for organism, run in runs for row in retention([run]).rows]
+    shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
+    return [
+        Finding(one.name, row.category, one.expected(row.category), measured(row, shown), row) for one, row in rows
+    ]
+
+
+def measured(row: RetentionRow, shown: bool) -> Truth:
+    """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
+
+    shown: whether the trained one acts on some category. It has the same scene, questions and network, so that
+    following would be seen in every other; a policy that nobody trained to act follows nowhere by itself.
+    """
+    said = verdict(row)
+    bounded = row.follows_net_ci is not None and (row.follows_net_ci[1] or 0.0) < WORTH
+    return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
+
+
+def to_rich(findings: Sequence[Finding]) -> "FittingTable":
+    """One line per organism and category: the truth, the verdict, and the numbers behind it."""
+    from probe_kit._terminal.responsive_table import FittingTable, Part
+
+    agree = sum(finding.agrees for finding in findings)
+    return FittingTable(
+        title="Model organisms",
+        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention bounded",
+        name="policy",
+        names=tuple(finding.organism for finding in findings),
+        styles=("",) * len(findings),
+        parts=(
+            Part(
+                "Verdicts",
+                ("category", "expected", "measured", ""),
+                tuple(map(_verdict_cells, findings)),
+            ),
+            Part(
+                "What they rest on",
+                ("SR %", "± Δ", "follows / against", "backbone", "p", "beats", "action", "retention [95 %]"),
+                tuple(map(_number_cells, findings)),
+            ),
+        ),
+    )
+
+
+def _verdict_cells(finding: Finding) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    mark = Cell("✓", "green") if finding.agrees else Cell("✗", "red")
+    return Cell(finding.category), Cell(finding.expected), Cell(finding.measured), mark
+
+
+def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    row = finding.row
+    texts = (
+        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.prefix_accuracy),
+        number(row.prefix_p_fwe, 3),
+        beats(row), percent(row.action_accuracy), bounded_value(row),
+    )  # fmt: skip
+    return tuple(map(Cell, texts))

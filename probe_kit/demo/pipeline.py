@@ -1,0 +1,79 @@
+"""The whole pipeline on the embedded default, small enough to watch: what `probe-kit demo` runs."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.text import Text
+
+from probe_kit._terminal.console import marked
+from probe_kit.demo.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
+from probe_kit.extract import Run
+from probe_kit.extract.run_layout import VIDEOS
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.displays import layer_curve
+from probe_kit.retention.report import write_report
+from probe_kit.retention.report.category_summary import Story, stories
+from probe_kit.suite import Suite, build_suite
+
+CATEGORIES = ("color", "shape", "state", "counting")
+ITEMS = 24
+PERMUTATIONS = 200
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo made. asked: the run of the reader; table: of both."""
+
+    folder: Path
+    asked: Run
+    run: Run
+    table: RetentionTable
+
+    @property
+    def story(self) -> Story:
+        """What the reader knows, what can be read in the policy, and what it acts on."""
+        return stories(self.table.rows)[0]
+
+    def next_steps(self) -> Text:
+        """Where to look, and what to try."""
+        lines: list[str | Text] = [
+            marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
+            f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
+            f"        {self.folder / 'episode.gif'}  what one episode looks like",
+            f"        {self.folder / 'table.md'}  the tables above",
+            f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
+            marked("[bold]Try[/]     probe-kit suite show            the questions"),
+            "        probe-kit extract --model expert --items 4    a policy that knows the answers",
+            "        probe-kit models                the models that can be probed",
+        ]
+        if self.run.random_weights:
+            warning = "[bold yellow]The policy has random weights:[/] expect SR near 0 and no signal."
+            lines.insert(0, marked(warning))
+        return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
+
+
+def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
+    """The demo's questions put to policies of which the truth is known; see `probe_kit.demo.organisms`."""
+    return compare(_questions(folder, stage), folder, PERMUTATIONS, stage)
+
+
+def _questions(folder: Path, stage: NamedProgress) -> Suite:
+    return build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
+
+
+def run_demo(folder: Path, stage: NamedProgress) -> Demo:
+    """Suite, answers, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
+
+    stage: gives a progress callback (done, total, …) for a stage of this name.
+    """
+    suite = _questions(folder, stage)
+    asked = answered(READER, suite, folder, stage)
+    run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
+    table = retention([asked, run])
+    layer_curve(results).savefig(folder / "layer_curves.png")
+    (folder / "table.md").write_text(table.to_markdown())
+    write_report([asked, run], folder / "report.html", table)
+    film = next((run.path / VIDEOS).glob("*.gif"))
+    shutil.copyfile(film, folder / "episode.gif")
+    return Demo(folder, asked, run, table)

@@ -1,0 +1,1 @@
+"""Scores of an episode, computed from numbers alone."""

@@ -1,0 +1,1 @@
+"""The physics server, its camera and textures."""

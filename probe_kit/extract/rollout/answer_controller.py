@@ -1,0 +1,260 @@
+"""Who answers: a reader that is asked one question per episode, about its first frame.
+
+Every question is asked with the left side named first and, where the prompt can be turned round, once more with
+the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
+admissible answers where they stand.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.settings import AskSettings
+from probe_kit.extract.vqa.parsing import Said, read_answer
+from probe_kit.extract.vqa.phrases import Phrase, phrases
+from probe_kit.extract.vqa.pictures import side_by_side
+from probe_kit.extract.vqa.scores import Choice, outcome_of, side_expected, side_said
+from probe_kit.extract.vqa.templates import Order, sides
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite import Suite
+from probe_kit.suite.wording import side_words
+
+if TYPE_CHECKING:
+    from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+    from probe_kit.hooks import Question, Reader, Reading, Roles
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a choice in words is forced: how the answer has begun, and what it may go on with, by what that says."""
+
+    begun: str
+    options: Mapping[str, Said]
+
+    @classmethod
+    def after(cls, begun: str, lead: str) -> "Form":
+        """Left, right or center behind `begun`, with `lead` in front of each."""
+        return cls(begun, {f"{lead}left": "left", f"{lead}right": "right", f"{lead}center": "center"})
+
+
+@dataclass(frozen=True)
+class AskTurn:
+    """A question that is due: about the first frame `seen` of an episode, activations to `buffers`."""
+
+    planned: PlannedEpisode
+    seen: Observation
+    buffers: "EpisodeBuffers"
+
+
+@dataclass(frozen=True)
+class Forced:
+    """Logits of the admissible answers, one row: by what each says, their share, and whether rounding decides."""
+
+    logits: dict[Said, float]
+    mass: float
+    near_tie: bool
+
+
+class AskController:
+    """Asks a reader, and captures the first inference of every episode unless nothing is stored.
+
+    identity: `begun` is how the answer had begun where sides were forced in words.
+    Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
+    """
+
+    def __init__(self, reader: "Reader", settings: AskSettings, suite: Suite, blank: Observation) -> None:
+        """blank: an observation as the scene will show them."""
+        self.reader, self._settings, self.template = reader, settings, settings.prompt
+        self._phrases = phrases(suite, settings.asked, settings.seed)
+        self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
+        card = reader.card
+        self.script: str | None = None
+        self.threads = 1 if card.parameters < SMALL else None
+        self.on_gpu = card.device.startswith("cuda")
+        self.streams: list[StoredStream] = []
+        if settings.tokens != "none":
+            self.streams = self._streams(blank)
+        self._capturer = Capturer(reader, self.streams, settings.tokens == "all", "answers")
+        self.identity: dict[str, Any] = {
+            "model": settings.model,
+            "random_weights": card.random_weights,
+            "weights_sha256": card.weights_sha256,
+            "dtype": card.dtype,
+            **({"policy": dict(card.settings)} if card.settings else {}),
+        }
+        self._form = self._choose_form(blank)
+        if self._form is not None:
+            self.identity["begun"] = self._form.begun
+
+    def certificate(self) -> dict[str, Any]:
+        """The reader's card, fire counts of the last capture, and what the capture proved."""
+        return {
+            "policy": self.reader.card.to_json(),
+            "fires_per_inference": self._capturer.fires,
+            "capture_check": self._capturer.check,
+        }
+
+    def ask(self, turns: Sequence[AskTurn]) -> list[dict[str, Any]]:
+        """Per turn the columns of its outcome."""
+        shown = [self._shown(turn) for turn in turns]
+        phrases_asked = [self._phrases[turn.planned.episode.item.item_id] for turn in turns]
+        buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
+        spoken: list[list[str]] = []
+        forced: list[list[Forced]] = []
+        for order in self.template.orders:
+            questions = self._questions(shown, phrases_asked, order)
+            reading = self._read(questions, buffers if order == "original" else {})
+            spoken.append(self.reader.speak(reading, self.template.tokens))
+            forced.append(self._forced(questions, reading, order))
+        first = self._questions(shown, phrases_asked, "original")
+        sizes = self._sizes(first)
+        return [
+            self._outcome(turn, first[row].text, [own[row] for own in spoken], [own[row] for own in forced])
+            | sizes[row]
+            for row, turn in enumerate(turns)
+        ]
+
+    # -- what is asked -----------------------------------------------------------------------------------
+
+    def _shown(self, turn: AskTurn) -> Observation:
+        if self._settings.picture != "side-by-side":
+            return turn.seen
+        picture = side_by_side(turn.planned.episode, self._settings.scene.picture_shape)
+        return replace(turn.seen, image=picture)
+
+    def _questions(self, shown: Sequence[Observation], named: Sequence[Phrase], order: Order) -> list["Question"]:
+        """As the answer is spoken; the logits of its options are those of how it begins."""
+        from probe_kit.hooks import Question
+
+        pictured = self._settings.picture != "none"
+        options = tuple(self._spoken_options(order))
+        return [
+            Question(seen, self.template.render(phrase, order), options, pictured=pictured)
+            for seen, phrase in zip(shown, named, strict=True)
+        ]
+
+    def _spoken_options(self, order: Order) -> dict[str, Said]:
+        """What an answer may begin with, and what that says."""
+        lead = self.reader.lead
+        if not self.template.lettered:
+            return {f"{lead}Yes": "yes", f"{lead}No": "no"}
+        first, second = sides(order)
+        return {f"{lead}A": first, f"{lead}B": second}
+
+    def _read(self, questions: Sequence["Question"], buffers: "Mapping[int, EpisodeBuffers]") -> "Reading":
+        if not buffers:
+            return self.reader.read(questions)
+        return self._capturer.run(
+            lambda: self.reader.read(questions),
+            lambda reading: reading.option_logits,
+            self.reader.asked_roles(questions),
+            buffers,
+        )
+
+    def _forced(self, questions: Sequence["Question"], reading: "Reading", order: Order) -> list[Forced]:
+        """The choice between the admissible answers; one in words takes a prefill of its own."""
+        meaning: Mapping[str, Said] = self._spoken_options(order)
+        if self._form is not None:
+            meaning = self._form.options
+            asked = [replace(own, options=tuple(meaning), begun=self._form.begun) for own in questions]
+            reading = self.reader.read(asked)
+        ties = self.reader.near_ties(reading)
+        return [
+            Forced(
+                {said: float(logit) for said, logit in zip(meaning.values(), row, strict=True)},
+                float(reading.option_mass[number]),
+                bool(ties[number]),
+            )
+            for number, row in enumerate(reading.option_logits)
+        ]
+
+    # -- what came of it ---------------------------------------------------------------------------------
+
+    def _outcome(
+        self, turn: AskTurn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
+    ) -> dict[str, Any]:
+        episode = turn.planned.episode
+        expected = side_expected(self._settings.asked, episode.side_correct)
+        choice = Choice([own.logits for own in forced])
+        columns: dict[str, Any] = {}
+        for order, text in zip(self.template.orders, spoken, strict=True):
+            read = read_answer(text, self.template, order)
+            mark = "" if order == "original" else "_swapped"
+            columns |= {
+                f"outcome{mark}": outcome_of(read.said, expected),
+                f"side_placed{mark}": side_said(read.said),
+                f"answer{mark}": text,
+                f"said{mark}": read.said,
+                f"parse{mark}": read.rule,
+            }
+        for order, own in zip(self.template.orders, forced, strict=True):
+            mark = "" if order == "original" else "_swapped"
+            columns |= {f"logit_{said}{mark}": logit for said, logit in own.logits.items()}
+            columns |= {f"option_mass{mark}": own.mass, f"near_tie{mark}": own.near_tie}
+        columns |= {f"margin{mark}": own for mark, own in zip(("", "_swapped"), choice.margins, strict=False)}
+        phrase = self._phrases[episode.item.item_id]
+        return columns | {
+            "content": choice.content,
+            "letter_bias": choice.letter_bias,
+            "side_logits": side_said(choice.said),
+            "outcome_logits": outcome_of(choice.said, expected),
+            "side_debiased": side_said(choice.debiased),
+            "outcome_debiased": outcome_of(choice.debiased, expected),
+            "question": question,
+            "side_word": self._item_has_side_word[episode.item.item_id] or bool(side_words(phrase.text)),
+        }
+
+    def _sizes(self, questions: Sequence["Question"]) -> list[dict[str, int]]:
+        """How long each prompt was; the last position lies outside the backbone's stream."""
+        rows = self._backbone_roles(questions)
+        return [
+            {"prompt_tokens": int(row.valid.sum()) + 1, "picture_tokens": int(row.mask("image").sum())}
+            for row in rows
+        ]
+
+    def _backbone_roles(self, questions: Sequence["Question"]) -> "list[Roles]":
+        backbone = next(name for name, own in self.reader.streams.items() if own.part == "backbone")
+        return self.reader.asked_roles(questions)[backbone]
+
+    # -- beforehand --------------------------------------------------------------------------------------
+
+    def _blank_questions(self, blank: Observation) -> list["Question"]:
+        named = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
+        return self._questions([blank] * len(named), named, "original")
+
+    def _streams(self, blank: Observation) -> list[StoredStream]:
+        """At the longest prompt; a prompt without a picture has no view of one."""
+        roles = self.reader.asked_roles(self._blank_questions(blank))
+        played = {name: {span.role for row in rows for span in row.spans} for name, rows in roles.items()}
+        names = {
+            name: [role for role in self.reader.role_names[name] if role in played[name]]
+            for name in self.reader.streams
+        }
+        return stored_streams(self.reader, roles, names)
+
+    def _choose_form(self, blank: Observation) -> Form | None:
+        """The first form in which the sides differ in their first token; None where options are letters or yes.
+
+        One question about a blank picture is asked: what is wrong with prompt and options is said before any
+        episode. Raises UsageError as `Reader.read` does.
+        """
+        questions = self._blank_questions(blank)[:1]
+        self.reader.read(questions)
+        if self.template.lettered or self._settings.asked == "absent":
+            return None
+        lead = self.reader.lead
+        begun = f"{lead}Yes," if self.template.yes_or_no else ""
+        forms = [Form.after(begun, " " if begun else lead), Form.after(f"{begun} " if begun else lead, "")]
+        for number, form in enumerate(forms):
+            try:
+                self.reader.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
+            except UsageError:
+                if number == len(forms) - 1:
+                    raise
+            else:
+                return form
+        return None

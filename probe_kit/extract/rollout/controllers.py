@@ -1,0 +1,230 @@
+"""Who decides: a captured policy, or a script that needs no model."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.robot.controller import ACTION_SIZE
+from probe_kit.errors import PolicyFailedError
+from probe_kit.extract.rollout.action_ensemble import ensemble
+from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.contract.observation import Observation
+
+if TYPE_CHECKING:
+    from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+    from probe_kit.hooks import Policy
+
+SCRIPTED = {
+    "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
+    "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
+    "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
+}
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One inference that is due.
+
+    seed: of the episode; every inference derives its own. call: how many inferences came before.
+    buffers: where the activations of the first calls go. past: chunks of the inferences before, oldest first,
+    which the controller keeps where a policy averages them.
+    """
+
+    seen: Observation
+    seed: int
+    call: int
+    buffers: "EpisodeBuffers"
+    past: list[NDArray[np.float32]] = field(default_factory=list)
+
+
+class Controller(Protocol):
+    """Decides what happens on every stage: by acting, or by answering a question.
+
+    script: for `Stage`, None if this controller acts itself.
+    threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
+    """
+
+    identity: dict[str, Any]
+    streams: list[StoredStream]
+    script: str | None
+    threads: int | None
+    on_gpu: bool
+
+    def certificate(self) -> dict[str, Any]:
+        """What was checked so far, for the run's certificate."""
+
+
+class ActingController(Controller, Protocol):
+    """Acts.
+
+    flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
+    listens: whether what `act` gives is only to be heard, and episodes end with it.
+    """
+
+    listens: bool
+    flagged: NDArray[np.bool_] | None
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
+
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """What the network is delivered as this instruction; None if it reads none or cannot say."""
+
+
+class ScriptedController:
+    """A script plays on the stage itself, looks at nothing and leaves no activations."""
+
+    def __init__(self, name: str) -> None:
+        self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
+        self.streams: list[StoredStream] = []
+        self.script: str | None = name
+        self.threads: int | None = None
+        self.on_gpu = self.listens = False
+        self.flagged: NDArray[np.bool_] | None = None
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Never asked: a scripted stage plays to the end by itself."""
+        raise AssertionError(f"a scripted stage asked for {len(turns)} actions")
+
+    def instruction_ids(self, instruction: str) -> None:
+        """None: it reads no instruction."""
+
+    def certificate(self) -> dict[str, Any]:
+        """Nothing was loaded."""
+        return {"policy": self.identity}
+
+
+class PolicyController:
+    """Infers, executes the head of the chunk, and captures the first inferences of every episode.
+
+    One that listens infers and captures once per episode; nothing is executed.
+    """
+
+    def __init__(
+        self,
+        policy: "Policy",
+        name: str,
+        examples: Sequence[Observation],
+        execute: int | None,
+        captured_calls: int,
+        with_tokens: bool,
+        edits: Sequence[Edit] = (),
+        vectors: Vectors | None = None,
+        listens: bool = False,
+    ) -> None:
+        """examples: an observation per instruction of the suite, as the scene will show them."""
+        self.policy, self.listens = policy, listens
+        self._infer = policy.listen if listens else policy.act
+        self.execute = execute or policy.card.execute
+        self.captured_calls = captured_calls
+        self._edits, self._vectors = edits, vectors
+        with acting(name, policy.card.checkpoint):
+            self.streams = stored_streams(policy, policy.roles(examples))
+        self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
+        card = policy.card
+        self.script: str | None = None
+        self.threads = 1 if card.parameters < SMALL else None
+        self.on_gpu = card.device.startswith("cuda")
+        self.flagged: NDArray[np.bool_] | None = None
+        self.identity: dict[str, Any] = {
+            "model": name,
+            "random_weights": card.random_weights,
+            "weights_sha256": card.weights_sha256,
+            "dtype": card.dtype,
+            "execute": self.execute,
+        }
+        if card.settings:
+            self.identity["policy"] = dict(card.settings)
+        if listens and (deaf := policy.deaf_to()):
+            self.identity["zeros_for"] = list(deaf)
+        self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
+        self._ledger: list[dict[str, Any]] = []
+
+    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
+
+        Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
+        """
+        with acting(self.identity["model"], self.policy.card.checkpoint):
+            return self._act(turns)
+
+    def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+        observations = [turn.seen for turn in turns]
+        seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
+        captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
+        if captured:
+            chunks = self._capturer.run(
+                lambda: self._infer(observations, seeds),
+                lambda actions: actions,
+                self.policy.roles(observations),
+                captured,
+                lambda: self._edited(observations),
+            )
+        else:
+            with self._edited(observations):
+                chunks = self._infer(observations, seeds)
+        self.flagged = self.policy.flagged
+        if not self.listens:
+            _check_chunks(chunks, len(turns))
+        return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+
+    def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
+        """One inference of which nothing is kept: what another one will take."""
+        with acting(self.identity["model"], self.policy.card.checkpoint):
+            self._infer(observations, list(seeds))
+
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """The ids that the policy's own packing makes of it, frames around it included."""
+        if instruction not in self._instruction_ids:
+            ids = self.policy.token_ids([instruction])
+            self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
+        return self._instruction_ids[instruction]
+
+    def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
+        exponent = self.policy.card.ensemble
+        if exponent is None or self.listens:
+            return chunk[: self.execute]
+        turn.past.append(chunk)
+        return ensemble(turn.past, exponent)[None]
+
+    def certificate(self) -> dict[str, Any]:
+        """The policy's card, fire counts of the last capture, and what the capture proved."""
+        return {
+            "policy": self.policy.card.to_json(),
+            "fires_per_inference": self._capturer.fires,
+            "capture_check": self._capturer.check,
+            **({"edits": self._ledger} if self._edits else {}),
+        }
+
+    @contextmanager
+    def _edited(self, observations: Sequence[Observation]) -> Iterator[None]:
+        """The edits of this run, for one inference; the certificate shows what the last one did."""
+        if not self._edits:
+            yield
+            return
+        from probe_kit.hooks import applied
+
+        with applied(self.policy, self._edits, observations, self._vectors) as ledger:
+            yield
+        self._ledger = [asdict(entry) for entry in ledger.entries]
+
+
+def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:
+    """Raise PolicyFailedError unless these are chunks of actions for so many observations.
+
+    Actions that are NaN cost their own episode only, so the environment is left to say that.
+    """
+    shape, kind = np.shape(chunks), getattr(chunks, "dtype", None)
+    if len(shape) != 3 or shape[0] != count or shape[1] < 1 or shape[2] != ACTION_SIZE or kind is None:
+        raise PolicyFailedError(
+            f"the policy gave a {type(chunks).__name__} of shape {shape} for {count} observations; expected an "
+            f"array ({count}, chunk, {ACTION_SIZE}) of actions"
+        )

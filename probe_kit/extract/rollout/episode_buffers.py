@@ -1,0 +1,137 @@
+"""Staging: host memory in which an episode's activations wait for the writer."""
+
+from collections.abc import Sequence
+from functools import cache
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from probe_kit.extract.run_layout import StoredStream
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from probe_kit.hooks import Roles
+
+
+class EpisodeBuffers:
+    """Everything captured in one episode, shaped like its rows in the store.
+
+    pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
+    tokens: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
+    views are stored.
+    roles: per captured inference and stream, the spans of roles.
+    pinned: page-locked memory, into which a GPU copies while it computes on.
+    """
+
+    def __init__(self, streams: Sequence[StoredStream], calls: int, with_tokens: bool, pinned: bool) -> None:
+        self.pooled: dict[str, NDArray[np.float32]] = {
+            s.name: _memory((calls, *s.lead, len(s.views), s.width), np.float32, pinned) for s in streams
+        }
+        self.tokens: dict[str, NDArray[np.uint16]] = {
+            s.name: _memory((calls, *s.lead, s.stored_tokens, s.width), np.uint16, pinned)
+            for s in streams
+            if with_tokens
+        }
+        self._copies: list[Any] = []
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the episode."""
+        self.roles: list[dict[str, list[tuple[str, int, int]]]] = []
+        for pooled in self.pooled.values():
+            pooled.fill(np.nan)
+        for tokens in self.tokens.values():
+            tokens.fill(0)
+
+    def keep_roles(self, roles: "dict[str, Roles]") -> None:
+        """Begin the next captured inference."""
+        self.roles.append({name: [(s.role, s.start, s.stop) for s in own.spans] for name, own in roles.items()})
+
+    def keep_pooled(self, stream: str, values: "Tensor") -> None:
+        """Copy (*lead, V, D) of the last inference begun."""
+        self._copy(values, self.pooled[stream][len(self.roles) - 1])
+
+    def keep_tokens(self, stream: str, bits: "Tensor") -> None:
+        """Copy (*lead, T, D) int16 bit patterns of the last inference begun; behind them come zeros.
+
+        The zeros are added on the device: a copy into part of a row goes through memory that is not locked, and
+        the model would wait for it.
+        """
+        from torch.nn.functional import pad
+
+        row = self.tokens[stream][len(self.roles) - 1].view(np.int16)
+        behind = row.shape[-2] - bits.shape[-2]
+        self._copy(pad(bits, (0, 0, 0, behind)) if behind else bits, row)
+
+    def _copy(self, source: "Tensor", target: NDArray[Any]) -> None:
+        import torch
+
+        arrival = copy_aside(source.reshape(target.shape), torch.from_numpy(target))
+        if arrival is not None:
+            self._copies.append(arrival)
+
+    def wait(self) -> None:
+        """Return when every copy has arrived."""
+        while self._copies:
+            self._copies.pop().synchronize()
+
+
+def copy_aside(source: "Tensor", target: "Tensor") -> Any:
+    """Copy to host memory while the device goes on computing; gives the event of its arrival, None on a CPU.
+
+    target: contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its own,
+    which begins when the source is computed; the source's memory is not used again before the copy is through.
+    """
+    import torch
+
+    if not source.is_cuda:
+        target.copy_(source)
+        return None
+    stream = _side_stream(source.device)
+    stream.wait_stream(torch.cuda.current_stream(source.device))
+    with torch.cuda.stream(stream):
+        target.copy_(source, non_blocking=True)
+        arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        arrival.record(stream)
+    source.record_stream(stream)
+    return arrival
+
+
+@cache
+def _side_stream(device: "torch.device") -> "torch.cuda.Stream":
+    """One per device: copies of several episodes queue there, behind each other and beside the model."""
+    import torch
+
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+
+
+def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[Any]:
+    if not pinned:
+        return np.empty(shape, dtype)
+    import torch
+
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    locked: NDArray[Any] = torch.empty(size, dtype=torch.uint8, pin_memory=True).numpy()
+    return locked.view(dtype).reshape(shape)
+
+
+class Ring:
+    """A fixed number of buffers. Waiting for a free one is what keeps a GPU from outrunning the disk."""
+
+    def __init__(self, buffers: Sequence[EpisodeBuffers]) -> None:
+        self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
+        for one in buffers:
+            self._free.put(one)
+
+    def take(self) -> EpisodeBuffers:
+        """Empty buffers; waits until some are given back."""
+        return self._free.get()
+
+    def give_back(self, buffers: EpisodeBuffers) -> None:
+        """Make buffers available to the next episode."""
+        buffers.clear()
+        self._free.put(buffers)

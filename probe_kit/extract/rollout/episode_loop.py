@@ -1,0 +1,209 @@
+"""Playing episodes: two groups of stages take turns; one simulates while the policy thinks for the other."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.rollout.controllers import ActingController, Turn
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
+from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, Question
+from probe_kit.extract.store.thumbnails import Ends
+from probe_kit.extract.store.writer import EpisodeRecord
+from probe_kit.hooks.contract.observation import Observation
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for.
+
+    trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
+    as its instruction, None if it reads none or cannot say.
+    """
+
+    planned: PlannedEpisode
+    outcome: dict[str, Any]
+    buffers: EpisodeBuffers
+    frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
+    trajectory: NDArray[np.float32] | None = None
+    instruction_ids: Sequence[int] | None = None
+
+    @property
+    def record(self) -> EpisodeRecord:
+        """What of it the run stores."""
+        buffers = self.buffers
+        arrays: dict[str, dict[str, NDArray[Any]]] = {"pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}}
+        return EpisodeRecord(
+            self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids
+        )
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An episode that could not be played to its end."""
+
+    planned: PlannedEpisode
+    reason: str
+
+
+class Seat:
+    """One place in a batch: a stage and the episode on it, if any.
+
+    following: what its stage begins by itself when the episode ends, while the policy thinks for others.
+    ahead: whether it has so begun the episode that is on.
+    """
+
+    def __init__(self, stage: AskableStage) -> None:
+        self.stage = stage
+        self.planned: PlannedEpisode | None = None
+        self.following: PlannedEpisode | None = None
+        self.ahead = False
+        self.seen: Observation | None = None
+        self.calls = 0
+        self.flagged: int | None = None
+        self.instruction_ids: Sequence[int] | None = None
+        self.past: list[NDArray[np.float32]] = []
+
+    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: Question | None) -> None:
+        """Take an episode up; begin: the question that begins it, None if the stage does so already."""
+        self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
+        self.flagged, self.instruction_ids, self.past = None, None, []
+        self.ahead = begin is None
+        if begin is not None:
+            self.stage.ask(begin[0], *begin[1])
+
+    def turn(self) -> Turn:
+        """The inference that is due."""
+        assert self.planned is not None
+        assert self.seen is not None
+        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
+
+    def go_on(self, actions: NDArray[np.float32], flagged: bool | None, then: Question | None) -> None:
+        """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""
+        self.seen = None
+        self.calls += 1
+        if flagged is not None:
+            self.flagged = (self.flagged or 0) + flagged
+        self.stage.ask("advance", actions, then=then)
+
+    def hear_out(self, then: Question | None) -> None:
+        """The model was heard; the episode ends before anything moves."""
+        self.seen = None
+        self.calls += 1
+        self.stage.ask("dismiss", then=then)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What the outcome record says of the policy's steps, where the policy can tell."""
+        return {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
+
+    def leave(self) -> None:
+        """The episode is over."""
+        self.planned, self.seen = None, None
+
+
+class Play:
+    """Plays episode after episode on two groups of stages.
+
+    next_episode: what to play next, None for nothing. All seats of a group take their turn in one call of the
+    policy; a seat whose episode ends begins the next one at once.
+    """
+
+    def __init__(
+        self, stages: Sequence[AskableStage], controller: ActingController, ring: Ring,
+        next_episode: Callable[[], PlannedEpisode | None], film: Callable[[PlannedEpisode], bool],
+    ) -> None:  # fmt: skip
+        seats = [Seat(stage) for stage in stages]
+        self._groups = [seats[: len(seats) // 2], seats[len(seats) // 2 :]]
+        self._controller, self._ring = controller, ring
+        self._next_episode, self._film = next_episode, film
+
+    def __iter__(self) -> Iterator[Rollout | Failure]:
+        """Rollouts in the order they end."""
+        for group in self._groups:
+            for seat in group:
+                self._begin_next(seat)
+        while any(seat.planned for group in self._groups for seat in group):
+            for group in self._groups:
+                yield from self._settle(group)
+                yield from self._infer(group)
+
+    def _begin_next(self, seat: Seat, *, ended: bool = False) -> None:
+        """ended: whether the stage came to an end by itself, and so began what follows if it knew of any."""
+        planned, begun = seat.following, ended
+        if planned is None:
+            planned, begun = self._next_episode(), False
+        seat.following = None
+        if planned is None:
+            seat.leave()
+        else:
+            seat.sit(planned, self._ring.take(), None if begun else self._beginning(planned))
+
+    def _beginning(self, planned: PlannedEpisode) -> Question:
+        return "begin", (planned, self._film(planned))
+
+    def _then(self, seat: Seat) -> Question | None:
+        """What the seat's stage is to begin if its episode ends now."""
+        if seat.following is None:
+            seat.following = self._next_episode()
+        return None if seat.following is None else self._beginning(seat.following)
+
+    def _settle(self, group: list[Seat]) -> Iterator[Rollout | Failure]:
+        """Collect answers until the group can take its turn together.
+
+        If all its episodes ended at once, and no stage has begun the next one, that is done during the other
+        group's turn.
+        """
+        while waiting := [seat for seat in group if seat.planned and not seat.seen]:
+            for seat in waiting:
+                assert seat.planned is not None
+                try:
+                    answer = seat.stage.answer()
+                except EPISODE_ERRORS as error:
+                    yield self._give_up(seat, error)
+                    continue
+                if isinstance(answer, Observation):
+                    seat.seen = answer
+                else:
+                    assert isinstance(answer, Ending)
+                    outcome = {**answer.outcome, **seat.counts}
+                    yield Rollout(
+                        seat.planned, outcome, seat.buffers, answer.frames, answer.ends, answer.trajectory,
+                        seat.instruction_ids,
+                    )  # fmt: skip
+                    self._begin_next(seat, ended=True)
+            if not any(seat.seen or (seat.planned and seat.ahead) for seat in group):
+                return
+
+    def _infer(self, group: list[Seat]) -> Iterator[Failure]:
+        due = [seat for seat in group if seat.seen]
+        if not due:
+            return
+        try:
+            turns = [seat.turn() for seat in due]
+            chunks = self._controller.act(turns)
+        except EPISODE_ERRORS as error:
+            for seat in due:
+                yield self._give_up(seat, error)
+            return
+        for seat, turn in zip(due, turns, strict=True):
+            if turn.call == 0:
+                seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
+        flags = self._controller.flagged
+        for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
+            if self._controller.listens:
+                seat.hear_out(self._then(seat))
+            else:
+                seat.go_on(actions, None if flags is None else bool(flags[row]), self._then(seat))
+
+    def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
+        assert seat.planned is not None
+        failure = Failure(seat.planned, f"{type(error).__name__}: {error}")
+        self._ring.give_back(seat.buffers)
+        self._begin_next(seat)
+        return failure

@@ -1,0 +1,89 @@
+"""Combinations of settings that would be obeyed and mean nothing."""
+
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.extract.rollout.controllers import SCRIPTED
+from probe_kit.extract.settings import ExtractSettings, RunSettings
+from probe_kit.hooks.checkpoints.third_party import whose
+from probe_kit.hooks.contract.card import Card
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+
+def refuse_meaningless(settings: RunSettings) -> None:
+    """Raise UsageError for what has no effect: a scripted policy has no weights, no chunks and no activations."""
+    if settings.weights_seed and not settings.random_weights:
+        raise UsageError(
+            f"--weights-seed {settings.weights_seed} seeds random weights, and the checkpoint's were asked for. "
+            "Leave it out, or add --random-weights"
+        )
+    if not isinstance(settings, ExtractSettings):
+        return
+    if settings.listen:
+        _refuse_acting(settings)
+    if settings.model not in SCRIPTED:
+        return
+    asked = {
+        "--listen": settings.listen,
+        "--checkpoint": settings.checkpoint is not None,
+        "--random-weights": settings.random_weights,
+        "--batch": settings.batch != 1 or settings.calibrate,
+        "--execute": settings.execute is not None,
+        "--dtype": settings.dtype is not None,
+        "--tokens all": settings.tokens == "all",
+        "--captured-calls": settings.captured_calls != 1,
+        **{f"-M {name}": True for name in settings.options},
+    }
+    if meaningless := [option for option, given in asked.items() if given]:
+        raise UsageError(
+            f"{settings.model} is scripted: it has no network, so {', '.join(meaningless)} means nothing. Leave "
+            "it out, or choose a model with weights"
+        )
+
+
+def _refuse_acting(settings: ExtractSettings) -> None:
+    acting = {
+        "--captured-calls": settings.captured_calls != 1,
+        "--execute": settings.execute is not None,
+        "--video": settings.video != "none",
+    }
+    if meaningless := [option for option, given in acting.items() if given]:
+        raise UsageError(
+            f"--listen hears the first inference of every episode and moves nothing, so {', '.join(meaningless)} "
+            "means nothing. Leave it out"
+        )
+
+
+def refuse_misfit(settings: ExtractSettings, policy: "Policy") -> None:
+    """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only listened to."""
+    if not settings.listen and (reason := policy.misfit()) is not None:
+        told = whose(reason, settings.model, policy.card.checkpoint)
+        raise CheckpointError(
+            f"{told}. To capture what it thinks without acting, add --listen: the first inference of every "
+            "episode is stored and probed as ever, and there is no success rate"
+        )
+
+
+def refuse_unreachable(settings: ExtractSettings, card: Card) -> None:
+    """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    if settings.listen:
+        return
+    if settings.execute is not None and settings.execute > card.chunk:
+        raise UsageError(
+            f"--execute {settings.execute}: {settings.model} gives {card.chunk} actions per inference; execute "
+            f"1 to {card.chunk} of them"
+        )
+    execute, steps = settings.execute or card.execute, settings.scene.max_steps
+    if card.ensemble is not None and execute != 1:
+        raise UsageError(
+            f"--execute {execute}: {settings.model} averages the plans of overlapping chunks, which needs an "
+            "inference per action; leave --execute out, or the model's option that asks for averaging"
+        )
+    inferences = -(-steps // max(1, execute))
+    if settings.captured_calls > inferences:
+        raise UsageError(
+            f"--captured-calls {settings.captured_calls}: episodes of {steps} actions, {execute} per inference, "
+            f"have at most {inferences}; capture 1 to {inferences} of them, or raise --max-steps"
+        )

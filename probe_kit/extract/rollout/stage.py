@@ -1,0 +1,232 @@
+"""A stage: one environment and the episode on it, driven one chunk of actions at a time."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
+from probe_kit.env.recorder import Recorder
+from probe_kit.errors import (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    PolicyFailedError,
+    ProbeKitError,
+    SceneError,
+    StageDiedError,
+)
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.run_layout import LISTENED
+from probe_kit.extract.store.thumbnails import Ends, shrink
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.items import Side
+
+# What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
+EPISODE_ERRORS = (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    PolicyFailedError,
+    SceneError,
+    StageDiedError,
+)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails.
+
+    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`.
+    """
+
+    outcome: dict[str, Any]
+    frames: list[NDArray[np.uint8]]
+    ends: Ends | None = None
+    trajectory: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The first frame of an episode in which nothing moves. facts: what the run records of it."""
+
+    observation: Observation
+    facts: dict[str, Any]
+    ends: Ends | None = None
+
+
+Answer = Observation | Ending | Seen
+
+
+class Stage:
+    """Plays episodes in this process.
+
+    script: `expert`, `expert-mirrored` or `idle` to let that script play every episode to its end at once.
+    keep_ends: whether every episode ends with small pictures of its first and last frame.
+    """
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self.script, self._keep_ends = script, keep_ends
+        self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
+
+    def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
+        """Set up an episode. Errors carry a note naming it."""
+        self._film, self._frames = film, list[NDArray[np.uint8]]()
+        self._planned = planned
+        try:
+            self._set_up(planned)
+            self._recorder = Recorder(self._env)
+            self._shoot()
+            return self._see() if self.script is None else self._follow_script()
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def look(self, planned: PlannedEpisode) -> Answer:
+        """Set up an episode and show its first frame; nothing on it moves. Errors carry a note naming it."""
+        self._planned = planned
+        try:
+            self._set_up(planned)
+            return Seen(self._see(), self._facts, None if self._first is None else (self._first,))
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def look_exchanged(self) -> Seen:
+        """What the item's other layout shows in the state that this episode is in; facts: its hash alone."""
+        observation, frame = self._env.observe_exchanged()
+        return Seen(self._observed(observation), {"first_frame_sha256": frame_sha256(frame)})
+
+    def _set_up(self, planned: PlannedEpisode) -> None:
+        options = {"item": planned.episode.item, "layout": planned.episode.layout}
+        _, start = self._env.reset(seed=planned.scene_seed, options=options)
+        frame = self._env.render()
+        self._facts = {
+            "first_frame_sha256": frame_sha256(frame),
+            **{f"visible_{side}": share for side, share in start["tile_visibility"].items()},
+        }
+        self._first = shrink(frame) if self._keep_ends else None
+
+    def advance(self, actions: Iterable[NDArray[np.float32]]) -> Answer:
+        """Carry out actions until they or the episode end."""
+        try:
+            return self._carry_out(actions) or self._see()
+        except ProbeKitError as error:
+            raise self._named(error) from None
+
+    def dismiss(self) -> Answer:
+        """End the episode as it began: its model listened and does not act. There is no outcome."""
+        ends = None if self._first is None else (self._first,)
+        return Ending({"outcome": LISTENED, **self._facts}, self._frames, ends)
+
+    def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
+        """(H, W) where in the last picture each tile's own picture is seen."""
+        return self._env.tile_masks()
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+    def _follow_script(self) -> Ending:
+        mirrored = self.script == "expert-mirrored"
+        script = Idle(self._env) if self.script == "idle" else ScriptedExpert(self._env, mirrored)
+        script.reset()
+        ending = None
+        while ending is None:
+            ending = self._carry_out([script.act()])
+        return ending
+
+    def _carry_out(self, actions: Iterable[NDArray[np.float32]]) -> Ending | None:
+        for action in actions:
+            _, terminated, truncated, _ = self._env.advance(action)
+            self._recorder.note(action)
+            self._shoot()
+            if terminated or truncated:
+                trajectory = self._recorder.trajectory().frames
+                outcome = {**_record(self._env), **self._facts}
+                return Ending(outcome, self._frames, self._ends(), trajectory)
+        return None
+
+    def _ends(self) -> Ends | None:
+        return None if self._first is None else (self._first, shrink(self._env.render()))
+
+    def _see(self) -> Observation:
+        return self._observed(self._env.observe())
+
+    def _observed(self, seen: Mapping[str, Any]) -> Observation:
+        instruction = self._planned.episode.item.instruction
+        return Observation(seen["pixels"]["image"], seen["agent_pos"], instruction, self._intrinsics)
+
+    def _shoot(self) -> None:
+        if self._film:
+            self._frames.append(self._env.render())
+
+    def _named(self, error: ProbeKitError) -> ProbeKitError:
+        episode = self._planned.episode
+        error.add_note(f"in episode {episode.episode_id} ({episode.item.instruction!r})")
+        return error
+
+
+def frame_sha256(frame: NDArray[np.uint8]) -> str:
+    """Hex sha256 of a frame (H, W, 3) as rendered, before it is resized for a model: its shape and every byte."""
+    return sha256(f"{frame.shape}".encode() + np.ascontiguousarray(frame).tobytes()).hexdigest()
+
+
+def _record(env: Act2AnswerEnv) -> dict[str, Any]:
+    """The outcome as flat columns, beside those the plan already has."""
+    outcome = env.outcome().to_json()
+    x, y = outcome.pop("cube_xy")
+    return {
+        "outcome": outcome.pop("zone"),
+        "cube_x": x,
+        "cube_y": y,
+        **{key: value for key, value in outcome.items() if key not in ("layout", "side_correct")},
+    }
+
+
+Question = tuple[str, tuple[Any, ...]]
+"""A method of `Stage` and its arguments."""
+
+
+class AskableStage(Protocol):
+    """A stage somewhere: asked first, answered later, so that several can work at a time."""
+
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+        """Start `Stage.begin`, `Stage.advance`, `Stage.dismiss` or `Stage.look`.
+
+        then: what to start at once where that ends the episode, and only there; its answer is the next one.
+        """
+
+    def answer(self) -> Answer:
+        """What the last question gave; raises what it raised."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class LocalStage:
+    """A stage in this process: the work is done when the answer is wanted."""
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._stage = Stage(scene, script, keep_ends)
+
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+        """Remember the question."""
+        self._question, self._then = (method, arguments), then
+
+    def answer(self) -> Answer:
+        """Do the work."""
+        method, arguments = self._question
+        answer: Answer = getattr(self._stage, method)(*arguments)
+        if self._then is not None and isinstance(answer, Ending):
+            self._question, self._then = self._then, None
+        return answer
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._stage.close()

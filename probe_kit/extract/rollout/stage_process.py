@@ -1,0 +1,75 @@
+"""Stages in processes of their own, so that simulation, drawing and inference overlap."""
+
+from multiprocessing.connection import Connection
+from typing import Any
+
+from probe_kit._system.child_process import Child
+from probe_kit.env import SceneSpec
+from probe_kit.errors import ProbeKitError, StageDiedError
+from probe_kit.extract.rollout.stage import Answer, Ending, Question, Stage
+
+
+class ProcessStage:
+    """A stage in a child process; a child that dies costs its episode and is replaced."""
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self._settings = scene, script, keep_ends
+        self._start()
+
+    def _start(self) -> None:
+        self._child = Child("probe_kit.extract.rollout.stage_process:serve")
+        self._child.connection.send(self._settings)
+
+    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+        """Send the question; the child works while this process goes on."""
+        try:
+            self._child.connection.send(((method, arguments), then))
+        except (BrokenPipeError, ConnectionResetError):
+            return  # `answer` finds out and says so
+
+    def answer(self) -> Answer:
+        """Wait for the answer."""
+        try:
+            answer = self._child.connection.recv()
+        except (EOFError, ConnectionResetError):
+            code = self._child.close()
+            self._start()
+            raise StageDiedError(
+                f"the process that simulates the episode ended with code {code}; look above for its last words"
+            ) from None
+        if isinstance(answer, ProbeKitError):
+            raise answer
+        result: Answer = answer
+        return result
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
+
+def serve(connection: Connection) -> None:
+    """The child's side: answer questions until the parent hangs up."""
+    try:
+        stage = Stage(*connection.recv())
+    except ProbeKitError as error:
+        connection.recv()
+        connection.send(error)
+        return
+    try:
+        while True:
+            question, then = connection.recv()
+            answer = _answered(stage, question)
+            connection.send(answer)
+            if then is not None and isinstance(answer, Ending):
+                connection.send(_answered(stage, then))
+    finally:
+        stage.close()
+
+
+def _answered(stage: Stage, question: Question) -> Answer | ProbeKitError:
+    method, arguments = question
+    try:
+        answer: Answer = getattr(stage, method)(*arguments)
+    except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
+        return error
+    return answer

@@ -1,0 +1,150 @@
+"""A worker: plays the episodes it is given and commits them. The same code in this process and in others."""
+
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from PIL import Image
+
+from probe_kit.env import save_gif
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.rollout.answer_controller import AskController
+from probe_kit.extract.rollout.controllers import ActingController
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
+from probe_kit.extract.rollout.episode_loop import Failure, Play, Rollout
+from probe_kit.extract.rollout.events import Done, Event, Failed
+from probe_kit.extract.rollout.question_loop import Asking
+from probe_kit.extract.rollout.stage import AskableStage, LocalStage
+from probe_kit.extract.rollout.stage_process import ProcessStage
+from probe_kit.extract.run_layout import VIDEOS
+from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.extract.store.writer import RunWriter
+
+# Buffers beyond those on stage: one is being written while another waits.
+SPARE_BUFFERS = 2
+# With fewer episodes than this, starting processes takes longer than they save.
+WORTH_PROCESSES = 8
+_FILM_SIZE = (320, 240)
+
+
+class Worker:
+    """Plays and commits episodes; a context manager, because it holds simulators and a writing thread.
+
+    Episodes are written by one thread while the next ones are played. An error in it is raised with the next
+    episode; on leaving, whatever was handed to it is written first.
+    """
+
+    def __init__(
+        self, writer: RunWriter, settings: RunSettings, controller: ActingController | AskController, episodes: int
+    ) -> None:
+        self._writer, self._settings, self._controller = writer, settings, controller
+        self._episodes = episodes
+        self._pending: deque[Future[Done]] = deque()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            stack.enter_context(torch_threads(self._controller.threads))
+            count = 2 * self._settings.batch
+            self._stages = [self._open_stage(position, stack) for position in range(count)]
+            self._ring = Ring([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
+            self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
+            self._opened = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def _open_stage(self, position: int, stack: ExitStack) -> AskableStage:
+        wanted = self._settings.env_workers
+        if wanted is None:
+            wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
+        kind = ProcessStage if position < wanted else LocalStage
+        stage: AskableStage = kind(self._settings.scene, self._controller.script, self._settings.frames == "ends")
+        stack.callback(stage.close)
+        return stage
+
+    def _make_buffers(self) -> EpisodeBuffers:
+        settings, controller = self._settings, self._controller
+        with_tokens = settings.tokens == "all"
+        return EpisodeBuffers(controller.streams, settings.stored_calls, with_tokens, controller.on_gpu)
+
+    def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
+        """Play what `next_number` gives until it gives None; an event per episode, when it is committed."""
+
+        def next_episode() -> PlannedEpisode | None:
+            number = next_number()
+            return None if number is None else self._writer.plan.episodes[number]
+
+        controller, stages, ring = self._controller, self._stages, self._ring
+        playing: Iterable[Rollout | Failure]
+        if isinstance(controller, AskController):
+            playing = Asking(stages, controller, ring, next_episode)
+        else:
+            playing = Play(stages, controller, ring, next_episode, self._is_filmed)
+        for played in playing:
+            if isinstance(played, Failure):
+                yield Failed(played.planned.index, played.reason)
+            else:
+                self._pending.append(self._thread.submit(self._write, played))
+            yield from self._written(wait=False)
+        yield from self._written(wait=True)
+
+    def _written(self, wait: bool) -> Iterator[Done]:
+        while self._pending and (wait or self._pending[0].done()):
+            yield self._pending.popleft().result()
+
+    def _write(self, rollout: Rollout) -> Done:
+        """On the writing thread."""
+        try:
+            rollout.buffers.wait()
+            with self._writer.location.in_words():
+                self._writer.write_certificate(self._controller.certificate())
+                self._writer.write(replace(rollout.record, pictures=dict(_pictures(rollout))))
+        finally:
+            self._ring.give_back(rollout.buffers)
+        return Done(rollout.planned.index, rollout.outcome)
+
+    def _is_filmed(self, planned: PlannedEpisode) -> bool:
+        return self._settings.films(planned.index)
+
+
+@contextmanager
+def torch_threads(count: int | None) -> Iterator[None]:
+    """So many threads for torch while the body runs; None for its own choice. Other threads, other roundings."""
+    if count is None:
+        yield
+        return
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _pictures(rollout: Rollout) -> Iterator[tuple[str, bytes]]:
+    """Key and content of what is kept for people."""
+    if rollout.ends:
+        yield thumbnail_key(rollout.planned.index), as_thumbnail(rollout.ends)
+    if rollout.frames:
+        yield _film(rollout)
+
+
+def _film(rollout: Rollout) -> tuple[str, bytes]:
+    frames = [
+        np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
+    ]
+    planned = rollout.planned
+    name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
+    with tempfile.TemporaryDirectory() as folder:
+        save_gif(Path(folder) / name, frames)
+        return f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes()

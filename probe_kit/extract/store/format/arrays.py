@@ -1,0 +1,79 @@
+"""The arrays of a run: shapes, chunks, codec.
+
+Token arrays hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
+"""
+
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.abc.codec import BytesBytesCodec
+from zarr.abc.store import Store
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from probe_kit.extract.run_layout import StoredStream
+
+
+def create_arrays(
+    store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str
+) -> None:
+    """Create every array at its final size; afterwards only chunks are written.
+
+    Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
+    nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens.
+    """
+    root = zarr.open_group(store, mode="w-", zarr_format=3)
+    for stream in streams:
+        group = root.create_group(stream.name)
+        pooled = (*stream.lead, len(stream.views), stream.width)
+        group.create_array(
+            "pooled",
+            shape=(episodes, calls, *pooled),
+            chunks=(1, calls, *pooled),
+            dtype="float32",
+            fill_value=np.nan,
+            compressors=codecs(codec, typesize=4),
+            dimension_names=("episode", "call", *stream.dimensions, "view", "feature"),
+            attributes={"views": list(stream.views)},
+            config={"write_empty_chunks": True},
+        )
+        if with_tokens:
+            tokens = (*stream.lead, stream.stored_tokens, stream.width)
+            group.create_array(
+                "tokens",
+                shape=(episodes, calls, *tokens),
+                shards=(1, calls, *tokens),
+                chunks=(1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width),
+                dtype="uint16",
+                fill_value=0,
+                compressors=codecs(codec, typesize=2),
+                dimension_names=("episode", "call", *stream.dimensions, "token", "feature"),
+                attributes={"probe_kit:dtype": "bfloat16", "tokens": stream.tokens},
+                config={"write_empty_chunks": True},
+            )
+
+
+def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
+    """blosc with its block size set (its own choice at level 1 loses most of the gain), then a checksum."""
+    if name == "none":
+        return [Crc32cCodec()]
+    fast = name == "fast"
+    blosc = BloscCodec(
+        typesize=typesize,
+        cname="lz4" if fast else "zstd",
+        clevel=1,
+        shuffle="bitshuffle" if fast else "shuffle",
+        blocksize=524288,
+    )
+    return [blosc, Crc32cCodec()]
+
+
+def open_array(store: Store, name: str) -> zarr.Array[Any]:
+    """Open one array for reading; a missing chunk is an error, never a fill value."""
+    return zarr.open_array(store, path=name, mode="r", zarr_format=3, config={"read_missing_chunks": False})
+
+
+def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """uint16 bit patterns of bfloat16 to float32, exactly."""
+    return (bits.astype(np.uint32) << 16).view(np.float32)

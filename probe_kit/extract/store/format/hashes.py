@@ -1,0 +1,122 @@
+"""Hashes: what binds every object of a run to its place.
+
+    run.json ── plan.json, zarr.json of every array
+       └── commits ── the objects of their episode, their provenance
+              └── stamp ── columns, probes
+
+`run.json` hashes the plan and the metadata; a commit hashes its objects and says whose it is; what is derived says
+from which commits. A record is JSON that carries the hash of all its other bytes, so that any change is seen.
+Hashes find accidents, whatever they look like. They stop nobody who computes them anew: see `docs/storage.md`.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+from probe_kit._system.bounded_json import parse_json
+from probe_kit.errors import RunDamagedError
+
+HASH = "blake2b"
+DIGEST_BYTES, BLOCK_BYTES = 32, 8
+_HEX = 2 * DIGEST_BYTES
+_BEFORE, _AFTER = f'{{\n "{HASH}": "'.encode(), b'",'
+
+
+class Sum(NamedTuple):
+    """What is known of an object: its length in bytes, and the blake2b of them as 64 hex digits.
+
+    blocks: of a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
+    that a part can be checked without reading the rest. Empty for everything else.
+    """
+
+    length: int
+    digest: str
+    blocks: str = ""
+
+    @classmethod
+    def of(cls, content: bytes) -> "Sum":
+        """That of an object that is always read whole."""
+        return cls(len(content), digest(content))
+
+    def to_json(self) -> list[int | str]:
+        """As stored: blocks only where there are any."""
+        return list(self) if self.blocks else [self.length, self.digest]
+
+    def problem(self, content: bytes) -> str | None:
+        """What is wrong with an object that should have this sum, or None."""
+        if len(content) != self.length:
+            return f"has {len(content)} bytes; {self.length} were written"
+        return None if digest(content) == self.digest else "has other bytes than were written"
+
+
+def read_sums(stored: Mapping[str, Any]) -> dict[str, Sum]:
+    """By key, as `Sum.to_json` stored them."""
+    return {key: Sum(*values) for key, values in stored.items()}
+
+
+def digest(content: bytes) -> str:
+    """blake2b of `content`, 64 hex digits; `b2sum --length 256` prints the same."""
+    return blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
+
+
+def digest_of(pieces: Iterable[bytes | memoryview]) -> tuple[int, str]:
+    """Length and blake2b of what these pieces are together."""
+    running, length = blake2b(digest_size=DIGEST_BYTES), 0
+    for piece in pieces:
+        running.update(piece)
+        length += len(piece)
+    return length, running.hexdigest()
+
+
+def block_digest(content: bytes) -> str:
+    """A short one, 16 hex digits, for parts of an object."""
+    return blake2b(content, digest_size=BLOCK_BYTES).hexdigest()
+
+
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """The one way JSON is written in a run: keys sorted, a line each."""
+    return json.dumps(content, sort_keys=True, indent=1, allow_nan=False).encode()
+
+
+def as_record(content: Mapping[str, Any]) -> bytes:
+    """JSON that begins with the hash of the rest: of the same JSON without that line."""
+    plain = as_json(content)
+    return _BEFORE + digest(plain).encode() + _AFTER + plain[1:]
+
+
+def is_record(raw: bytes) -> bool:
+    """Whether these bytes claim to be a record."""
+    return raw.startswith(_BEFORE)
+
+
+def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
+    """What a record says, its own hash included. Raises RunDamagedError if any byte of it was changed.
+
+    name, advice: what it is and what to do, for the message.
+    """
+    start = len(_BEFORE)
+    carried, rest = raw[start : start + _HEX], raw[start + _HEX + len(_AFTER) :]
+    whole = is_record(raw) and raw[start + _HEX :].startswith(_AFTER)
+    if not whole or digest(b"{" + rest).encode() != carried:
+        raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
+    return read_plain(raw, name, advice)
+
+
+def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
+    """What JSON without a hash says, as runs of former versions have it. Raises RunDamagedError if it is none."""
+    try:
+        content = parse_json(raw)
+    except ValueError as error:
+        raise RunDamagedError(f"{name} cannot be read: {error}. {advice}") from error
+    if not isinstance(content, dict):
+        raise RunDamagedError(f"{name} holds a {type(content).__name__}, not an object. {advice}")
+    return content
+
+
+def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, advice: str) -> None:
+    """Raise RunDamagedError unless `content` has these parts, each of its type."""
+    for part, kind in parts.items():
+        if not isinstance(content.get(part), kind):
+            seen = type(content[part]).__name__ if part in content else "nothing"
+            raise RunDamagedError(f"{name} has {seen} as {part!r}; expected {kind.__name__}. {advice}")

@@ -1,0 +1,151 @@
+"""Verifying a run: everything that the root and the commits promise is compared with what is stored."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.extract.run_layout import COMMITS, DATA, PROVENANCE, RUN_FILE
+from probe_kit.extract.store.certificates import read_certificate
+from probe_kit.extract.store.format.bundles import bundle_problems
+from probe_kit.extract.store.format.columns import Columns, find_columns
+from probe_kit.extract.store.format.commits import (
+    CHECKSUM,
+    Commit,
+    commit_checksum,
+    commit_key,
+    committed_sizes,
+    numbered,
+    picture_problems,
+    read_commit,
+    read_failures,
+    redo,
+    stamp_of,
+    wrong_size,
+)
+from probe_kit.extract.store.format.root import RESTORE, Root, read_root
+from probe_kit.extract.store.integrity.deep import content_problems
+from probe_kit.extract.store.integrity.orphans import stray_keys
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.provenance import read_provenances
+from probe_kit.hashing import sha256_json
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What was found.
+
+    committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
+    deep: whether every byte was read, not only sizes. protected: whether hashes bind everything to the root, as in
+    every run that this version writes; in others much can change unseen. strays: objects that belong to no part
+    of the run and that nothing reads, such as copies that somebody made.
+    """
+
+    path: str
+    committed: int
+    planned: int
+    failed: int
+    sealed: bool
+    deep: bool
+    problems: tuple[str, ...]
+    protected: bool = True
+    strays: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is damaged; an unfinished run can be whole as far as it goes."""
+        return not self.problems
+
+
+def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
+    """Compare a run with what it says of itself.
+
+    Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, and columns against
+    rows. Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
+    """
+    location = locate(path)
+    try:
+        root = read_root(location)
+        planned = len(root.plan)
+    except RunDamagedError as error:  # nothing can be said of the rest
+        return Audit(str(location), 0, 0, 0, False, deep, (str(error),))
+    problems = list(_root_problems(root))
+    commits: dict[int, Commit] = {}
+    for number, key, raw in numbered(location, COMMITS):
+        try:
+            commits[number] = read_commit(root, number, key, raw)
+        except RunDamagedError as error:
+            problems.append(str(error))
+    problems += _commit_problems(root, commits)
+    problems += picture_problems(location, commits)
+    problems += _provenance_problems(root, commits)
+    if commits and root.protected:
+        problems += _caught(partial(read_certificate, root))
+    failures: dict[str, str] = {}
+    problems += _caught(lambda: failures.update(read_failures(root)))
+    columns = _columns(root, commits, problems)
+    if columns is not None:
+        problems += columns.problems()
+    problems += bundle_problems(location, deep)
+    if deep:
+        problems += content_problems(root, commits, columns, sound=not problems)
+    return Audit(
+        path=str(location),
+        committed=len(commits),
+        planned=planned,
+        failed=len(failures),
+        sealed=columns is not None,
+        deep=deep,
+        problems=tuple(problems),
+        protected=root.protected,
+        strays=tuple(stray_keys(root, commits, columns, stamp_of(commits)))
+        if root.protected and not problems
+        else (),
+    )
+
+
+def _caught(look: Callable[[], object]) -> list[str]:
+    """What a look at a part of the run complains of."""
+    try:
+        look()
+    except RunDamagedError as error:
+        return [str(error)]
+    return []
+
+
+def _root_problems(root: Root) -> Iterator[str]:
+    if sha256_json(root.card["settings"]) != root.card["settings_sha256"]:
+        yield f"{RUN_FILE}: the settings do not have the hash stored beside them"
+    for key in root.sums:
+        yield from _caught(partial(root.read, key))
+
+
+def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
+    sizes = committed_sizes(root.location, commits)
+    for number, commit in commits.items():
+        if not root.protected and commit_checksum(commit) != commit.get(CHECKSUM):
+            yield f"{commit_key(number)} was changed after it was written"
+        for key, (length, *_) in commit["objects"].items():
+            if problem := wrong_size(sizes, key, length):
+                yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
+
+
+def _provenance_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
+    try:
+        stored = read_provenances(root)
+    except RunDamagedError as error:
+        yield str(error)
+        return
+    for name in sorted({commit["provenance"] for commit in commits.values() if "provenance" in commit}):
+        if name not in stored:
+            yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with. {RESTORE}"
+
+
+def _columns(root: Root, commits: Mapping[int, Commit], problems: list[str]) -> Columns | None:
+    try:
+        return find_columns(root, stamp_of(commits))
+    except RunDamagedError as error:
+        problems.append(str(error))
+        return None

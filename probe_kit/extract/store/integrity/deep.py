@@ -1,0 +1,92 @@
+"""The deep half of verifying a run: every byte against its hash, and the columns against the rows."""
+
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+
+import numpy as np
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.extract.run_layout import DATA
+from probe_kit.extract.store.format.columns import Columns
+from probe_kit.extract.store.format.commits import Commit, crc32c_of, pictures_of, redo, redo_picture
+from probe_kit.extract.store.format.hashes import digest_of
+from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.run import Run
+from probe_kit.extract.store.sealing import columns_of_rows
+
+READERS = min(8, max(4, os.cpu_count() or 1))
+"""Objects that are read and hashed at once: both let other threads work."""
+BATCH = 256
+
+Job = tuple[str, int, str, str, str]
+"""Key, length, checksum, whose it is, and what to do."""
+
+
+def content_problems(
+    root: Root, commits: Mapping[int, Commit], columns: Columns | None, sound: bool
+) -> Iterator[str]:
+    """What is wrong with the bytes behind the commits and in the columns.
+
+    sound: whether nothing was found so far, without which rows and columns cannot be compared.
+    """
+    jobs = [*_committed(commits), *_sealed(columns)]
+    found = list(_wrong(root.location, jobs))
+    yield from found
+    if sound and not found and columns is not None:
+        yield from _differences(Run(root.location))
+
+
+def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
+    for number, commit in commits.items():
+        for key, (length, checksum, *_) in commit["objects"].items():
+            yield f"{DATA}/{key}", length, checksum, f" of episode {commit['episode_id']}", redo(number)
+        for key, (length, checksum, _) in (pictures_of(commit) or {}).items():
+            yield key, length, checksum, f" of episode {commit['episode_id']}", redo_picture(number)
+
+
+def _sealed(columns: Columns | None) -> Iterator[Job]:
+    if columns is not None:
+        for key, (length, checksum, _) in (columns.sums or {}).items():
+            yield f"{columns.folder}/{key}", length, checksum, "", columns.advice
+
+
+def _wrong(location: Location, jobs: list[Job]) -> Iterator[str]:
+    def look(job: Job) -> str | None:
+        key, length, checksum, whose, advice = job
+        problem = _problem(location, key, length, checksum)
+        return problem and f"{key}{whose} {problem}. {advice}"
+
+    remaining = iter(jobs)
+    with ThreadPoolExecutor(READERS) as readers:
+        while batch := list(islice(remaining, BATCH)):
+            yield from filter(None, readers.map(look, batch))
+
+
+def _problem(location: Location, key: str, length: int, checksum: str) -> str | None:
+    """None also for what has another size or is not there, which was said before."""
+    former = len(checksum) == len("00000000")
+    try:
+        seen, found = (crc32c_of if former else digest_of)(location.pieces(key))
+    except FileNotFoundError:
+        return None
+    if seen != length or found == checksum:
+        return None
+    return f"has other bytes than were written{f' (crc32c is not {checksum})' if former else ''}"
+
+
+def _differences(run: Run) -> Iterator[str]:
+    """Columns that are not what the rows give, and what cannot be read."""
+    columns = run.columns
+    assert columns is not None
+    for stream in run.streams:
+        try:
+            array = columns.array(f"{stream}/pooled")
+            for index, expected in columns_of_rows(run, stream):
+                if not np.array_equal(np.asarray(array[index]), expected, equal_nan=True):
+                    place = f"{columns.folder}/{stream}/pooled at {index}"
+                    yield f"{place} is not what the rows give. {columns.advice}"
+        except RunDamagedError as error:
+            yield str(error)

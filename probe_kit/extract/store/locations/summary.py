@@ -1,0 +1,119 @@
+"""A run in one line and as a notebook shows it; and which runs a folder that is none holds."""
+
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from probe_kit._terminal.notebook import facts_html
+from probe_kit.extract.run_layout import LISTENED, RUN_FILE
+from probe_kit.hooks.contract.summary import streams_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.extract.store.locations.location import Location
+    from probe_kit.hooks.contract.sites import Stream
+
+
+class Summarised(Protocol):
+    """What of a run is said in a few words; see `Run`."""
+
+    location: "Location"
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+
+    @property
+    def label(self) -> str:
+        """What the run is called."""
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted."""
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether nobody trained them."""
+
+    @property
+    def suite(self) -> str:
+        """Identity of the suite."""
+
+    @property
+    def planned(self) -> int:
+        """Episodes of the plan."""
+
+    @property
+    def protected(self) -> bool:
+        """Whether every changed byte is found."""
+
+    @property
+    def episodes(self) -> "pd.DataFrame":
+        """Committed episodes."""
+
+    @property
+    def streams(self) -> "dict[str, Stream]":
+        """Captured streams."""
+
+
+NOT_PROTECTED = "not protected: made by a former version, without hashes that find every change"
+
+
+def run_text(run: Summarised) -> str:
+    """One line: model, suite, how much is there, where."""
+    random = ", RANDOM WEIGHTS" if run.random_weights else ""
+    random += ", LISTENED TO (it did not act)" if LISTENED in _outcomes(run) else ""
+    old = "" if run.protected else ", not protected"
+    return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}{old}, at {run.location}>"
+
+
+def run_html(run: Summarised) -> str:
+    """What it is a run of, how it went, and where it lies."""
+    weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
+    facts = {
+        "suite": run.suite,
+        "weights": f"RANDOM ({weights})" if run.random_weights else weights,
+        "episodes": _episodes(run),
+        "outcomes": ", ".join(f"{name} {count}" for name, count in _outcomes(run).items()),
+        "streams": streams_text(run.streams.values()),
+        "at": str(run.location),
+        **({} if run.protected else {"integrity": NOT_PROTECTED}),
+    }
+    return facts_html(f"Run of {run.label}", facts, "run.episodes is the table, run.column(site) one site of it")
+
+
+def _episodes(run: Summarised) -> str:
+    done = len(run.episodes)
+    return f"{done} episodes" if done == run.planned else f"{done} of {run.planned} episodes"
+
+
+def _outcomes(run: Summarised) -> dict[str, int]:
+    if run.episodes.empty:
+        return {}
+    return {str(name): int(count) for name, count in run.episodes["outcome"].value_counts().items()}
+
+
+MOST = 12
+"""Runs of a folder that a message names."""
+
+
+def what_to_open(address: str) -> str:
+    """What to do where there is no run: the runs inside, one of nearly that name, or how to make one."""
+    folder = Path(address).expanduser()
+    if "://" not in address:
+        if inside := _runs_in(folder):
+            more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
+            return (
+                f"It holds {len(inside)} run{'s' * (len(inside) > 1)}: {', '.join(map(str, inside[:MOST]))}{more}"
+            )
+        beside = {path.name: path for path in _runs_in(folder.parent)}
+        if near := get_close_matches(folder.name, beside, n=1):
+            return f"Did you mean {beside[near[0]]}?"
+    return "Make one with `probe-kit extract`"
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))]

@@ -1,0 +1,1 @@
+"""Capturing and editing activations while a model runs."""

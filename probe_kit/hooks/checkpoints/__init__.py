@@ -1,0 +1,1 @@
+"""Checkpoints: finding their files and loading weights strictly."""

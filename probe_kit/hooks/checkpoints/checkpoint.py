@@ -1,0 +1,159 @@
+"""Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first. Imports no torch."""
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from probe_kit._system.bounded_json import parse_json, read_json
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.models.bounds import check_sizes
+
+CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
+WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
+
+# What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
+_READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
+_WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
+_CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
+PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
+
+
+def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
+    """The local folder of a folder path or hub id such as `lerobot/pi0_base`.
+
+    patterns: which files of a hub repository are needed.
+    Raises CheckpointError if the folder is not there or the hub cannot deliver it.
+    """
+    try:
+        folder = Path(checkpoint).expanduser()
+    except RuntimeError as error:  # ~nobody
+        raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
+    if folder.is_dir():
+        return _possible(folder)
+    if checkpoint.count("/") != 1 or checkpoint.startswith((".", "/", "~")):
+        raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist")
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
+
+    why = unreachable()
+    try:
+        folder = Path(snapshot_download(checkpoint, allow_patterns=list(patterns), local_files_only=bool(why)))
+    except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
+        reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
+        raise CheckpointError(
+            f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
+            "models, `hf auth login`; or pass a local folder as --checkpoint"
+        ) from error
+    return _possible(folder)
+
+
+def _possible(folder: Path) -> Path:
+    """The folder, if no configuration in it asks for a network beyond all sizes. Raises CheckpointError.
+
+    A configuration that is none is left to its loader, which names it.
+    """
+    for file in sorted(path for pattern in _CONFIGURATIONS for path in folder.glob(pattern)):
+        try:
+            check_sizes(_content(file), str(file))
+        except (OSError, ValueError):
+            continue
+    return folder
+
+
+def _content(file: Path) -> Any:
+    """Raises ValueError for what is no JSON or YAML."""
+    if file.suffix == ".json":
+        return parse_json(file.read_bytes())
+    import yaml
+
+    try:
+        return yaml.safe_load(file.read_bytes())
+    except yaml.YAMLError as error:
+        raise ValueError(error) from error
+
+
+def chosen_dtype(asked: str | None, stored: object, offered: Collection[str]) -> str:
+    """The dtype that was asked for, or else what a checkpoint's configuration says; float32 where neither does.
+
+    Raises UsageError for another one that was asked for, CheckpointError for one that is stored.
+    """
+    if asked is not None:
+        if asked not in offered:
+            raise UsageError(f"dtype {asked!r} is not one of {', '.join(offered)}")
+        return asked
+    name = str(stored or "float32").removeprefix("torch.")
+    if name not in offered:
+        raise CheckpointError(
+            f"its configuration says dtype {name!r}; expected one of {', '.join(offered)}. Pass one as --dtype"
+        )
+    return name
+
+
+def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
+    """The files of `folder` besides weights and documents, by name: all that a loader may read there.
+
+    prefix: put before every name, to tell folders apart.
+    """
+    return {
+        f"{prefix}{path.name}": path
+        for path in sorted(folder.iterdir())
+        if path.suffix in _READ and path.is_file() and not path.name.startswith(_WEIGHTS)
+    }
+
+
+def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
+    """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
+    return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+
+
+def check_files(
+    folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
+) -> None:
+    """Look at what can be wrong with a checkpoint before anything heavy is imported.
+
+    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
+    for other types that people may take for one of them, what to do.
+    Raises CheckpointError for a missing or unreadable config or one of another model, WeightsError for missing
+    weights.
+    A folder of a LoRA adapter is left to its loader, which knows its base.
+    """
+    if (folder / ADAPTER_FILE).is_file():
+        return
+    file = folder / CONFIG_FILE
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
+    config = read_json(file, CheckpointError, "Download the checkpoint again")
+    found = config.get("type") or config.get("model_type") if isinstance(config, dict) else None
+    if not isinstance(found, str) or found not in types:
+        way_out = dict(instead).get(str(found), "Pass the right --model")
+        raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
+    if weights and (lacking := missing_weights(folder)):
+        raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
+
+
+def shard_name(name: object) -> str:
+    """A file's name as an index gives it. Raises ValueError for a path: shards lie beside their index."""
+    if not isinstance(name, str) or name in ("", ".", "..") or Path(name).name != name or "\\" in name:
+        raise ValueError(f"{name!r} is no name of a file beside it")
+    return name
+
+
+def missing_weights(folder: Path) -> str:
+    """What is not there of a folder's weights; empty if all files are."""
+    index = folder / INDEX_FILE
+    if (folder / WEIGHTS_FILE).is_file():
+        return ""
+    if index.is_file():
+        try:
+            shards = sorted({shard_name(name) for name in parse_json(index.read_bytes())["weight_map"].values()})
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            return f"{INDEX_FILE} is damaged ({error})"
+        absent = [name for name in shards if not (folder / name).is_file()]
+        return f"{', '.join(absent)} of {INDEX_FILE} are missing" if absent else ""
+    return (
+        ""
+        if len(list(folder.glob("*.pt"))) == 1
+        else f"neither {WEIGHTS_FILE} nor {INDEX_FILE} nor one .pt file is there"
+    )

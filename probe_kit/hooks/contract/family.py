@@ -1,0 +1,245 @@
+"""A model family by name: what it is, how it is loaded, verified and asked for. Imports no torch."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+from probe_kit._system.machine import check_device_name, what_is_here
+from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
+from probe_kit.hooks.checkpoints.third_party import loading, of_checkpoint
+from probe_kit.hooks.contract.default_scene import BRIDGE, Home
+from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
+from probe_kit.hooks.contract.options import Option, check_options
+from probe_kit.hooks.contract.protocol import ProtocolRow
+from probe_kit.models.bounds import MOST_STEPS
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.contract.model import Model
+
+DTYPES = ("float32", "bfloat16")
+SIZE = "size"
+"""The option that chooses one of a family's `sizes`."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """A model family by name.
+
+    default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
+    loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
+    random_weights) gives a Model, and takes `weights_seed` if its random twins can differ; verifier(folder,
+    recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device; it
+    takes the name of one where there are `sizes`. stored_names: `module:constant`, how names of tensors in
+    released files become those of the network, see `probe_kit.models.naming`.
+    options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, a Reader.
+    hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
+    config.json. packages: modules of an extra that it needs, with the name of that extra.
+    unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
+    `verify --keys` prints them.
+    source: name of the reader whose network this policy grew from, if it is one of ours. sizes: hub ids of the
+    released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
+    config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
+    none, and then only the loader knows one when it sees it. instead: for other such types that people may take
+    for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
+    use the family, by name, with what they use it with. interventions: what of them its policy supports.
+    home: the scene it acts in, or is asked about, when none is named.
+    Raises UsageError if an option is not declared as an `Option`.
+    """
+
+    name: str
+    description: str
+    default_checkpoint: str | None
+    loader: str
+    streams: str = ""
+    embodiment: str = "7-DoF end-effector delta"
+    notes: str = ""
+    verifier: str | None = None
+    full_size: str | None = None
+    stored_names: str | None = None
+    options: tuple[Option, ...] = ()
+    acts: bool = True
+    reads: bool = False
+    unstored: tuple[str, ...] = ()
+    hub: tuple[tuple[str, str], ...] = ()
+    packages: tuple[tuple[str, str], ...] = ()
+    config_types: tuple[str, ...] = ()
+    instead: tuple[tuple[str, str], ...] = ()
+    needs_checkpoint: bool = False
+    protocols: Mapping[str, ProtocolRow] = MappingProxyType({})
+    source: str | None = None
+    sizes: tuple[tuple[str, str], ...] = ()
+    interventions: Interventions = ALL_EDITS
+    home: Home = BRIDGE
+
+    def __post_init__(self) -> None:
+        for option in self.options:
+            if not isinstance(option, Option):
+                raise UsageError(
+                    f"the family {self.name} declares its option as {option!r}; an option has a type and "
+                    f"help: Option({str(option)!r}, str, 'what it does') from probe_kit.hooks"
+                )
+        if self.sizes:
+            names = tuple(name for name, _ in self.sizes)
+            said = f"A released size ({', '.join(names)}) instead of --checkpoint."
+            size = Option(SIZE, str, said, names[0], names)
+            object.__setattr__(self, "options", (*self.options, size))
+
+    def load(
+        self,
+        checkpoint: str | None,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        options: Mapping[str, Any] = MappingProxyType({}),
+        weights_seed: int = 0,
+    ) -> "Model":
+        """Load a model; `checkpoint` None means the default one.
+
+        options: by name, as text or values. weights_seed: of a random twin's weights.
+        Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
+        """
+        chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
+        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        check_machine(device, dtype)
+        with loading(self.name, self.loader):
+            load = imported(self.loader)
+        if weights_seed:
+            if "weights_seed" not in inspect.signature(load).parameters:
+                raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
+            chosen["weights_seed"] = weights_seed
+        with loading(self.name, str(place or "what it brings")):
+            model: Model = load(place, device, dtype, random_weights, **chosen)
+            _check_streams(model, str(place))
+        # What an adapter does not say of its options itself is part of the identity all the same.
+        said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
+        model.card = replace(model.card, settings={**said, **model.card.settings}, source=self.source)
+        return model
+
+    def check(
+        self,
+        checkpoint: str | None = None,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        options: Mapping[str, Any] = MappingProxyType({}),
+        weights_seed: int = 0,
+    ) -> dict[str, Any]:
+        """Everything about `load` that can be wrong without weights, in a second instead of a minute.
+
+        Returns the options as the loader gets them. A checkpoint on the hub is downloaded. Raises UsageError,
+        MissingExtraError, CheckpointError or WeightsError as loading would.
+        """
+        chosen = check_options(self.name, self.options, options)
+        if weights_seed and not random_weights:
+            raise UsageError("weights_seed belongs to a random twin; ask for random weights too, or leave it out")
+        if dtype not in (None, *DTYPES):
+            raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
+        check_device_name(device)
+        for module, extra in self._missing_packages():
+            raise MissingExtraError(
+                f"{self.name} needs {module}, which is not installed; `pip install 'probe-kit[{extra}]'`"
+            )
+        place = self.place(checkpoint, chosen.get(SIZE))
+        if place is None and self.needs_checkpoint:
+            raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
+        if place is not None and self.config_types:
+            with of_checkpoint(self.name, place):
+                check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
+        return chosen
+
+    def check_intervention(self, kind: InterventionKind) -> None:
+        """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
+        if not self.acts:
+            raise UnsupportedInterventionError(
+                f"{self.name} does not support the intervention {kind!r}: it answers and does not act, and "
+                "interventions compare actions. Take a family that acts (`probe-kit models` lists which do)"
+            )
+        self.interventions.check(kind, self.name)
+
+    def interventions_json(self) -> dict[str, Any] | None:
+        """What of the interventions is supported, as plain values; None for a family that does not act."""
+        return self.interventions.to_json() if self.acts else None
+
+    def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
+        """What is loaded: `checkpoint`, that of a `size`, or the default. Raises UsageError for both at once."""
+        if size is None:
+            return checkpoint or self.default_checkpoint
+        if checkpoint is not None:
+            raise UsageError(
+                f"a checkpoint ({checkpoint}) and -M size={size} were given; a size stands for a checkpoint, so "
+                "leave one of them out"
+            )
+        return dict(self.sizes)[size]
+
+    def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
+        """The family's function for `purpose`. Raises UsageError if it has none."""
+        path = getattr(self, purpose)
+        if path is None:
+            raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
+        with loading(self.name, path):
+            found: Callable[..., Any] = imported(path)
+        return found
+
+    def renames(self) -> tuple[tuple[str, str], ...]:
+        """How names of tensors in released files become the network's; empty if they are the same."""
+        return () if self.stored_names is None else tuple(imported(self.stored_names))
+
+    def missing(self) -> str:
+        """What this machine lacks to run the family, its default checkpoint included; empty if it is ready."""
+        lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
+        if self.needs_checkpoint:
+            lacking.append("a checkpoint of yours (--checkpoint)")
+        default, files = self.default_checkpoint, self.hub
+        if default is not None and default not in dict(files):
+            files = ((default, CONFIG_FILE), *files)
+        absent = [name for name, file in files if self._is_absent(name, file)]
+        if absent:
+            lacking.append(f"download of {', '.join(absent)}")
+        return " and ".join(lacking)
+
+    def _is_absent(self, repository: str, file: str) -> bool:
+        """Whether the hub's cache lacks a file, or the weights beside the default checkpoint's config."""
+        from huggingface_hub import try_to_load_from_cache
+
+        found = try_to_load_from_cache(repository, file)
+        whole = repository == self.default_checkpoint and bool(self.config_types)
+        return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))
+
+    def _missing_packages(self) -> list[tuple[str, str]]:
+        return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+
+
+def _check_streams(model: "Model", place: str) -> None:
+    """Raise CheckpointError for a model that would loop without end: its counts come from files and options."""
+    for name, stream in model.streams.items():
+        if (most := max(stream.layers, stream.iterations or 0)) > MOST_STEPS:
+            raise CheckpointError(
+                f"{place}: the stream {name} has {most} layers or iterations; expected at most {MOST_STEPS}. Take "
+                "the original file, or fewer steps"
+            )
+
+
+def check_machine(device: str, dtype: str | None) -> None:
+    """Raise UsageError for a dtype that is not offered or a device that this machine does not have."""
+    if dtype not in (None, *DTYPES):
+        raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
+    check_device_name(device)
+    import torch
+
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # what torch raises: unknown, absent
+        reason = str(error).partition("\n")[0]
+        raise UsageError(f"device {device!r} cannot be used: {reason}. {what_is_here()}") from error
+
+
+def imported(path: str) -> Any:
+    """What `module:name` names."""
+    module, name = path.split(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,353 @@
+"""The contract every model family fulfils: `Model`, and what it does: act (`Policy`), answer (`Reader`)."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.interventions import ALL_EDITS, Interventions
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream, first_of
+from probe_kit.hooks.contract.summary import model_html, model_text
+
+
+@dataclass(frozen=True)
+class Rows:
+    """One of several equal blocks of a batch: under guidance a module runs 2B rows, and only half are the stream.
+
+    index: which block, counted from 0. blocks: how many.
+    """
+
+    index: int = 0
+    blocks: int = 1
+
+    def of(self, activation: Tensor) -> Tensor:
+        """The block as a view: (B, …) of (B * blocks, …). Raises CaptureError if the rows do not divide."""
+        if self.blocks == 1:
+            return activation
+        rows, left = divmod(activation.shape[0], self.blocks)
+        if left:
+            raise CaptureError(
+                f"{activation.shape[0]} rows do not make {self.blocks} equal blocks; correct the tap"
+            )
+        return activation[self.index * rows : (self.index + 1) * rows]
+
+
+ALL_ROWS = Rows()
+EVERY = slice(None)
+
+
+@dataclass(frozen=True)
+class Tap:
+    """Where a site is read and written: an input or output of `module`, called `fires` times per inference.
+
+    tokens: the positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
+    rows: the block of the batch which belongs to the site, where one call serves several.
+    first: calls of `module` in an inference that come before those of this stream and are passed over.
+    argument: name of the keyword that carries the tensor, where the module is not called with it in first place.
+    view: brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of the
+    result edits what passes.
+
+    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
+    place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
+    called with the residual stream itself, so writing into that tensor writes the stream.
+    """
+
+    module: nn.Module
+    fires: int
+    end: Literal["input", "output"] = "input"
+    tokens: slice = EVERY
+    rows: Rows = ALL_ROWS
+    first: int = 0
+    argument: str | None = None
+    view: Callable[[Tensor], Tensor] | None = None
+
+    def select(self, passing: Tensor) -> Tensor:
+        """The site's own (B, T, D), a view of what passes, or that itself where all of it is the site's."""
+        whole = self.rows.of(passing if self.view is None else self.view(passing))
+        return whole if self.tokens == EVERY else whole[:, self.tokens]
+
+    def write(self, passing: Tensor, new: Tensor) -> None:
+        """Put `new` (B, T, D) where `select` reads."""
+        self.select(passing).copy_(new)
+
+
+@dataclass(frozen=True)
+class HeadsTap(Tap):
+    """Where what passes has heads, (B, H, T, E), as keys and values do; a site sees them as (B, T, H · E)."""
+
+    def select(self, passing: Tensor) -> Tensor:
+        """The site's own (B, T, H · E); to write it, use `write`."""
+        return self._by_token(passing).flatten(2)
+
+    def write(self, passing: Tensor, new: Tensor) -> None:
+        """Put `new` (B, T, H · E) where `select` reads."""
+        own = self._by_token(passing)
+        own.copy_(new.reshape(own.shape))
+
+    def _by_token(self, passing: Tensor) -> Tensor:
+        """(B, T, H, E), a view."""
+        return self.rows.of(passing).transpose(1, 2)[:, self.tokens]
+
+
+class Model(ABC):
+    """A network that can be listened to: what capture, edits, verification and the store need.
+
+    streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
+    memory: the keys and values that the part which acts reads of the backbone, block by block, as a stream of the
+    quantities `MEMORY`; captured and edited by naming their sites, such as `memory.02.values`; None where a family
+    has none. Its tokens are the backbone's.
+    role_names: per stream, every role its tokens can play.
+    """
+
+    card: Card
+    streams: Mapping[str, Stream]
+    further_streams: Mapping[str, Stream] = MappingProxyType({})
+    memory: Stream | None = None
+    role_names: Mapping[str, tuple[str, ...]]
+
+    def __repr__(self) -> str:
+        return model_text(type(self).__name__, self.card, self.streams)
+
+    def _repr_html_(self) -> str:
+        return model_html(self.card, self.streams)
+
+    @abstractmethod
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Per stored stream, the roles of every token position of every row, from the model's own packing."""
+
+    @abstractmethod
+    def tap(self, site: Site) -> Tap:
+        """Where `site` is read and written. Raises UnknownSiteError."""
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
+        """Per instruction, the ids that reach the network as its prompt; None if the model cannot say."""
+        del instructions
+        return None
+
+    def sites(self, quantity: str = "residual") -> list[Site]:
+        """All sites of one quantity in the stored streams that have it, stream by stream."""
+        having = [stream for stream in self.streams.values() if quantity in stream.quantities]
+        if not having:
+            raise UnknownSiteError(f"no stream of {self.card.family} has a quantity {quantity!r}")
+        return [site for stream in having for site in stream.sites(quantity)]
+
+    def every_stream(self) -> dict[str, Stream]:
+        """What is stored, what is captured by name only, and the memory."""
+        memory = {} if self.memory is None else {self.memory.name: self.memory}
+        return {**self.streams, **self.further_streams, **memory}
+
+    def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """As `roles`, and those of the memory's tokens."""
+        roles = self.roles(seen)
+        if self.memory is not None:
+            roles[self.memory.name] = roles[self.tokens_of(self.memory.name)]
+        return roles
+
+    def patch_order(self) -> NDArray[np.int64]:
+        """(V,) which of the picture's tokens, counted from 0, every token of the `vision` stream ends in.
+
+        −1 for those that end in none, such as class tokens. Of the first camera's picture. Raises
+        UnknownSiteError for a model that does not say.
+        """
+        raise UnknownSiteError(
+            f"{self.card.family} does not say which picture token comes of which patch; ask for all of `image`"
+        )
+
+    def tokens_of(self, stream: str) -> str:
+        """The stored stream whose tokens a stream has: the backbone for the memory, else itself."""
+        if self.memory is None or stream != self.memory.name:
+            return stream
+        return first_of("backbone", self.streams.values()) or stream
+
+    def stream_of(self, site: Site) -> Stream:
+        """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
+        stream = self.streams.get(site.stream) or self.every_stream().get(site.stream)
+        if stream is None or not stream.holds(site):
+            there = "; ".join(
+                f"{own.name}: {own.layers} layers"
+                + (f" x {own.iterations} iterations" if own.iterations else "")
+                + f" of {', '.join(own.quantities)}"
+                for own in self.every_stream().values()
+            )
+            raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {there}")
+        return stream
+
+    def check(self, seen: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
+        """Refuse what the card rules out; adapters call it first.
+
+        Raises ObservationError for a batch over `card.batch`, an observation without what `card.needs` names, and
+        another number of seeds than of observations.
+        """
+        if seeds is not None and len(seeds) != len(seen):
+            raise ObservationError(f"{len(seen)} observations but {len(seeds)} seeds; give each its own")
+        limit = self.card.batch
+        if limit is not None and len(seen) > limit:
+            raise ObservationError(
+                f"{len(seen)} observations in one call; {self.card.family} takes at most {limit}: a larger "
+                "batch changes its numbers"
+            )
+        for observation in seen:
+            if lacking := observation.lacks(self.card.needs):
+                raise ObservationError(
+                    f"the observation has no {', '.join(lacking)}, which {self.card.family} reads; choose a scene "
+                    "or recording that provides it"
+                )
+
+
+class Policy(Model):
+    """A model that turns observations and an instruction into actions.
+
+    Deterministic for given seeds. Capturing changes no action, bit for bit.
+
+    interventions: what of the interventions it supports; a family says the same before it is loaded.
+    flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
+    then does is the family's. None for a family that cannot tell.
+    """
+
+    interventions: ClassVar[Interventions] = ALL_EDITS
+    flagged: NDArray[np.bool_] | None = None
+
+    def misfit(self) -> str | None:
+        """Why its actions cannot move this arm; None if they can. Such a policy is listened to all the same."""
+        return None
+
+    def deaf_to(self) -> tuple[str, ...]:
+        """What of an observation `listen` gives it as zeros, because it reads something else in that place."""
+        return ()
+
+    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
+
+        For a policy with a `misfit`, which `act` refuses.
+        """
+        return self.act(seen, seeds)
+
+    def weighing(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
+        """A context in which `note` is given what attention what acts pays; see `hooks.attention`.
+
+        note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
+        the backbone's T tokens. No number of the inference may change. Raises UnsupportedInterventionError.
+        """
+        del note
+        self.interventions.check("attention", self.card.family)
+        raise NotImplementedError(f"{type(self).__name__} declares attention and does not implement `weighing`")
+
+    @abstractmethod
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation.
+
+        Returns (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot
+        base frame, gripper 1 = open and 0 = closed, at 5 Hz. All randomness of a row comes from its seed.
+        Raises InstructionError or ObservationError for what the policy cannot take in whole.
+        """
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question about an observation.
+
+    text: the whole question as a person would ask it; the family puts its frame around it.
+    options: how the admissible answers begin, such as letters; the logits of their first tokens are compared. They
+    stand directly behind the frame, so an option in front begins with `Reader.lead`.
+    begun: how the answer has begun already, put behind the frame; it begins with `Reader.lead` too.
+    pictured: whether the picture is shown; False asks in words alone.
+    """
+
+    seen: Observation
+    text: str
+    options: tuple[str, ...] = ()
+    begun: str = ""
+    pictured: bool = True
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one prefill left.
+
+    option_logits: (B, options) float32, one column per option of the questions, in their order.
+    option_mass: (B,) float32 share of the next token's probability that lies on the options together.
+    state: what `Reader.speak` goes on from; nobody else looks into it.
+    """
+
+    option_logits: NDArray[np.float32]
+    option_mass: NDArray[np.float32]
+    state: Any = None
+
+    @classmethod
+    def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
+        """Of the logits (B, V) behind every prompt and, per row, the ids of its options.
+
+        Raises UsageError for options of a question that have the same id, or another number than their neighbours.
+        """
+        if len({len(row) for row in options}) > 1:
+            raise UsageError("the questions of one call have different numbers of options; ask them in several")
+        for row in options:
+            if len(set(row)) < len(row):
+                raise UsageError(
+                    f"two options begin with the same token (ids {list(row)}): their logits would be one number. "
+                    "Name options that differ in their first token, such as letters"
+                )
+        chosen = np.take_along_axis(logits, np.array(options, np.int64).reshape(len(logits), -1), axis=1)
+        shares = np.exp(logits - logits.max(axis=1, keepdims=True))
+        peak = np.exp(chosen - logits.max(axis=1, keepdims=True))
+        return cls(chosen, peak.sum(axis=1) / shares.sum(axis=1), state)
+
+
+NEAR_TIE: Mapping[str, float] = MappingProxyType({"float32": 1e-4, "bfloat16": 0.1})
+"""Per dtype, margins below which another batch or machine may turn a choice round.
+
+Measured on small models, batches against single rows: logits move by 1e-5 in float32, margins by 0.03 in bfloat16.
+"""
+
+
+class Reader(Model):
+    """A model that answers questions in text. Being asked is one inference, as `capture` counts it."""
+
+    @property
+    def lead(self) -> str:
+        """What stands between the frame and the first word of an answer, such as a space; see `Question`."""
+        return ""
+
+    @abstractmethod
+    def read(self, questions: Sequence[Question]) -> Reading:
+        """One prefill of all questions, which must have equally many options: every tap fires as promised.
+
+        Questions with and without a picture do not go together in one call.
+        Raises InstructionError or ObservationError for what the model cannot take in whole, UsageError for an
+        option that changes the prompt's own tokens, or begins like another one.
+        """
+
+    def near_ties(self, reading: Reading) -> NDArray[np.bool_]:
+        """(B,) whether the two likeliest options are so close that rounding may decide; see `NEAR_TIE`."""
+        best = np.sort(reading.option_logits, axis=1)[:, -2:]
+        limit = NEAR_TIE.get(self.card.dtype, NEAR_TIE["bfloat16"])
+        return np.asarray(best[:, -1] - best[:, 0] < limit) if best.shape[1] == 2 else np.zeros(len(best), bool)
+
+    @staticmethod
+    def shows_pictures(questions: Sequence[Question]) -> bool:
+        """Whether the questions are asked about their pictures. Raises UsageError if only some are."""
+        shown = {question.pictured for question in questions}
+        if len(shown) > 1:
+            raise UsageError("some of these questions come with a picture and some without; ask them in two calls")
+        return shown != {False}
+
+    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+        """Like `roles`, of the sequences that `read` makes of these questions.
+
+        A family whose prompt depends on more than a question's text, or that also acts, says so itself.
+        """
+        return self.roles([replace(question.seen, instruction=question.text) for question in questions])
+
+    @abstractmethod
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Per row at most `tokens` greedy tokens of text, outside of any capture. No answer is an answer: ""."""

@@ -1,0 +1,119 @@
+"""Token roles: what each position of a stream is, and the pooled views made from them."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit.errors import EmptyRoleError, RolesMismatchError, UnknownSiteError
+from probe_kit.hooks.contract.views import PADDING, plays
+
+
+class Span(NamedTuple):
+    """Positions `start` up to, not including, `stop` play `role`."""
+
+    role: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The roles of one sequence: spans that cover every position once, in order.
+
+    Roles are `image.<camera>`, `language`, `state`, `action`, `special` and `padding`; `image` names the positions
+    of all cameras, so that poolings compare across families.
+    """
+
+    spans: tuple[Span, ...]
+
+    def __post_init__(self) -> None:
+        start = 0
+        for span in self.spans:
+            if span.start != start or span.stop <= span.start:
+                raise ValueError(f"spans must tile the sequence without gaps or overlaps; got {self.spans}")
+            start = span.stop
+
+    @classmethod
+    def from_labels(cls, labels: Sequence[str]) -> "Roles":
+        """Run-length encode one label per position."""
+        spans: list[Span] = []
+        for position, role in enumerate(labels):
+            if spans and spans[-1].role == role:
+                spans[-1] = spans[-1]._replace(stop=position + 1)
+            else:
+                spans.append(Span(role, position, position + 1))
+        return cls(tuple(spans))
+
+    def __len__(self) -> int:
+        return self.spans[-1].stop if self.spans else 0
+
+    def mask(self, role: str) -> NDArray[np.bool_]:
+        """(T,) bool: positions of one role, or of all `<role>.<…>`."""
+        mask = np.zeros(len(self), dtype=bool)
+        for span in self.spans:
+            if plays(span.role, role):
+                mask[span.start : span.stop] = True
+        return mask
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(T,) bool: every position but padding."""
+        return ~self.mask(PADDING)
+
+
+def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
+    """Pooled views of one sequence, reduced in float32 on the device of `tokens`.
+
+    tokens: (..., T, D), any float dtype. views: as in `view_names`.
+    Returns (..., V, D) float32. Padding enters no view.
+    Raises EmptyRoleError for a view without a token, RolesMismatchError for roles of another length,
+    UnknownSiteError for an unknown view.
+    """
+    if tokens.shape[-2] != len(roles):
+        raise RolesMismatchError(
+            f"the stream has {tokens.shape[-2]} tokens but the model names roles for {len(roles)}; "
+            "the adapter's roles() does not describe this model's packing"
+        )
+    return _matrix(roles, tuple(views), tokens.device) @ tokens.float()
+
+
+def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.device | str) -> None:
+    """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
+
+    Raises EmptyRoleError and UnknownSiteError as `pool` does.
+    """
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is None:
+        place = torch.device("cuda", torch.cuda.current_device())  # as its tensors say
+    for own in roles:
+        _matrix(own, tuple(views), place)
+
+
+@lru_cache(maxsize=1024)
+def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tensor:
+    """(V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
+    weights = np.stack([_weights(roles, view) for view in views]).astype(np.float32)
+    return torch.from_numpy(weights).to(device)
+
+
+def _weights(roles: Roles, view: str) -> NDArray[np.float64]:
+    valid = roles.valid
+    if view == "last":
+        weights = np.zeros(len(roles))
+        weights[np.flatnonzero(valid)[-1]] = 1
+        return weights
+    if view == "mean":
+        chosen = valid
+    elif view.startswith("mean:"):
+        chosen = roles.mask(view.removeprefix("mean:"))
+    else:
+        raise UnknownSiteError(f"unknown view {view!r}; expected mean, last or mean:<role>")
+    if not chosen.any():
+        raise EmptyRoleError(f"no token for view {view!r}; roles present: {sorted({s.role for s in roles.spans})}")
+    return np.asarray(chosen / chosen.sum(), np.float64)

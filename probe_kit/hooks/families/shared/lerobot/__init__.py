@@ -1,0 +1,1 @@
+"""What lerobot's flow policies share."""

@@ -1,0 +1,164 @@
+"""Normalisation with the statistics of a lerobot checkpoint: in processor files or, until 2025, in its weights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import load_file
+
+from probe_kit._system.bounded_json import read_json_object
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoints.checkpoint import shard_name
+from probe_kit.models.bounds import check_bounds, check_deviations
+from probe_kit.models.lerobot.pi0_keys import STATISTICS
+
+_EPS = 1e-8
+# The two statistics each mode needs, as (offset-like, scale-like).
+_NEEDED = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}
+
+
+class Units(Protocol):
+    """Between physical units and the numbers of a network. mode, source: what it is and whence, in words."""
+
+    @property
+    def mode(self) -> str:
+        """The kind of map."""
+
+    @property
+    def source(self) -> str:
+        """The file the statistics come from."""
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D)."""
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Network output to physical units; (..., D)."""
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """An affine map per dimension, in lerobot's conventions (`NormalizerProcessorStep`, lerobot 0.6).
+
+    mode: MEAN_STD, MIN_MAX, QUANTILES or IDENTITY. low, high: the two statistics, (D,) float32.
+    source: the file they come from.
+    Raises CheckpointError for statistics that are not finite, or whose scale is not positive.
+    """
+
+    mode: str
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    eps: float
+    source: str
+
+    def __post_init__(self) -> None:
+        if self.mode != "IDENTITY":
+            (check_deviations if self.mode == "MEAN_STD" else check_bounds)(self.low, self.high, self.source)
+        if not (np.isfinite(self.eps) and self.eps >= 0):
+            raise CheckpointError(f"{self.source}: eps is {self.eps}; expected a small positive number")
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D)."""
+        if self.mode == "IDENTITY":
+            return values
+        if self.mode == "MEAN_STD":
+            return np.asarray((values - self.low) / (self.high + self.eps), np.float32)
+        span = np.where(self.high == self.low, self.eps, self.high - self.low)
+        return np.asarray(2 * (values - self.low) / span - 1, np.float32)
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Network output to physical units; (..., D)."""
+        if self.mode == "IDENTITY":
+            return values
+        if self.mode == "MEAN_STD":
+            return np.asarray(values * self.high + self.low, np.float32)
+        span = np.where(self.high == self.low, self.eps, self.high - self.low)
+        return np.asarray((values + 1) / 2 * span + self.low, np.float32)
+
+
+def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:
+    """The map of one feature from `<pipeline>.json` and the safetensors file it names.
+
+    pipeline: `policy_preprocessor` or `policy_postprocessor`. feature: `observation.state` or `action`.
+    kind: the feature's type in lerobot's norm_map, `STATE` or `ACTION`.
+    Raises CheckpointError if statistics are missing: lerobot would let the values pass unchanged.
+    """
+    path = folder / f"{pipeline}.json"
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing: without it the units of {feature} are unknown")
+    steps = read_json_object(path, CheckpointError, "Download the checkpoint again").get("steps")
+    for step in steps if isinstance(steps, list) else ():
+        if step["registry_name"] in ("normalizer_processor", "unnormalizer_processor"):
+            config = step["config"]
+            mode = config["norm_map"].get(kind, "IDENTITY")
+            if mode == "IDENTITY":
+                return Normaliser(mode, np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
+            low, high = _statistics(folder, step.get("state_file"), feature, mode)
+            return Normaliser(mode, low, high, float(config.get("eps", 1e-8)), step["state_file"])
+    raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
+
+
+def _statistics(
+    folder: Path, name: str | None, feature: str, mode: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    if mode not in _NEEDED:
+        raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
+    try:
+        path = folder / shard_name(name) if name else None
+        arrays = load_file(path) if path is not None and path.is_file() else {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise CheckpointError(f"{folder / str(name)} cannot be read ({error}); download it again") from error
+    wanted = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
+    missing = [key for key in wanted if key not in arrays]
+    if missing:
+        raise CheckpointError(
+            f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
+            "unit. Take the statistics of the data set it was trained on"
+        )
+    return arrays[wanted[0]], arrays[wanted[1]]
+
+
+def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
+    """The statistics that lerobot kept among the weights until 2025, by their names there; mostly none.
+
+    Raises CheckpointError if a weights file cannot be read.
+    """
+    found: dict[str, NDArray[np.float32]] = {}
+    for path in sorted(folder.glob("model*.safetensors")):
+        try:
+            with safe_open(path, "pt") as file:
+                names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
+                found |= {name: file.get_tensor(name).float().numpy() for name in names}
+        except SafetensorError as error:
+            raise CheckpointError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+    return found
+
+
+def from_buffers(
+    buffers: Mapping[str, NDArray[np.float32]], modes: Mapping[str, object], feature: str, kind: str, source: str
+) -> Normaliser | None:
+    """The map of one feature from old buffers; None where the configuration normalises nothing.
+
+    modes: `normalization_mapping` of the configuration. source: whose weights they are, for messages.
+    Raises CheckpointError if a buffer is missing, or was never filled.
+    """
+    found = modes.get(kind, "IDENTITY")
+    mode = str(getattr(found, "value", found))
+    if mode == "IDENTITY":
+        return None
+    if mode not in _NEEDED:
+        raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
+    module = "normalize_inputs" if kind == "STATE" else "unnormalize_outputs"
+    names = [f"{module}.buffer_{feature.replace('.', '_')}.{statistic}" for statistic in _NEEDED[mode]]
+    missing = [name for name in names if name not in buffers]
+    unfilled = [name for name in names if name in buffers and not np.isfinite(buffers[name]).all()]
+    if missing or unfilled:
+        what = f"lack {', '.join(missing)}" if missing else f"hold {', '.join(unfilled)} that nobody filled"
+        raise CheckpointError(
+            f"{source} has no policy_preprocessor.json and its weights {what}: its {feature} has no physical "
+            "unit. Take the statistics of the data set it was trained on"
+        )
+    return Normaliser(mode, buffers[names[0]], buffers[names[1]], _EPS, "the weights")

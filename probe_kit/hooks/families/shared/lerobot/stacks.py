@@ -1,0 +1,49 @@
+"""The transformer stacks of lerobot's flow policies, and where their sites are read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import nn
+
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.sites import Site, Stream
+
+
+@dataclass(frozen=True)
+class Stack:
+    """One transformer stack inside a policy; `entry` names the block's first submodule."""
+
+    layers: Sequence[nn.Module]
+    norm: nn.Module
+    width: int
+    iterations: int | None
+    entry: str = "input_layernorm"
+
+    def tap(self, site: Site) -> Tap:
+        """Where a site of this stack is read."""
+        fires = self.iterations or 1
+        if site.quantity == "final_norm":
+            return Tap(self.norm, fires, "output")
+        if site.layer == len(self.layers):
+            return Tap(self.norm, fires)
+        block: Any = self.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, fires, "output")
+        if site.quantity == "attention":
+            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.out_proj
+            return Tap(projection, fires, "output")
+        return Tap(getattr(block, self.entry), fires)
+
+    def stream(self, name: str) -> Stream:
+        """What is stored of it: the input of every block, and of the final norm."""
+        return Stream(name, len(self.layers) + 1, self.width, self.iterations)
+
+
+def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:
+    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotFlow`."""
+    return {
+        "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
+        "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
+        "vision": Stack(vision.encoder.layers, vision.post_layernorm, vision.config.hidden_size, 1, "layer_norm1"),
+    }

@@ -1,0 +1,1 @@
+"""What models on Qwen's vision-language models share."""

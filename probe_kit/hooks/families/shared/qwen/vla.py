@@ -1,0 +1,180 @@
+"""What the adapters of policies on Qwen's vision-language models share: prompts, pictures, the backbone's taps."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from probe_kit.errors import InstructionError
+from probe_kit.hooks.contract.model import Policy, Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
+from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
+from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
+
+CAMERA = "primary"
+IMAGE_ROLE = f"image.{CAMERA}"
+BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
+
+
+class QwenVLA(Policy):
+    """A policy whose backbone is one of transformers' Qwen vision-language models.
+
+    Subclasses say what the model is shown and told, and what follows the backbone.
+    """
+
+    fast_pictures: ClassVar[bool]
+    """Which of Qwen's two picture processors the model's authors ran."""
+
+    def __init__(self, vlm: Any, folder: Path, tokenizer: str | None, device: str) -> None:
+        """vlm: `Qwen…VLForConditionalGeneration`. folder: of tokenizer.json and preprocessor_config.json."""
+        self.vlm, self.folder, self.device = vlm, folder, device
+        self._tokenizer_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
+        # Pictures of the inference under way: vision towers run over the patches of all rows at once.
+        self._grid: Tensor | None = None
+
+    @property
+    def language(self) -> Any:
+        """The decoder."""
+        return self.vlm.model.language_model
+
+    @property
+    def tower(self) -> Any:
+        """Qwen's vision tower."""
+        return self.vlm.model.visual
+
+    def backbone_stream(self) -> Stream:
+        """The decoder's stream."""
+        return Stream("backbone", len(self.language.layers) + 1, int(self.vlm.config.text_config.hidden_size))
+
+    def backbone_memory(self) -> Stream:
+        """The decoder's keys and values."""
+        return kept_prompt(self.vlm.config.text_config)
+
+    def vision_stream(self) -> Stream:
+        """The vision tower's stream; the last site is what its merger reads."""
+        vision = self.vlm.config.vision_config
+        return Stream("vision", len(self.tower.blocks) + 1, int(vision.hidden_size), quantities=("residual",))
+
+    # -- what a family decides ---------------------------------------------------------------------------
+
+    @abstractmethod
+    def text(self, instruction: str) -> str:
+        """The whole prompt with one image slot."""
+
+    @abstractmethod
+    def look(self, seen: Observation) -> Any:
+        """(H, W, 3) uint8 the processor gets."""
+
+    def shown(self, seen: Observation) -> Any:
+        """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
+        return self.look(seen)
+
+    @property
+    @abstractmethod
+    def merger_entry(self) -> nn.Module:
+        """The module that reads what leaves the vision tower."""
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def tokenizer(self) -> QwenTokenizer:
+        """The checkpoint's. Raises CheckpointError naming the missing file."""
+        return QwenTokenizer.find(self._tokenizer_folder)
+
+    @cached_property
+    def pictures(self) -> QwenPictures:
+        """How pictures become patches. Raises CheckpointError naming the missing file."""
+        vision = self.vlm.config.vision_config
+        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
+        return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of the whole prompt, one for the picture."""
+        return self.tokenizer.encode(self.text(instruction), int(self.vlm.config.text_config.vocab_size))
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt, one for the picture."""
+        return [tuple(self.prompt(instruction)) for instruction in instructions]
+
+    def rows(self, seen: Sequence[Observation]) -> list[list[int]]:
+        """Per observation the ids the backbone gets, the picture's as often as its size demands.
+
+        Raises InstructionError for a prompt that is too long.
+        """
+        limit = int(self.vlm.config.text_config.max_position_embeddings)
+        rows = []
+        for observation in seen:
+            grid = self.pictures.grid(*self.look(observation).shape[:2])
+            count = merged_tokens(grid, self.pictures.merge)
+            row = image_slots(self.prompt(observation.instruction), self._image_token, [count])
+            if len(row) > limit:
+                raise InstructionError(f"a prompt makes {len(row)} positions; this model has {limit}. Shorten it")
+            rows.append(row)
+        return rows
+
+    def inputs(self, seen: Sequence[Observation]) -> QwenInputs:
+        """The observations as the backbone reads them, on the model's device. Raises ObservationError."""
+        for observation in seen:
+            checked_picture(observation.image)
+        pixels, grid = self.pictures.patches([self.shown(observation) for observation in seen])
+        padding = self.vlm.config.text_config.pad_token_id
+        packed = pack_inputs(
+            self.rows(seen), pixels, grid, self._image_token, 0 if padding is None else int(padding)
+        )
+        return packed.to(self.device)
+
+    @property
+    def _image_token(self) -> int:
+        return int(self.vlm.config.image_token_id)
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def backbone_roles(self, seen: Sequence[Observation]) -> list[Roles]:
+        """Chat marks, picture, text; padding behind it where another prompt is longer."""
+        rows, special = self.rows(seen), self.tokenizer.special
+        longest = max(map(len, rows))
+
+        def role(number: int) -> str:
+            if number == self._image_token:
+                return IMAGE_ROLE
+            return "special" if number in special else "language"
+
+        return [Roles.from_labels([*map(role, row), *[PADDING] * (longest - len(row))]) for row in rows]
+
+    def backbone_tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or a block's output."""
+        if site.quantity == "final_norm":
+            return Tap(self.language.norm, 1, "output")
+        if site.layer == len(self.language.layers):
+            return Tap(self.language.norm, 1)
+        block = self.language.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, 1, "output")
+        if site.quantity == "attention":
+            return Tap(block.self_attn.o_proj, 1, "output")
+        return Tap(block.input_layernorm, 1)
+
+    def vision_tap(self, site: Site) -> Tap:
+        """The first norm of the block, or what reads the last one; patches in the tower's own order."""
+        blocks = self.tower.blocks
+        module = self.merger_entry if site.layer == len(blocks) else blocks[site.layer].norm1
+        return Tap(module, 1, view=self._by_picture)
+
+    def _by_picture(self, patches: Tensor) -> Tensor:
+        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
+        count = 1 if self._grid is None or bool((self._grid != self._grid[0]).any()) else len(self._grid)
+        return patches.view(count, -1, patches.shape[-1])
+
+
+def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:
+    """(B, …) float32 standard normal numbers, a row per seed, the same on every device."""
+    rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+    return torch.stack(rows).to(device)

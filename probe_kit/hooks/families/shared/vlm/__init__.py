@@ -1,0 +1,1 @@
+"""What vision-language models that answer in text share."""

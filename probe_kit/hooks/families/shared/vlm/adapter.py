@@ -1,0 +1,247 @@
+"""What the adapters of vision-language models that answer in text share: packing, reading, speaking, taps, roles.
+
+One stack serves two streams, told apart by position: `backbone` is the prompt without its last position, `answer`
+the last one, whose logits choose the first token of the answer. Padding stands in front of every row.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import InstructionError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.model import Question, Reader, Reading, Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.network_loading import Filled
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, Prompt
+from probe_kit.models.packing import LeftPacked
+
+CAMERA = "primary"
+IMAGE_ROLE = f"image.{CAMERA}"
+ANSWER = "answer"
+_PROMPT, _LAST = slice(None, -1), slice(-1, None)
+Pictures = list[NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A loaded network and where it is from. checkpoint: as asked for. folder: where its files lie."""
+
+    filled: Filled[Any]
+    checkpoint: str
+    folder: Path
+    device: str
+
+    @property
+    def network(self) -> Any:
+        """The network."""
+        return self.filled.network
+
+
+class VisionLanguageModel(Reader):
+    """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions."""
+
+    family: ClassVar[str]
+    frame: ClassVar[Frame]
+    picture_token: ClassVar[str | None] = None
+    """What stands at the positions of a picture, if it is a token of the tokenizer."""
+    marks: ClassVar[int] = 0
+    """Positions at either end of a picture's that only say where it begins and ends."""
+    sums: ClassVar[bool] = True
+    """Whether a block's attention and MLP are all that is added to the stream."""
+
+    def __init__(self, loaded: Loaded, tokenizer: str | None = None, **settings: str) -> None:
+        """settings: what else the numbers depend on, for the card."""
+        self.loaded, self.network = loaded, loaded.network
+        self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
+        layers, width = len(self.language.layers) + 1, int(self.text_config.hidden_size)
+        self.streams = {
+            "backbone": Stream("backbone", layers, width, sums=self.sums),
+            ANSWER: Stream(ANSWER, layers, width, 1, part="action", sums=self.sums),
+        }
+        blocks, seen = self.vision_size
+        self.further_streams = {
+            "vision": Stream("vision", blocks + 1, seen, part="vision", quantities=("residual",))
+        }
+        self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
+        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", **settings})
+
+    def _card(self, settings: dict[str, str]) -> Card:
+        loaded, audit = self.loaded, self.loaded.filled.audit
+        files = side_files(loaded.folder)
+        if self._text_folder != loaded.folder and self._text_folder.is_dir():
+            files |= side_files(self._text_folder, "tokenizer/")
+        return Card(
+            family=self.family,
+            checkpoint=loaded.checkpoint,
+            weights_sha256=audit.sha256,
+            random_weights=audit.random,
+            parameters=audit.parameters,
+            dtype=loaded.filled.dtype,
+            device=loaded.device,
+            embodiment="",
+            cameras=(CAMERA,),
+            chunk=0,
+            execute=0,
+            audit=audit.to_json(),
+            settings={**content_hashes(files), "frame": str(self.frame), **settings},
+            weights_seed=loaded.filled.weights_seed,
+        )
+
+    # -- what a family decides ---------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def vision_size(self) -> tuple[int, int]:
+        """Blocks and width of the vision tower."""
+
+    @abstractmethod
+    def vision_tap(self, layer: int) -> Tap:
+        """Where what enters block `layer` of the vision tower is read; the last is what leaves the tower."""
+
+    @abstractmethod
+    def picture_ids(self, height: int, width: int) -> list[int]:
+        """The ids at the positions of a picture of that size, `marks` at either end included."""
+
+    @abstractmethod
+    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+        """What the network is called with for a batch of (H, W, 3) uint8 pictures, on the model's device."""
+
+    def positions(self, packed: LeftPacked, shown: dict[str, Tensor]) -> Tensor:
+        """(…, B, T) int64 positions. shown: of `shown`; empty without pictures."""
+        del shown
+        return packed.positions()
+
+    def further(self, packed: LeftPacked) -> dict[str, Tensor]:
+        """What else the network is called with, with or without pictures."""
+        del packed
+        return {}
+
+    @property
+    def language(self) -> Any:
+        """The decoder."""
+        return self.network.model.language_model
+
+    @property
+    def text_config(self) -> Any:
+        """The language model's configuration."""
+        return self.network.config.text_config
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def text(self) -> FramedText:
+        """How the model is spoken to. Raises CheckpointError naming the files that are missing."""
+        text = FramedText.of(self._text_folder, self.frame, self.text_config, self.loaded.folder)
+        if self.picture_token is not None:
+            text.check_token(self.picture_token, int(self.network.config.image_token_id))
+        return text
+
+    def prompt(self, question: Question) -> Prompt:
+        """The whole prompt of a question. Raises InstructionError or ObservationError for what does not fit in."""
+        ids = None
+        if question.pictured:
+            ids = self.picture_ids(*checked_picture(question.seen.image).shape[:2])
+        prompt = self.text.prompt(question.text, question.begun, ids, self.marks)
+        limit = int(self.text_config.max_position_embeddings)
+        if len(prompt.ids) > limit:
+            raise InstructionError(
+                f"a prompt makes {len(prompt.ids)} positions; this model has {limit}. Shorten it, or show a "
+                "smaller picture"
+            )
+        return prompt
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt, as it is without a picture."""
+        return [self.text.prompt(instruction).ids for instruction in instructions]
+
+    # -- answering ---------------------------------------------------------------------------------------
+
+    def prefill(self, questions: Sequence[Question]) -> Prefill:
+        """One pass over all questions."""
+        self.check([question.seen for question in questions])
+        shown: dict[str, Tensor] = {}
+        if self.shows_pictures(questions):
+            shown = self.shown([checked_picture(question.seen.image) for question in questions])
+        packed = self.packed([self.prompt(question) for question in questions])
+        with torch.inference_mode():
+            return Prefill.of(
+                self.network, packed, self.positions(packed, shown), {**shown, **self.further(packed)}
+            )
+
+    def packed(self, prompts: Sequence[Prompt]) -> LeftPacked:
+        """Prompts as one batch on the model's device."""
+        return LeftPacked.of([prompt.ids for prompt in prompts], self.text.padding, self.loaded.device)
+
+    def read(self, questions: Sequence[Question]) -> Reading:
+        """One prefill; see the contract."""
+        self.shows_pictures(questions)
+        options = [
+            [self.text.option(prompt, option) for option in question.options]
+            for question in questions
+            for prompt in [self.text.prompt(question.text, question.begun, [] if question.pictured else None)]
+        ]
+        prefill = self.prefill(questions)
+        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
+        if not isinstance(reading.state, Prefill) or reading.state.network is not self.network:
+            raise UsageError("this reading does not come from this model; pass what its read() returned")
+        with torch.inference_mode():
+            ids = reading.state.speak(tokens, self.text.ends)
+        return [self.text.decode(row) for row in ids.tolist()]
+
+    # -- listening ---------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Of the observations' instructions as questions."""
+        return self.asked_roles([Question(one, one.instruction) for one in seen])
+
+    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+        """Everything around picture and question is `special`, how an answer has begun too."""
+        self.shows_pictures(questions)
+        prompts = [self.prompt(question) for question in questions]
+        longest = max(len(prompt.ids) for prompt in prompts)
+        rows = [[PADDING] * (longest - len(prompt.ids)) + _labels(prompt) for prompt in prompts]
+        return {
+            "backbone": [Roles.from_labels(labels[:-1]) for labels in rows],
+            ANSWER: [Roles.from_labels([ANSWER])] * len(rows),
+        }
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or a block's output."""
+        if self.stream_of(site).part == "vision":
+            return self.vision_tap(site.layer)
+        tokens = _PROMPT if site.stream == "backbone" else _LAST
+        norm: nn.Module = self.language.norm
+        if site.quantity == "final_norm":
+            return Tap(norm, 1, "output", tokens)
+        if site.layer == len(self.language.layers):
+            return Tap(norm, 1, tokens=tokens)
+        block = self.language.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.mlp, 1, "output", tokens)
+        if site.quantity == "attention":
+            return Tap(block.self_attn.o_proj, 1, "output", tokens)
+        return Tap(block.input_layernorm, 1, tokens=tokens)
+
+
+def _labels(prompt: Prompt) -> list[str]:
+    labels = ["language" if asked else "special" for asked in prompt.question]
+    start, stop = prompt.picture
+    labels[start:stop] = [IMAGE_ROLE] * (stop - start)
+    return labels

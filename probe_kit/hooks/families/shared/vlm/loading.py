@@ -1,0 +1,94 @@
+"""Loading a vision-language model from a folder or hub id: configuration, renamed weights, random twin."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from huggingface_hub.errors import StrictDataclassError
+from torch import nn
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder
+from probe_kit.hooks.checkpoints.weights import read_weights
+from probe_kit.hooks.families.shared.network_loading import fill, twin
+from probe_kit.hooks.families.shared.vlm.adapter import Loaded
+from probe_kit.models.building import without_precision
+from probe_kit.models.naming import Renames, renamed
+
+Build = Callable[[Any, torch.dtype, str], Any]
+# What Python, torch and transformers raise for numbers and names in a configuration that cannot be.
+_OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a family's network is made of the files of a checkpoint.
+
+    config: of the values of config.json. build: an empty network of a configuration, dtype and device.
+    names: from tensors in files to those of the network.
+    """
+
+    config: Callable[[Mapping[str, Any]], Any]
+    build: Build
+    names: Renames = ()
+
+
+def load_vlm(
+    recipe: Recipe,
+    checkpoint: str | None,
+    device: str,
+    dtype: str | None,
+    random_weights: bool,
+    weights_seed: int,
+) -> Loaded:
+    """The network of a checkpoint with exactly the weights of its files, or its random twin.
+
+    Raises UsageError without a checkpoint, CheckpointError for a configuration that describes no such network, and
+    WeightsError for weights that are not exactly the network's.
+    """
+    if checkpoint is None:
+        raise UsageError("name a folder or hub id as --checkpoint")
+    folder = checkpoint_folder(checkpoint)
+    file = folder / CONFIG_FILE
+    with _describing(file):
+        config = recipe.config(without_precision(json.loads(file.read_text())))
+
+    def build(kind: torch.dtype, place: str) -> Any:
+        with _describing(file):
+            return recipe.build(config, kind, place)
+
+    if random_weights:
+        filled = twin(build, checkpoint, dtype, weights_seed)
+    else:
+        filled = fill(
+            build, lambda: read_weights(folder), dtype, doubles, lambda name: renamed(name, recipe.names)
+        )
+    filled.network.to(device)
+    return Loaded(filled, checkpoint, folder, device)
+
+
+@contextmanager
+def _describing(file: Path) -> Iterator[None]:
+    """Whatever goes wrong inside is because of what a configuration says. Raises CheckpointError."""
+    try:
+        yield
+    except (*_OF_VALUES, StrictDataclassError, OSError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(
+            f"{file} describes no network of this family ({type(error).__name__}: {reason}); download it "
+            "again, or pass the right --model"
+        ) from error
+
+
+def doubles(network: nn.Module) -> tuple[str, ...]:
+    """Parameters that are another one's double, such as tied output weights: files hold one of them."""
+    first: dict[int, str] = {}
+    found = []
+    for name, tensor in network.state_dict(keep_vars=True).items():
+        if first.setdefault(id(tensor), name) != name:
+            found.append(name)
+    return tuple(found)

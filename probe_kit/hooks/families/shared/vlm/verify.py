@@ -1,0 +1,220 @@
+"""What vision-language models can be compared in, under the names of their golden references.
+
+B rows, T positions, L blocks, D width, V vocabulary. The questions stand in `dims.json` beside the reference, as
+whole prompts; the adapter is given what stands between their frames.
+"""
+
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.families.shared.module_outputs import numpy_of
+from probe_kit.hooks.families.shared.vlm.adapter import ANSWER, VisionLanguageModel
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.verification.verify import Comparison, Produce, compare
+from probe_kit.models.packing import LeftPacked
+
+Arrays = Mapping[str, NDArray[Any]]
+PIXELS, STREAMS, LOGITS = 1e-6, 3e-5, 2e-5
+"""Tolerances, absolute."""
+LETTERS = ("A", "B")
+_INPUTS = ("pixel_values_index",)
+DIMS_FILE = "dims.json"
+# How the templates that references were recorded with mark a picture's place.
+_PLACEHOLDER = re.compile(r"<\|vision_end\|>|<IMG_CONTEXT>|<image>")
+
+
+def verify_vlm(
+    model: VisionLanguageModel,
+    folder: Path,
+    recorded: Arrays,
+    further: Mapping[str, Produce] | None = None,
+    streams: float = STREAMS,
+) -> tuple[Comparison, ...]:
+    """Compare a reference. further: outputs that only this family has. streams: tolerance of its activations."""
+    reference = Reference(model, questions_of(folder, recorded, model), recorded)
+    return compare_all(recorded, {**reference.produced(), **(further or {})}, streams)
+
+
+def compare_all(
+    recorded: Arrays, produced: Mapping[str, Produce], streams: float = STREAMS
+) -> tuple[Comparison, ...]:
+    """Every recorded output with the tolerance of its kind; streams where `attention_mask` says so."""
+    mask = dict.fromkeys(("backbone_resid", "backbone_final_norm"), recorded["attention_mask"].astype(bool))
+    comparisons: list[Comparison] = []
+    for name in sorted(recorded):
+        if name.startswith("in_") or name in _INPUTS:
+            continue
+        valid = {name: mask[name]} if name in mask else {}
+        absolute = not name.endswith("_sum")
+        comparisons += compare({name: recorded[name]}, produced, _tolerance(name, streams), valid, absolute)
+    return tuple(comparisons)
+
+
+def _tolerance(name: str, streams: float) -> float:
+    if name.startswith("pixel_values"):
+        return PIXELS
+    return LOGITS if "logits" in name else streams
+
+
+def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Question]:
+    """The recorded questions with their pictures. Raises UsageError where they do not lie beside the reference."""
+    file = folder / DIMS_FILE
+    if not file.is_file():
+        raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
+    rows = json.loads(file.read_text())["rows"]
+    shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
+    return [
+        Question(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))
+        for row, picture in zip(rows, shown, strict=True)
+    ]
+
+
+def _letters(model: VisionLanguageModel) -> tuple[str, ...]:
+    return tuple(model.lead + letter for letter in LETTERS)
+
+
+def _between(text: str, model: VisionLanguageModel) -> str:
+    """The question in a whole prompt: behind the picture's placeholder, before the frame's end."""
+    end = model.frame.end
+    body = text.removesuffix(end) if end.strip() else text
+    return _PLACEHOLDER.split(body)[-1].lstrip("\n")
+
+
+class Reference:
+    """The recorded questions, run through the adapter when something asks for what comes of them."""
+
+    def __init__(self, model: VisionLanguageModel, questions: Sequence[Question], recorded: Arrays) -> None:
+        self.model, self.questions, self.recorded = model, questions, recorded
+
+    @cached_property
+    def shown(self) -> dict[str, torch.Tensor]:
+        """The pictures of all rows as the network gets them."""
+        return self.model.shown([question.seen.image for question in self.questions])
+
+    @cached_property
+    def batch(self) -> LeftPacked:
+        """All rows."""
+        return self.model.packed([self.model.prompt(question) for question in self.questions])
+
+    @cached_property
+    def heard(self) -> tuple[Tape, Prefill]:
+        """One pass over all rows, with everything that is stored of it."""
+        model = self.model
+        with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
+            prefill = model.prefill(self.questions)
+        return tape, prefill
+
+    @cached_property
+    def alone(self) -> list[Prefill]:
+        """Every row by itself."""
+        return [self.model.prefill([question]) for question in self.questions]
+
+    @cached_property
+    def bare(self) -> Question:
+        """The first question without its picture."""
+        return replace(self.questions[0], pictured=False)
+
+    def produced(self) -> dict[str, Produce]:
+        """How to make every output the adapter can make, whether recorded or not."""
+        return {**self._inputs(), **self._pixels(), **self._streams(), **self._answers()}
+
+    def _inputs(self) -> dict[str, Produce]:
+        model = self.model
+        return {
+            "input_ids": lambda: self.batch.ids.numpy(),
+            "attention_mask": lambda: self.batch.mask.numpy(),
+            "position_ids": lambda: model.positions(self.batch, self.shown).numpy(),
+            "image_grid_thw": lambda: self.shown["image_grid_thw"].numpy(),
+            "token_type_ids": lambda: model.further(self.batch)["token_type_ids"].numpy(),
+            "mm_token_type_ids": lambda: model.further(self.batch)["mm_token_type_ids"].numpy(),
+            "textonly_input_ids": lambda: np.array([model.prompt(self.bare).ids]),
+        }
+
+    def _pixels(self) -> dict[str, Produce]:
+        def values() -> NDArray[Any]:
+            return self.shown["pixel_values"].float().numpy()
+
+        def sums() -> NDArray[Any]:
+            whole = values().astype(np.float64)
+            return np.array([whole.sum(), np.abs(whole).sum()])
+
+        return {
+            "pixel_values": values,
+            "pixel_values_shape": lambda: np.array(values().shape),
+            "pixel_values_at": lambda: values().ravel()[self.recorded["pixel_values_index"]],
+            "pixel_values_sum": sums,
+            "pixel_values_row0": lambda: self.model.shown([self.questions[0].seen.image])["pixel_values"].numpy(),
+        }
+
+    def _streams(self) -> dict[str, Produce]:
+        def joined(layer: int, quantity: str) -> torch.Tensor:
+            tape = self.heard[0]
+            parts = [Site("backbone", layer, quantity), Site(ANSWER, layer, quantity, 0)]
+            return torch.cat([tape[site] for site in parts], dim=1)
+
+        layers = self.model.streams["backbone"].layers
+        return {
+            "backbone_resid": lambda: numpy_of(
+                torch.stack([joined(layer, "residual") for layer in range(layers)])
+            ),
+            "backbone_final_norm": lambda: numpy_of(joined(layers - 1, "final_norm")),
+            "vision_resid_row0": self.vision,
+        }
+
+    def vision(self) -> NDArray[Any]:
+        """What enters every block of the tower for the first row's picture."""
+        sites = self.model.further_streams["vision"].sites()[:-1]
+        with capture(self.model, sites) as tape:
+            self.model.prefill(self.questions[:1])
+        values = numpy_of(torch.stack([tape[site] for site in sites]))
+        flat = self.recorded["vision_resid_row0"].ndim < values.ndim
+        return values[:, 0] if flat else values
+
+    def _answers(self) -> dict[str, Produce]:
+        model = self.model
+
+        def options() -> NDArray[Any]:
+            prompt = model.prompt(self.questions[0])
+            return np.array([model.text.option(prompt, option) for option in self.questions[0].options])
+
+        return {
+            "logits_last": lambda: numpy_of(self.heard[1].logits),
+            "single_logits_last": lambda: numpy_of(torch.cat([prefill.logits for prefill in self.alone])),
+            "textonly_logits_last": lambda: numpy_of(model.prefill([self.bare]).logits),
+            "option_ids": options,
+            "option_logits": lambda: model.read(self.questions).option_logits,
+            "greedy_ids": self._greedy,
+        }
+
+    def _greedy(self) -> NDArray[np.int64]:
+        """What is said behind every row, padded behind its end."""
+        length = self.recorded["greedy_ids"].shape[1]
+        with torch.inference_mode():
+            said = self.heard[1].speak(length, self.model.text.ends).numpy()
+        return padded_answers(said, length, self.model.text.ends, self.model.text.padding)
+
+
+def padded_answers(
+    said: Sequence[NDArray[np.int64]] | NDArray[np.int64], length: int, ends: Collection[int], padding: int
+) -> NDArray[np.int64]:
+    """(B, length) ids, each row up to and with its end, padded behind it."""
+    padded = np.full((len(said), length), padding)
+    for row, ids in enumerate(said):
+        over = np.isin(ids, list(ends))
+        stop = int(over.argmax()) + 1 if over.any() else len(ids)
+        padded[row, :stop] = ids[:stop]
+    return padded

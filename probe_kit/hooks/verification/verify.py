@@ -1,0 +1,207 @@
+"""`probe-kit verify`: the ordinary adapter against outputs recorded from a model's original implementation."""
+
+import gzip
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
+from zlib import error
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from probe_kit._system.bounded_json import parse_json
+from probe_kit.errors import UsageError
+from probe_kit.hooks.checkpoints.third_party import in_words, loading
+from probe_kit.hooks.registry import find_family
+from probe_kit.models.naming import renamed
+
+Status = Literal["ok", "over", "not compared"]
+Produce = Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One recorded output beside ours; `error` is the largest absolute difference, None if not compared."""
+
+    output: str
+    status: Status
+    error: float | None
+    tolerance: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All comparisons of one golden reference."""
+
+    family: str
+    source: str
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was compared and nothing is over its tolerance."""
+        statuses = {comparison.status for comparison in self.comparisons}
+        return "ok" in statuses and "over" not in statuses
+
+    def to_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {**asdict(self), "passed": self.passed}
+
+
+def compare(
+    recorded: Mapping[str, NDArray[Any]],
+    produced: Mapping[str, Produce],
+    tolerance: float,
+    valid: Mapping[str, NDArray[np.bool_]],
+    absolute: bool = False,
+) -> tuple[Comparison, ...]:
+    """Compare every recorded output but the inputs (`in_…`).
+
+    tolerance: of an output whose values are below one; larger values may differ by as much of the largest one.
+    produced: how to make each output we can make. valid: per output a mask over its leading axes behind the
+    first, where only some positions mean anything. absolute: the tolerance is the same for larger values.
+    """
+    comparisons = []
+    for name in sorted(recorded):
+        if name.startswith("in_"):
+            continue
+        if name not in produced:
+            comparisons.append(
+                Comparison(name, "not compared", None, tolerance, "the adapter does not produce it")
+            )
+            continue
+        ours, theirs = np.asarray(produced[name]()), recorded[name]
+        if ours.shape != theirs.shape:
+            note = f"shape {ours.shape}, recorded {theirs.shape}"
+            comparisons.append(Comparison(name, "over", None, tolerance, note))
+            continue
+        error = _largest_error(ours, theirs, valid.get(name))
+        exact = not np.issubdtype(theirs.dtype, np.floating)
+        allowed = tolerance if absolute and not exact else _allowed(theirs, tolerance)
+        comparisons.append(Comparison(name, "ok" if error <= allowed else "over", error, allowed))
+    return tuple(comparisons)
+
+
+def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
+    """Absolute plus relative to the largest recorded value; ids, masks and counts must be equal."""
+    if not np.issubdtype(theirs.dtype, np.floating):
+        return 0.0
+    size = np.abs(theirs.astype(np.float64))
+    return tolerance * (1 + float(size[np.isfinite(size)].max(initial=0.0)))
+
+
+def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.bool_] | None) -> float:
+    """NaN on either side counts as infinitely wrong."""
+    difference = np.abs(ours.astype(np.float64) - theirs.astype(np.float64))
+    if valid is not None:
+        difference = difference[..., valid, :]
+    worst = float(difference.max(initial=0.0))
+    return worst if np.isfinite(worst) else float("inf")
+
+
+def verify_reference(family: str, folder: Path) -> Verification:
+    """Load `folder/checkpoint` through the family's adapter and compare with `folder/reference.npz`.
+
+    Raises UsageError if the folder has no reference or the family no verifier, and whatever loading raises.
+    """
+    run = find_family(family).function("verifier")
+    file = folder / "reference.npz"
+    if not file.is_file():
+        raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
+    recorded = _read_arrays(file)
+    with loading(family, str(folder)):
+        return Verification(family, str(folder), run(folder, recorded))
+
+
+_DAMAGED = (OSError, ValueError, EOFError, KeyError, AttributeError, NotImplementedError, BadZipFile, error)
+"""What numpy raises for an .npz file that is none, or no longer."""
+
+
+def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
+    """What an .npz file holds. Raises UsageError if it is damaged or holds something else than numbers."""
+    try:
+        with np.load(file) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except _DAMAGED as why:
+        raise UsageError(
+            f"{file} cannot be read as arrays ({in_words(why)}). Record it again, or copy it again from its source"
+        ) from why
+
+
+def verify_keys(family: str, file: Path) -> Verification:
+    """Build the full-size model on the meta device and compare names, shapes and dtypes with a recorded list.
+
+    file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}, under the network's
+    names or those of released files. Keys that the family declares as `unstored` may be recorded; they are listed
+    as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
+    several released sizes the one that the list differs least from is meant.
+    """
+    recorded = _read_key_list(file)
+    known = find_family(family)
+    build, renames = known.function("full_size"), known.renames()
+    theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
+    sizes: list[str | None] = [name for name, _ in known.sizes] or [None]
+    found = {size: _differences(build(size) if size else build(), theirs, known.unstored) for size in sizes}
+    size = min(found, key=lambda name: len(found[name]))
+    wrong, unstored = found[size], sorted(name for name in theirs if _is_declared(name, known.unstored))
+    whole = Comparison(
+        f"{len(theirs) - len(unstored)} keys{f' of {size}' if size else ''}",
+        "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8]),
+    )  # fmt: skip
+    left_out = Comparison(
+        f"{len(unstored)} keys the network does not have", "not compared", None, 0.0,
+        f"declared by the family as never read: {', '.join(unstored)}",
+    )  # fmt: skip
+    return Verification(family, str(file), (whole, left_out) if unstored else (whole,))
+
+
+Described = tuple[tuple[int, ...], str]
+
+
+def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[str, ...]) -> list[str]:
+    """What is wrong with a list of keys; nothing if it is this network's."""
+    state = network.state_dict(keep_vars=True)
+    ours = {name: _described(tensor) for name, tensor in state.items()}
+    present = {id(state[name]) for name in ours.keys() & theirs.keys()}
+    wrong = [
+        f"{name}: missing here" for name in sorted(theirs.keys() - ours.keys()) if not _is_declared(name, unstored)
+    ]
+    wrong += [
+        f"{name}: not recorded" for name in sorted(ours.keys() - theirs.keys()) if id(state[name]) not in present
+    ]
+    wrong += [
+        f"{name}: {ours[name]}, recorded {theirs[name]}"
+        for name in sorted(ours.keys() & theirs.keys())
+        if ours[name] != theirs[name]
+    ]
+    return wrong
+
+
+def _read_key_list(file: Path) -> dict[str, Any]:
+    """The `keys` of a list, each with shape and dtype. Raises UsageError for anything else."""
+    if not file.is_file():
+        raise UsageError(f"key list {file} does not exist")
+    try:
+        raw = file.read_bytes()
+        content = parse_json(gzip.decompress(raw) if file.suffix == ".gz" else raw)
+        keys: dict[str, Any] = dict(content["keys"].items())
+        for entry in keys.values():
+            tuple(entry["shape"]), str(entry["dtype"])
+    except (OSError, EOFError, error, ValueError, KeyError, TypeError, AttributeError) as why:
+        raise UsageError(
+            f"{file} is no key list ({in_words(why)}); expected JSON with `keys`: name, then shape and dtype"
+        ) from why
+    return keys
+
+
+def _is_declared(name: str, declared: tuple[str, ...]) -> bool:
+    """Whether `name` is one of `declared`, or begins with one that ends in a dot."""
+    return any(name == entry or (entry.endswith(".") and name.startswith(entry)) for entry in declared)
+
+
+def _described(tensor: Tensor) -> Described:
+    return tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")

@@ -1,0 +1,1 @@
+"""Edits of token activations, and the directions they use."""

@@ -1,0 +1,1 @@
+"""Attention of the acting stream; descriptive, changes nothing."""

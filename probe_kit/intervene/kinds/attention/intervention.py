@@ -1,0 +1,163 @@
+"""Attention: how much of it what acts pays to the picture, its two tiles, the words and the state. No cause.
+
+A token can be weighed and not be used, and used where hardly anything is weighed. So this describes, beside what
+an exchange finds: it enters no verdict, and nothing is changed. Every inference is made twice, once with somebody
+who notes the weights, and both must be the same action bit for bit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.sites import first_of
+from probe_kit.intervene.edits.sites import ALL, roles_of
+from probe_kit.intervene.kinds.attention.attention_mass import Weighed
+from probe_kit.intervene.replay.conditions import Condition, Intervention, Plain, Played, Replayed, Turn
+from probe_kit.intervene.replay.image_tokens import TILES, role_mask
+from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.store.answers import ATTENTION, NOTED, WEIGHED
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+    from probe_kit.hooks.capturing.attention import AttentionMass
+
+ROLES = ("image", *TILES, "language", "state", "special")
+"""Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attention(Intervention):
+    """Two inferences per episode, or with the readout `shadow` per call of it: plain, and noted.
+
+    roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always noted:
+    what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that comes twice.
+    """
+
+    roles: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(set(self.roles)) != len(self.roles):
+            raise UsageError(f"roles are {', '.join(self.roles)}; give each once")
+
+    @property
+    def kind(self) -> str:
+        """`attention`."""
+        return ATTENTION
+
+    @property
+    def needs(self) -> tuple[InterventionKind, ...]:
+        """A family that tells it; and which tokens see a tile, where that is asked by name."""
+        return ("attention", *(("tiles",) if set(self.roles) & set(TILES) else ()))
+
+    def own_settings(self) -> dict[str, Any]:
+        """Of whose tokens."""
+        return {"roles": list(self.roles)}
+
+    def conditions(self, bench: Bench) -> Sequence[Condition]:
+        """As the run made it, and the same with its attention noted. Raises UsageError for a role it lacks."""
+        return Plain(), Noting(backbone_of(bench.policy), self._roles(bench.policy))
+
+    def told(self, conditions: Sequence[Condition], found: Replayed) -> dict[str, Any]:
+        """What the axes of the stored array are. Raises CaptureChangedActionError if noting changed an action."""
+        (noting,) = (one for one in conditions if isinstance(one, Noting))
+        largest = float(found.changed.max(initial=0.0))
+        if largest:
+            raise CaptureChangedActionError(
+                f"with its attention noted an action differs by {largest:.3g}; expected the same bit for bit. The "
+                "adapter's `weighing` changes the inference, or the model is not deterministic"
+            )
+        assert found.mass is not None
+        inferences, blocks, iterations, heads, _ = found.mass.shape
+        return {
+            ATTENTION: {
+                "stream": noting.stream, "roles": list(noting.roles), "inferences": inferences, "blocks": blocks,
+                "iterations": iterations, "heads": heads, "largest_change": largest,
+            }
+        }  # fmt: skip
+
+    def files(self, run: Run, conditions: Sequence[Condition], found: Replayed) -> dict[str, bytes]:
+        """The attention of every inference."""
+        (noting,) = (one for one in conditions if isinstance(one, Noting))
+        assert found.mass is not None
+        assert found.inferences is not None
+        rows = run.episodes.iloc[found.inferences[:, 0]]
+        columns = {
+            own: rows[name].to_numpy(dtype=str)
+            for own, name in (
+                ("episodes", "episode_id"), ("groups", "group_id"), ("categories", "category"),
+                ("sides", "side_correct"),
+            )
+        }  # fmt: skip
+        noted = Weighed(noting.roles, **columns, calls=found.inferences[:, 1], mass=found.mass)
+        return {WEIGHED: noted.to_bytes()}
+
+    def _roles(self, policy: "Policy") -> tuple[str, ...]:
+        stream = backbone_of(policy)
+        told = policy.interventions.supports("tiles")
+        wanted = self.roles or tuple(role for role in ROLES if told or role not in TILES)
+        there = roles_of(policy, stream, wanted)
+        if missing := [role for role in self.roles if role not in there]:
+            raise UsageError(
+                f"no token of {stream} plays {missing[0]!r}; there are "
+                f"{', '.join(policy.role_names[policy.tokens_of(stream)])}"
+            )
+        return tuple(dict.fromkeys((ALL, *there)))
+
+
+@dataclass(frozen=True)
+class Noting:
+    """The plain inference with somebody who notes what attention is paid. stream: whose tokens are weighed."""
+
+    stream: str
+    roles: tuple[str, ...]
+    name: str = NOTED
+
+    def play(self, turn: Turn) -> Played:
+        """Nothing is changed."""
+        from probe_kit.hooks.capturing.attention import attention
+
+        question, bench = turn.question, turn.bench
+        masks = [self._mask(turn, role) for role in self.roles]
+        with attention(bench.policy) as mass:
+            chunk = bench.act(question.seen, question.seed)
+        return Played(chunk, mass=by_role(mass, masks))
+
+    def _mask(self, turn: Turn, role: str) -> NDArray[np.bool_] | None:
+        """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
+        try:
+            return role_mask(turn.bench.policy, turn.question, self.stream, role, turn.memo)
+        except EmptyRoleError:
+            return None
+
+
+def by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
+    """(B, I, H, R) shares by block, iteration, head and role.
+
+    NaN where a block is not read in an iteration, and of a role that nobody plays. Of one observation. masks: (T,)
+    each, None of nobody. Raises CaptureError for blocks with different numbers of heads.
+    """
+    shapes = {found.shape[:2] for found in mass.by_head.values()}
+    if len(shapes) != 1 or next(iter(shapes))[0] != 1:
+        raise CaptureError(f"attention has rows and heads {sorted(shapes)}; expected one row, as many heads each")
+    blocks, iterations = (max(own) + 1 for own in zip(*mass.by_head, strict=True))
+    shares = np.full((blocks, iterations, next(iter(shapes))[1], len(masks)), np.nan, np.float32)
+    for role, tokens in enumerate(masks):
+        if tokens is None:
+            continue
+        for (block, iteration), share in mass.heads_on(tokens).items():
+            shares[block, iteration, :, role] = share[0]
+    return shares
+
+
+def backbone_of(policy: "Policy") -> str:
+    """Name of the stream that what acts reads."""
+    name = first_of("backbone", policy.streams.values())
+    assert name is not None, "every policy has a backbone"
+    return name

@@ -1,0 +1,1 @@
+"""Closed loop: whole episodes with an edit at every inference."""

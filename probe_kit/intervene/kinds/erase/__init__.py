@@ -1,0 +1,1 @@
+"""Concept erasure: remove what can be read linearly."""

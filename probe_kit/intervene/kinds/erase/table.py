@@ -1,0 +1,64 @@
+"""What erasing did, as a table for a console."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from probe_kit.intervene.kinds.erase.effects import Erasing
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import Cell, FittingTable
+
+_LEGEND = (
+    "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
+    "not; controls: the mean of random subspaces of the same rank; p: exact, that the action moves away farther "
+    "than under the controls, by item and by group, the larger one; readable: a fresh probe on the mean over "
+    "tokens; moved: how far tokens were moved, in their own norms. Erasing says less than exchanging: see the "
+    "interchange"
+)
+
+
+def erased_table(rows: Sequence[Erasing], of: str) -> "FittingTable":
+    """One line per category and place; controls stand beside what they are held against. of: model, suite."""
+    from probe_kit._terminal.responsive_table import FittingTable, Part
+
+    shown = [row for row in rows if row.finding not in ("control", "dose 0")]
+    return FittingTable(
+        title=f"What is lost without it? {of}, erase",
+        caption=_LEGEND,
+        name="category · erased",
+        names=tuple(f"{row.category} · {row.name}" for row in shown),
+        styles=tuple("bold" if row.finding == "lost" else "" for row in shown),
+        parts=(
+            Part(
+                "What the action does",
+                ("goes there %", "controls %", "kept", "controls", "shift cm", "p", "moved"),
+                tuple(_action_cells(row) for row in shown),
+            ),
+            Part(
+                "What a probe reads",
+                ("readable %", "finding"),
+                tuple(_probe_cells(row) for row in shown),
+            ),
+        ),
+    )
+
+
+def _action_cells(row: Erasing) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    beside = None if row.control_net is None else row.right_before - row.control_net
+    texts = (
+        f"{100 * row.right_before:.1f} → {100 * row.right:.1f}", "–" if beside is None else f"{100 * beside:.1f}",
+        "n/a" if row.kept is None else f"{row.kept:.2f}",
+        "–" if row.control_kept is None else f"{row.control_kept:.2f}",
+        f"{-100 * row.shift:+.2f}", "–" if row.p is None else f"{row.p:.2g}", f"{row.norm_ratio:.2f}",
+    )  # fmt: skip
+    return tuple(map(Cell, texts))
+
+
+def _probe_cells(row: Erasing) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    unknown = row.readable_before is None or row.readable is None
+    read = "–" if unknown else f"{100 * (row.readable_before or 0):.1f} → {100 * (row.readable or 0):.1f}"
+    return Cell(read), Cell(row.finding)

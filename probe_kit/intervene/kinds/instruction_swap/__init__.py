@@ -1,0 +1,1 @@
+"""Instruction swap: other words, or other noise, before the same scene."""

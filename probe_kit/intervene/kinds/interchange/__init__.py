@@ -1,0 +1,1 @@
+"""Interchange intervention (activation patching) from the run with exchanged pictures."""

@@ -1,0 +1,1 @@
+"""Steering: add a direction to the tokens of a site."""

@@ -1,0 +1,1 @@
+"""Replaying stored inferences and episodes of a run under conditions."""

@@ -1,0 +1,254 @@
+"""The bench: a run's policy and scene, set up again so that its first inferences can be repeated and changed."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from math import nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import (
+    CaptureChangedActionError,
+    NoTrajectoryError,
+    OtherFramesError,
+    SettingsMismatchError,
+    UsageError,
+)
+from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.rollout.capturing import SMALL
+from probe_kit.extract.rollout.stage import Seen, Stage
+from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.extract.store.run import Run
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.counterparts import twins_of
+from probe_kit.suite.items import Episode, Item, Layout, Side
+from probe_kit.train.controls.baselines import embedded_suite_of, suite_of
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+Chunk = NDArray[np.float32]
+FAR = 0.01
+"""Metres by which a repeated first action may differ from the stored one; more is another policy or scene."""
+
+
+class Progress(Protocol):
+    """Called after every item."""
+
+    def __call__(self, done: int, total: int, what: str, /) -> None:
+        """done: items so far, of `total`. what: the last one."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a run's policy, pictures and files are found again; what is found must have the run's hashes.
+
+    suite: folder; None for the embedded suite. checkpoint, options, weights_seed, device: as for `probe-kit
+    extract`. files: of the scene, by field, such as `background`.
+    """
+
+    suite: Path | None = None
+    checkpoint: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    weights_seed: int = 0
+    device: str = "cpu"
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Question:
+    """The first inference of one episode, and what is seen when the two pictures are exchanged.
+
+    row: in the run's episodes. seed: of the inference. tiles: (H, W) where in its picture each tile's own is seen.
+    stored: (n, 7) actions that the run carried out of it, None where it does not say.
+    """
+
+    row: int
+    episode_id: str
+    item_id: str
+    group_id: str
+    category: str
+    side_correct: Side
+    layout: Layout
+    seen: Observation
+    exchanged: Observation
+    seed: int
+    tiles: Mapping[Side, NDArray[np.bool_]] = field(repr=False)
+    stored: Chunk | None = None
+
+
+class Bench:
+    """A policy and a scene; a context manager, because it holds a simulator.
+
+    items: of the run's suite, by id. twins: of those that have one, see `twins_of`. learning: is told of items
+    that are inferred beforehand, for directions and erasers.
+    """
+
+    def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
+        self.run, self.policy, self.scene = run, policy, scene
+        self.items, self.twins = items, twins_of(items.values())
+        self.learning: Progress | None = None
+        self.stage = Stage(scene, None)
+        left, right = np.array(scene.tile_left), np.array(scene.tile_right)
+        self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stage.close()
+
+    def questions(self, item_id: str) -> list[Question]:
+        """The committed episodes of one item, their first frames drawn again, both layouts of one state.
+
+        Raises OtherFramesError if a frame is not the one that the run began with.
+        """
+        episodes = self.run.episodes
+        rows = np.flatnonzero((episodes["item_id"] == item_id).to_numpy())
+        frames: dict[Layout, Seen] = {}
+        found = []
+        for row in rows:
+            record = episodes.iloc[int(row)]
+            item = replace(self.items[item_id], instruction=str(record["instruction"]))
+            own: Layout = "original" if record["layout"] == "original" else "swapped"
+            other: Layout = "swapped" if own == "original" else "original"
+            if own not in frames:
+                frames[own] = self._look(item, own, int(record["scene_seed"]))
+                frames[other], tiles = self.stage.look_exchanged(), self.stage.tile_masks()
+            self._check_frame(record, frames[own])
+            found.append(
+                Question(
+                    row=int(row),
+                    episode_id=str(record["episode_id"]),
+                    item_id=item_id,
+                    group_id=str(record["group_id"]),
+                    category=str(record["category"]),
+                    side_correct="left" if record["side_correct"] == "left" else "right",
+                    layout=own,
+                    seen=frames[own].observation,
+                    exchanged=frames[other].observation,
+                    seed=derive_seed(int(record["policy_seed"]), "inference", 0),
+                    tiles=tiles,
+                    stored=self._stored(int(row)),
+                )
+            )
+        return found
+
+    def _look(self, item: Item, layout: Layout, scene_seed: int) -> Seen:
+        answer = self.stage.look(PlannedEpisode(0, Episode(item, layout), scene_seed, 0))
+        assert isinstance(answer, Seen)
+        return answer
+
+    def _check_frame(self, record: Any, seen: Seen) -> None:
+        wanted, found = record.get("first_frame_sha256"), seen.facts["first_frame_sha256"]
+        if wanted is not None and wanted != found:
+            raise OtherFramesError(
+                f"the first frame of {record['episode_id']}, drawn again, is {found[:12]}; {self.run.location} "
+                f"began with {str(wanted)[:12]}. Its pictures, its scene or the renderer are others here; use the "
+                "machine and versions that its provenance names"
+            )
+
+    def _stored(self, row: int) -> Chunk | None:
+        try:
+            commanded = self.run.trajectory(row).commanded
+        except NoTrajectoryError:
+            return None
+        executed = 1 if self.policy.card.ensemble is not None else int(self.run.settings["execute"])
+        return np.asarray(commanded[:executed], np.float32)
+
+    @contextmanager
+    def ready(self) -> Iterator[None]:
+        """With as many threads as the run had, so that sums are rounded alike."""
+        threads = 1 if self.policy.card.parameters < SMALL else None
+        with torch_threads(threads):
+            yield
+
+    def act(self, seen: Observation, seed: int) -> Chunk:
+        """(chunk, 7): one inference, alone in its batch. Raises PolicyFailedError for what the policy raises."""
+        with acting(self.run.model, self.policy.card.checkpoint):
+            return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
+
+    def apart(self, question: Question, chunk: Chunk) -> float:
+        """By how much a plain inference differs from what the run carried out; NaN where it does not say.
+
+        Raises CaptureChangedActionError if it is another action altogether.
+        """
+        if question.stored is None:
+            return nan
+        known = min(len(question.stored), len(chunk))
+        largest = float(np.abs(chunk[:known] - question.stored[:known]).max())
+        if not largest <= FAR:
+            raise CaptureChangedActionError(
+                f"the first action of {question.episode_id}, inferred again, differs from the stored one by "
+                f"{largest:.3g}; expected the same. The policy has other options than the run's, or is not "
+                "deterministic"
+            )
+        return largest
+
+    def lateral(self, chunk: Chunk, seen: Observation) -> float:
+        """Where the chunk would bring the hand, in metres from the middle between the tiles; left is positive."""
+        end = np.asarray(seen.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
+        return self.across(end)
+
+    def across(self, point: NDArray[np.float64]) -> float:
+        """How far a point (2,) is from the middle between the tiles, in metres; left is positive."""
+        return float((point - self._middle) @ self._across)
+
+
+def open_bench(run: Run, source: Source, load: "Callable[[Run, Source], Policy] | None" = None) -> Bench:
+    """Load the run's policy and set up its scene.
+
+    load: how the policy is found, if not by its name. Raises SettingsMismatchError if it is another one,
+    SuiteError for another suite, SceneError for a scene that needs a file which is not given.
+    """
+    scene = SceneSpec.from_json(run.settings["scene"], source.files)
+    suite = suite_of(run.whole, source.suite or _embedded(run))
+    policy = (load or load_policy_of)(run, source)
+    _check_policy(run, policy)
+    return Bench(run, policy, scene, {item.item_id: item for item in suite.items})
+
+
+def _embedded(run: Run) -> Path:
+    folder = embedded_suite_of(run)
+    if folder is None:
+        raise UsageError(
+            f"{run.location} was extracted from {run.suite}, whose pictures are needed again: give its folder as "
+            "--suite"
+        )
+    return folder
+
+
+def load_policy_of(run: Run, source: Source) -> "Policy":
+    """The policy that a run names."""
+    from probe_kit.hooks import load_policy
+
+    return load_policy(
+        run.model,
+        source.checkpoint,
+        source.device,
+        run.settings["dtype"],
+        run.random_weights,
+        source.weights_seed,
+        **source.options,
+    )
+
+
+def _check_policy(run: Run, policy: "Policy") -> None:
+    card = policy.card
+    if card.weights_sha256 != run.weights_sha256:
+        made = run.certificate.get("policy", {}).get("checkpoint", "unknown")
+        raise SettingsMismatchError(
+            f"the weights of {card.checkpoint} are {card.weights_sha256[:12]}; {run.location} was made with "
+            f"{str(run.weights_sha256)[:12]}, loaded from {made}. Give that --checkpoint (or --weights-seed)"
+        )
+    was, now = dict(run.settings.get("policy", {})), dict(card.settings)
+    if was != now:
+        different = sorted(name for name in was | now if was.get(name) != now.get(name))
+        lines = "; ".join(f"{name}: stored {was.get(name)!r}, here {now.get(name)!r}" for name in different)
+        raise SettingsMismatchError(f"{run.location} was made with other options ({lines}). Give the same with -M")

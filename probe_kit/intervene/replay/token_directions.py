@@ -1,0 +1,86 @@
+"""Directions of the tokens themselves, for answers that lie in which tokens are marked.
+
+Marks on the left tile for one answer and on the right tile for the other cancel in a mean over tokens. The
+differences of class means at every position do not: they lie along few directions, which are the same for every
+token.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from probe_kit.errors import UsageError
+from probe_kit.intervene.edits.linear_erasure import Method
+from probe_kit.intervene.edits.pooled_directions import DIRECTIONS, MEAN_DIFFERENCE, Vector, axes_of, control_names
+from probe_kit.intervene.edits.sites import Place
+from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.token_features import by_episode, fit_by_fold, gather
+
+
+class Bases(Protocol):
+    """Directions by name, each found without the episode that it is used on."""
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Of the random ones beside the one that was asked for."""
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """(K, D) float32, orthonormal."""
+
+
+@dataclass(frozen=True)
+class TokenAxes:
+    """Of one site and role. bases: by name and episode, (K, D) float32."""
+
+    bases: Mapping[tuple[str, str], Vector]
+    control_names: tuple[str, ...] = ()
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """(K, D) the directions that never saw this episode."""
+        del category  # an episode has one
+        return self.bases[name, episode]
+
+
+def check_direction(direction: str) -> None:
+    """Raises UsageError for what is no direction to take tokens over along."""
+    if direction.startswith(f"{MEAN_DIFFERENCE}:"):
+        Method.of(direction)
+    elif direction not in DIRECTIONS:
+        raise UsageError(
+            f"unknown direction {direction!r}; expected {', '.join(DIRECTIONS)}, or {MEAN_DIFFERENCE}:K for K "
+            "directions of the tokens themselves"
+        )
+
+
+def bases_of(
+    bench: Bench,
+    items: Sequence[str],
+    wanted: Mapping[Place, Sequence[str]],
+    direction: str,
+    controls: int,
+    seed: int,
+) -> dict[tuple[Place, str], Bases]:
+    """By place and role what `direction` means there: of the run's columns, or of the tokens of these items (ids).
+
+    `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
+    same for every token; from one plain inference per episode and place. wanted: roles by place. Raises
+    UnknownSiteError for a place of several sites or one that is not stored, UsageError where there are too few
+    episodes to learn from.
+    """
+    if ":" not in direction:
+        return {
+            (place, role): axes_of(bench.run, place.only_site, role, direction, controls, seed)
+            for place, roles in wanted.items()
+            for role in roles
+        }
+    bases: dict[tuple[Place, str], dict[tuple[str, str], Vector]] = {}
+    for place, role, category, own in gather(bench, items, wanted):
+        fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
+        found = bases.setdefault((place, role), {})
+        for name, of_episode in by_episode(own, fits).items():
+            found |= {
+                (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
+            }
+    return {cell: TokenAxes(found, control_names(controls)) for cell, found in bases.items()}

@@ -1,0 +1,1 @@
+"""Results of interventions, read back from a run."""

@@ -1,0 +1,107 @@
+"""What interventions a run holds, for `probe-kit run show`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.extract.run_layout import INTERVENTIONS
+from probe_kit.extract.store.format.bundles import PARTIAL, Bundle, read_bundles
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.intervene.kinds.attention.attention_mass import foremost_attention
+from probe_kit.intervene.results.site_maps import keys_inside
+from probe_kit.intervene.store.answers import ATTENTION, stored_interventions
+from probe_kit.intervene.store.selection import foremost
+from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.train.data.run_reader import RunReader
+
+COMMON = frozenset(
+    {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout"}
+)
+"""What every intervention is asked; the rest of its settings is its kind's own."""
+
+
+TABLED = frozenset({"follow", "interchange", "steer", ATTENTION})
+"""Kinds that verdicts, tables or figures read."""
+
+
+@dataclass(frozen=True)
+class StoredIntervention:
+    """One stored intervention, or what is known of one written by another version.
+
+    state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
+    that it says, of more episodes or newly; `other episodes` if the run has others by now; `other version` if this
+    version cannot read it. asked: what its kind was asked besides, as stored.
+    """
+
+    key: str
+    state: str
+    created: str
+    kind: str = ""
+    categories: tuple[str, ...] = ()
+    items: int | None = None
+    wording: str = ""
+    asked: Mapping[str, Any] | None = None
+
+    @property
+    def words(self) -> str:
+        """In a line."""
+        if not self.kind:
+            return f"written by another version of probe_kit, which this one cannot read; {self._when}"
+        own = [f"{name} {_plain(value)}" for name, value in (self.asked or {}).items() if value not in (None, [])]
+        parts = [self.kind, f"of {', '.join(self.categories)}"]
+        parts += [f"{self.items} items each"] * (self.items is not None)
+        parts += [f"wording {self.wording}"] * bool(self.wording)
+        if self.state == "other":
+            own.append("another one stands in its place in tables")
+        if self.state == "other episodes":
+            own.append("of other episodes than the run has now")
+        return "; ".join([" ".join(parts[:2]), *parts[2:], *own, self._when])
+
+    @property
+    def _when(self) -> str:
+        return f"made {self.created[:16].replace('T', ' ')} UTC"
+
+
+def listed_interventions(run: Any) -> list[StoredIntervention]:
+    """All of a run, oldest first. Raises RunDamagedError if one was changed."""
+    wordings = getattr(run, "wordings", ())
+    readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
+    current = {one.key for reader in readers for one in stored_interventions(reader)}
+    used = {key for reader in readers for key in _used(reader)}
+    found = [_listed(bundle, current, used) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    return sorted(found, key=lambda one: (one.created, one.key))
+
+
+def unfinished_interventions(location: Location) -> dict[str, int]:
+    """Number of finished items of every intervention that was interrupted, by the key it will have."""
+    parts = (key.split("/") for key in location.keys(INTERVENTIONS))
+    names = [own[1] for own in parts if len(own) > 2 and own[1].startswith(".") and own[1].endswith(PARTIAL)]
+    return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
+
+
+def _used(run: RunReader) -> set[str]:
+    """Keys of what is read, and of the kinds of which nothing takes another's place."""
+    found = {told.stored.key for told in foremost(run, "follow").values()} | keys_inside(run)
+    found |= {told.stored.key for told, _ in foremost_attention(run).values()}
+    return found | {one.key for one in stored_interventions(run) if one.settings["kind"] not in TABLED}
+
+
+def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredIntervention:
+    settings, created = bundle.head.get("settings"), str(bundle.head.get("created", ""))
+    if not isinstance(settings, Mapping) or settings.get("format") != FORMAT:
+        return StoredIntervention(bundle.key, "other version", created)
+    state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
+    return StoredIntervention(
+        key=bundle.key,
+        state=state,
+        created=created,
+        kind=str(settings["kind"]),
+        categories=tuple(map(str, settings["categories"])),
+        items=settings.get("items"),
+        wording=str(settings.get("wording") or ""),
+        asked={name: value for name, value in settings.items() if name not in COMMON},
+    )
+
+
+def _plain(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

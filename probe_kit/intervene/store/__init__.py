@@ -1,0 +1,1 @@
+"""Stored interventions: settings, answers, selection."""

@@ -1,0 +1,199 @@
+"""Where interventions live: `RUN/interventions/<key>/`, complete or not there. Reading them needs no model.
+
+settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
+episodes.npz       per condition and episode where the action would go, and how far it changed
+effects.csv        the same in numbers per category, for people and other programs
+attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
+certificate.json   what was loaded, and what was checked
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from io import BytesIO
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoInterventionsError, UsageError
+from probe_kit.extract.run_layout import INTERVENTIONS
+from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
+from probe_kit.extract.store.format.hashes import as_json
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.store import stamp_of_run
+
+PLAIN, EXCHANGED = "plain", "exchanged"
+"""Conditions: as the run made it, and before the same two pictures in each other's place."""
+PICTURES, NOISE = "pictures", "noise"
+"""Of `words`, where the words are what is exchanged: the pictures instead, and only the noise drawn anew."""
+ERASE, READABLE = "erase", "readable"
+"""A kind, and what its certificate calls what probes read behind its conditions."""
+ATTENTION, NOTED, WEIGHED = "attention", "noted", "attention.npz"
+"""A kind, its condition in which somebody notes the weights, and the file in which they are."""
+UNCHANGED = frozenset({PLAIN, EXCHANGED, PICTURES, NOISE, NOTED})
+"""Conditions in which nothing inside the network is changed."""
+EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What K conditions gave for E episodes of a run; see `conditions.Replayed`.
+
+    conditions: names of the K, the plain one first. episodes, items, groups, categories, sides: (E,), `sides`
+    those of the correct picture. lateral: (K, E) metres from the middle, left positive. changed: (K, E) largest
+    difference of any action from the plain one's. ledger: (K, E, 5), see `patching.LEDGER`. apart: (E,) of the
+    plain one from the stored one. outcomes: (K, E) correct, wrong or oob, where episodes were played to their end;
+    else None.
+    """
+
+    conditions: tuple[str, ...]
+    episodes: NDArray[np.str_]
+    items: NDArray[np.str_]
+    groups: NDArray[np.str_]
+    categories: NDArray[np.str_]
+    sides: NDArray[np.str_]
+    lateral: NDArray[np.float64]
+    changed: NDArray[np.float64]
+    ledger: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    outcomes: NDArray[np.str_] | None = None
+
+    def of(self, condition: str) -> NDArray[np.float64]:
+        """(E,) lateral of one condition."""
+        return np.asarray(self.lateral[self.conditions.index(condition)])
+
+    @property
+    def toward(self) -> NDArray[np.float64]:
+        """(E,) +1 where the correct picture lies left, −1 where it lies right."""
+        return np.where(self.sides == "left", 1.0, -1.0)
+
+    def only(self, category: str) -> "Answers":
+        """The episodes of one category."""
+        chosen = self.categories == category
+        axes = {"lateral": 1, "changed": 1, "ledger": 1, "outcomes": 1}
+        cut: dict[str, Any] = {
+            name: np.compress(chosen, value, axes.get(name, 0))
+            for name, value in vars(self).items()
+            if name != "conditions" and value is not None
+        }
+        return Answers(self.conditions, **cut)
+
+    def by_category(self) -> "list[tuple[str, Answers]]":
+        """Every category with its episodes, in the order of the episodes."""
+        return [(name, self.only(name)) for name in dict.fromkeys(map(str, self.categories))]
+
+    def to_bytes(self) -> bytes:
+        """As a `.npz`; the same answers give the same bytes."""
+        file = BytesIO()
+        arrays = {name: value for name, value in vars(self).items() if value is not None}
+        arrays["conditions"] = np.array(self.conditions)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> "Answers":
+        """Read back."""
+        with np.load(BytesIO(content), allow_pickle=False) as arrays:
+            found: dict[str, Any] = {
+                name: arrays[name] for name in cls.__annotations__ if name in arrays or name != "outcomes"
+            }
+        return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One stored intervention. settings: see `settings.settings_of`. created: when it was made."""
+
+    bundle: Bundle
+
+    @property
+    def key(self) -> str:
+        """Name of its folder."""
+        return self.bundle.key
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """What decided its numbers."""
+        settings: Mapping[str, Any] = self.bundle.head["settings"]
+        return settings
+
+    @property
+    def created(self) -> str:
+        """ISO time, UTC."""
+        return str(self.bundle.head.get("created", ""))
+
+    def answers(self) -> Answers:
+        """What was measured. Raises RunDamagedError if it was changed."""
+        return Answers.from_bytes(self.bundle.read(EPISODES))
+
+    def certificate(self) -> dict[str, Any]:
+        """What was loaded and checked. Raises RunDamagedError if it was changed."""
+        found: dict[str, Any] = json.loads(self.bundle.read(CERTIFICATE))
+        return found
+
+
+def save(
+    run: Location,
+    settings: Mapping[str, Any],
+    key: str,
+    answers: Answers,
+    effects: str,
+    certificate: Mapping[str, Any],
+    further: Mapping[str, bytes] = MappingProxyType({}),
+) -> None:
+    """Write `interventions/<key>/`, all or nothing; what is there is kept. further: other files, by name."""
+    if is_stored(run, key):
+        tidy_bundle(run, INTERVENTIONS, key)
+        return
+    files = {
+        EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
+    }  # fmt: skip
+    now = datetime.now(UTC).isoformat(timespec="microseconds")
+    write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings), "created": now}, files)
+
+
+def is_stored(run: Location, key: str) -> bool:
+    """Whether complete results called `key` are there."""
+    return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
+
+
+def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored]:
+    """Those of the episodes that the run has now, in the wording it is in, oldest first.
+
+    kind: only these. Those of another format, written by another version of probe_kit, are passed over. Raises
+    RunDamagedError if any of the run was changed or lost its settings.
+    """
+    found = [Stored(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    wanted = {
+        "format": FORMAT, "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
+        "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),
+    }  # fmt: skip
+    fitting = [one for one in found if all(one.settings.get(name) == value for name, value in wanted.items())]
+    return sorted(fitting, key=lambda one: (one.created, one.key))
+
+
+def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Stored:
+    """The one whose key begins with `key`, or the newest of `kind`.
+
+    Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.
+    """
+    there = stored_interventions(run, kind)
+    if key is None:
+        if not there:
+            raise NoInterventionsError(
+                f"{run.location} has no stored intervention{'' if kind is None else f' of kind {kind}'} on its "
+                f"episodes. Run `probe-kit intervene {run.location}`"
+            )
+        return there[-1]
+    found = [one for one in there if key and one.key.startswith(key)]
+    if len(found) != 1:
+        raise UsageError(
+            f"{run.location} has {'several' if found else 'no'} interventions {key!r}; it has: "
+            f"{', '.join(one.key for one in there) or 'none'}"
+        )
+    return found[0]

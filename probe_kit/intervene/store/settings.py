@@ -1,0 +1,111 @@
+"""What every intervention is asked, and the key under which its results are stored. Needs no model."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+from probe_kit.errors import UnknownCategoryError, UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hashing import sha256_json
+
+FORMAT = 1  # raise when stored numbers would be others
+Readout = Literal["chunk", "shadow"]
+READOUTS: Mapping[str, str] = {
+    "chunk": "where the first inference's actions would bring the hand, with nothing carried out",
+    "shadow": "what every inference of the unedited episode would add across, with only the plain one carried out",
+}
+CHUNK: Readout = "chunk"
+SHADOW: Readout = "shadow"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What is asked of every kind of intervention.
+
+    categories: of the run; None for all. items: so many of each category, the first ones; None for all.
+    readout: what of the policy's answer is read, see `READOUTS`.
+    """
+
+    categories: tuple[str, ...] | None = None
+    items: int | None = None
+    readout: Readout = CHUNK
+
+    def __post_init__(self) -> None:
+        if self.items is not None and self.items < 1:
+            raise UsageError(f"items is {self.items}; expected at least 1")
+        if self.readout not in READOUTS:
+            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(READOUTS)}")
+
+    @property
+    def kind(self) -> str:
+        """Its name on the command line."""
+        raise NotImplementedError
+
+    def own_settings(self) -> dict[str, Any]:
+        """What else decides its numbers, as plain JSON."""
+        return {}
+
+    def chosen(self, run: Run) -> tuple[str, ...]:
+        """Its categories. Raises UnknownCategoryError for one that the run lacks."""
+        known = list(dict.fromkeys(run.episodes["category"].astype(str)))
+        for category in self.categories or ():
+            if category not in known:
+                raise UnknownCategoryError(
+                    f"{run.location} has no category {category!r}; it has: {', '.join(known)}"
+                )
+        return self.categories or tuple(known)
+
+
+def items_of(run: Run, asked: Asked) -> list[str]:
+    """The items that are replayed, category by category. Raises UsageError if there is none."""
+    episodes, chosen = run.episodes, []
+    for category in asked.chosen(run):
+        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
+        chosen += list(dict.fromkeys(names))[: asked.items]
+    if not chosen:
+        raise UsageError(f"{run.location} has no episode yet; extract some first")
+    return chosen
+
+
+def settings_of(asked: Asked, run: Run) -> dict[str, Any]:
+    """Everything that decides the numbers, as plain JSON; its hash is the key."""
+    return {
+        "format": FORMAT,
+        "kind": asked.kind,
+        "run_settings": run.settings_sha256,
+        "stamp": run.stamp,
+        "weights": run.weights_sha256,
+        "wording": run.wording,
+        "categories": list(asked.chosen(run)),
+        "items": asked.items,
+        "readout": asked.readout,
+        **asked.own_settings(),
+    }
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+    return sha256_json(settings)[:12]
+
+
+def refuse_unfit(run: Run) -> None:
+    """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
+    settings = run.settings
+    why = None
+    if "ask" in settings:
+        why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
+    elif run.weights_sha256 is None or not run.streams:
+        why = f"{run.model} is scripted: it has no network in which anything could be changed"
+    elif run.listened:
+        why = f"{run.model} was only listened to, because its actions cannot move this arm"
+    elif settings.get("edits"):
+        why = "its streams were edited already, and the stored run does not hold the vectors"
+    if why is not None:
+        raise UsageError(f"{run.location}: {why}")
+
+
+def readout_of(text: str) -> Readout:
+    """A readout by its name. Raises UsageError."""
+    if text not in READOUTS:
+        raise UsageError(f"unknown readout {text!r}; expected one of {', '.join(READOUTS)}")
+    return cast("Readout", text)

@@ -1,8 +1,0 @@
-"""Where the checkpoints lie that come with the package. Imports nothing heavy."""
-
-from pathlib import Path
-
-
-def embedded_checkpoint(name: str) -> Path:
-    """Folder of a checkpoint that comes with the package: such as `pi0-tiny` or `vlm-tiny`."""
-    return Path(__file__).parent / "checkpoints" / name

@@ -1,0 +1,1 @@
+"""lerobot's own policies at the size of a checkpoint."""

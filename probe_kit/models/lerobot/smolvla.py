@@ -1,0 +1,89 @@
+"""lerobot's own `SmolVLAPolicy`, built from the VLM configuration its checkpoint names; no second download."""
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import torch
+from lerobot.policies.smolvla import smolvlm_with_expert
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+from torch import Tensor
+from transformers import SmolVLMConfig
+
+from probe_kit.errors import CheckpointError
+from probe_kit.models.lerobot.pi0_keys import STATISTICS
+from probe_kit.models.scoped import replaced
+
+
+def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
+    """A `SmolVLAPolicy` in eval mode, float32, with weights nobody should use yet.
+
+    folder: the checkpoint; `vlm_model_name` may be a path relative to it, or a hub id. Only the VLM's
+    configuration and tokenizer are read: its weights are part of the policy's own file.
+    device: `meta` serves to look at names and shapes.
+    Raises CheckpointError if the VLM's configuration cannot be found.
+    """
+    config.device = device
+    config.load_vlm_weights = False
+    local = folder / config.vlm_model_name
+    name = config.vlm_model_name
+    config.vlm_model_name = str(local.resolve()) if local.is_dir() else name
+    try:
+        # lerobot prints while it builds; stdout belongs to results.
+        with torch.device(device), redirect_stdout(sys.stderr):
+            policy = SmolVLAPolicy(config)
+    except OSError as error:
+        raise CheckpointError(
+            f"{folder} names the VLM {name!r}, whose configuration and tokenizer cannot be found: "
+            f"{str(error).splitlines()[0]}. Check your network, or name a local copy in its config.json"
+        ) from error
+    policy.eval()
+    return cast(SmolVLAPolicy, policy)
+
+
+def current_smolvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same tensors without the statistics that old files kept among the weights."""
+    return {name: tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
+
+
+def full_size_smolvla() -> SmolVLAPolicy:
+    """The released size, on the meta device, without the hub: for names and shapes only."""
+    with _released_vlm():
+        return build_smolvla(SmolVLAConfig(device="cpu"), Path(), device="meta")
+
+
+@contextmanager
+def _released_vlm() -> Iterator[None]:
+    """While the network is built, lerobot asks us instead of the hub for SmolVLM2-500M's configuration."""
+    config = SmolVLMConfig(
+        text_config={
+            "model_type": "llama",
+            "hidden_size": 960,
+            "num_hidden_layers": 32,
+            "num_attention_heads": 15,
+            "num_key_value_heads": 5,
+            "head_dim": 64,
+            "intermediate_size": 2560,
+            "vocab_size": 49280,
+        },
+        vision_config={
+            "hidden_size": 768,
+            "num_hidden_layers": 12,
+            "num_attention_heads": 12,
+            "intermediate_size": 3072,
+            "patch_size": 16,
+            "image_size": 512,
+        },
+        scale_factor=4,
+    )
+    tokenizer = SimpleNamespace(fake_image_token_id=0, global_image_token_id=0)
+    answers = {
+        "AutoConfig": SimpleNamespace(from_pretrained=lambda _: config),
+        "AutoProcessor": SimpleNamespace(from_pretrained=lambda _: SimpleNamespace(tokenizer=tokenizer)),
+    }
+    with replaced(smolvlm_with_expert, answers):
+        yield

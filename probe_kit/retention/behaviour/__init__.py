@@ -1,0 +1,1 @@
+"""What a run did: success rates, answers, wordings."""

@@ -1,0 +1,47 @@
+"""What runs are called in tables, figures and titles: no two by the same name."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.train.data.run_reader import RunReader
+
+_MARKS: Sequence[Callable[[RunReader, int], str]] = (
+    lambda run, _: run.settings_sha256[:6],
+    lambda run, _: run.location.name,
+    lambda _, number: str(number),
+)
+"""What is added to a name that comes twice, one after the other, until none does: settings, folder, number."""
+
+
+def full_name(label: str, random_weights: bool, heard: bool = False, group: str | None = None) -> str:
+    """A label, marked if nobody trained the model or it was only listened to, with its group if there is one."""
+    name = label + (" (random weights)" if random_weights else "") + (" (listened to)" if heard else "")
+    return name if group is None else f"{group}: {name}"
+
+
+def distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
+    """By location, the label of each run, so that no two full names are equal.
+
+    Runs of one name are told apart by the hash of their settings; where that is the same too, by their folders;
+    and where these have one name as well, by their number.
+    """
+    labels = {str(run.location): run.label for run in runs}
+    for mark in _MARKS:
+        doubles = _doubles(runs, labels)
+        for number, run in enumerate(runs, 1):
+            if str(run.location) in doubles:
+                labels[str(run.location)] += f" · {mark(run, number)}"
+    return labels
+
+
+def full_names(runs: Sequence[RunReader], labels: Mapping[str, str] | None = None) -> list[str]:
+    """The full names of runs, in order; labels: by location, distinct ones by default."""
+    called = distinct_labels(runs) if labels is None else labels
+    return [full_name(called[str(run.location)], run.random_weights, listened(run.episodes)) for run in runs]
+
+
+def _doubles(runs: Sequence[RunReader], labels: Mapping[str, str]) -> set[str]:
+    names = full_names(runs, labels)
+    often = Counter(names)
+    return {str(run.location) for run, name in zip(runs, names, strict=True) if often[name] > 1}

@@ -1,0 +1,238 @@
+"""What the policy did: success rate, whether it differs from guessing, and on which side it errs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import comb
+from statistics import fmean
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
+from probe_kit.errors import UsageError
+from probe_kit.extract.run_layout import LISTENED
+from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.significance import chance_margin
+from probe_kit.train.data.run_reader import refuse_several_wordings
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
+
+class Regime(StrEnum):
+    """What a success rate says about knowledge that reaches the action."""
+
+    KNOWLEDGE = "evidence of usable knowledge"
+    NO_RELIABLE_KNOWLEDGE = "no reliable usable knowledge"
+    FAILURE = "instruction or perceptual failure"
+
+
+@dataclass(frozen=True)
+class PairedItems:
+    """Items that ran in both layouts, by how many of the two were right.
+
+    both, one, none: numbers of items. both_wrong: items that chose the wrong picture twice, part of `none`.
+    p: exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of any
+    strength makes them equally likely, and items that share a picture count once.
+    """
+
+    both: int
+    one: int
+    none: int
+    both_wrong: int
+    p: float
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
+
+    ci: 95 % interval of `sr`, whole groups of items resampled. sr_original, sr_swapped: per layout, and
+    layout_mean their mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None
+    if it was not recorded. p_flagged: share of inferences that put out no action, None for a policy that cannot
+    tell. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
+    guessing explains, for N = episodes (the paper's); delta_items: the same for N = items; delta_regime: for as
+    many items as count, fewer where items of a group answer alike, and what `regime` is judged by.
+    side_preference: share placed left among episodes placed in a zone. A rate over no episodes is None.
+    """
+
+    n_episodes: int
+    n_items: int
+    sr: float
+    ci: tuple[float, float]
+    sr_original: float | None
+    sr_swapped: float | None
+    layout_mean: float | None
+    sr_left: float | None
+    sr_right: float | None
+    p_wrong: float
+    p_oob: float
+    p_never_moved: float | None
+    p_flagged: float | None
+    delta: float
+    delta_items: float
+    delta_regime: float
+    regime: Regime
+    reason: str
+    side_preference: float | None
+    paired: PairedItems
+
+
+def regime(sr: float, delta: float, p_wrong: float, p_oob: float, asked: bool = False) -> tuple[Regime, str]:
+    """The regime of a success rate, and why in a few words. asked: `oob` is an answer not read."""
+    if sr > 0.5 + delta:
+        return Regime.KNOWLEDGE, f"SR {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
+    if sr >= 0.5 - delta:
+        return Regime.NO_RELIABLE_KNOWLEDGE, f"SR {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
+    nowhere = "no answer could be read in" if asked else "the cube ends outside both zones in"
+    cause = (
+        f"{nowhere} {p_oob:.0%} of episodes"
+        if p_oob >= p_wrong
+        else f"the wrong picture is chosen in {p_wrong:.0%} of episodes"
+    )
+    return Regime.FAILURE, f"SR {sr:.3f} is below 0.5 − Δ = {0.5 - delta:.3f}: {cause}"
+
+
+def normalised_score(success_rates: Sequence[float]) -> float:
+    """Mean success rate over categories on a scale where guessing is 0 and perfection 100."""
+    if not success_rates:
+        raise UsageError("the normalised score needs the success rate of at least one category")
+    return (100 * fmean(success_rates) - 50) / 50 * 100
+
+
+def listened(episodes: "pd.DataFrame") -> bool:
+    """Whether the model of these episodes was only listened to: it did not act, and there is no success rate."""
+    return not episodes.empty and bool((episodes["outcome"] == LISTENED).all())
+
+
+def _refuse_listened(episodes: "pd.DataFrame") -> None:
+    if listened(episodes):
+        raise UsageError(
+            "this run's model was listened to (extract --listen) and did not act: there is no success rate. Its "
+            "probes are as ever"
+        )
+
+
+def shares_of(episodes: "pd.DataFrame", outcome: str) -> "NDArray[np.float64]":
+    """(E,) how much of each episode had this outcome: 0 or 1, or a share where several last steps were judged."""
+    name = f"share_{outcome}"
+    if name in episodes:
+        return episodes[name].to_numpy(dtype=np.float64)
+    return (episodes["outcome"] == outcome).to_numpy().astype(np.float64)
+
+
+def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
+    return episodes[[]].assign(correct=shares_of(episodes, "correct"))["correct"]
+
+
+def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
+    """Success rate and its companions for a table of episodes.
+
+    episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
+    and `group_id` where items share pictures; `share_correct` and so on where the last steps of an episode were
+    averaged, which items' pairs take no notice of. Raises UsageError for a table that is
+    empty or of several wordings, and for episodes in which the model did not act.
+    """
+    refuse_several_wordings(episodes)
+    _refuse_listened(episodes)
+    if episodes.empty:
+        raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
+    correct = _correct(episodes)
+    sr, p_wrong = float(correct.mean()), float(shares_of(episodes, "wrong").mean())
+    p_oob = float(shares_of(episodes, "oob").mean())
+    n_items = int(episodes["item_id"].nunique())
+    delta_regime = chance_margin(independent_items(episodes))
+    name, reason = regime(sr, delta_regime, p_wrong, p_oob, "parse" in episodes)
+    low, high = group_bootstrap(correct.to_numpy()[:, None], units_of(episodes), seed)
+    original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
+    placed = episodes["side_placed"][episodes["outcome"] != "oob"]
+    return SuccessRate(
+        n_episodes=len(episodes),
+        n_items=n_items,
+        sr=sr,
+        ci=(float(low[0]), float(high[0])),
+        sr_original=original,
+        sr_swapped=swapped,
+        layout_mean=None if original is None or swapped is None else (original + swapped) / 2,
+        sr_left=_rate(correct[episodes["side_correct"] == "left"]),
+        sr_right=_rate(correct[episodes["side_correct"] == "right"]),
+        p_wrong=p_wrong,
+        p_oob=p_oob,
+        p_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
+        p_flagged=_flagged(episodes),
+        delta=chance_margin(len(episodes)),
+        delta_items=chance_margin(n_items),
+        delta_regime=delta_regime,
+        regime=name,
+        reason=reason,
+        side_preference=_rate(placed == "left"),
+        paired=paired_items(episodes),
+    )
+
+
+def _flagged(episodes: "pd.DataFrame") -> float | None:
+    """Every inference counts once, whatever its episode."""
+    if not {"flagged_steps", "inferences"} <= set(episodes):
+        return None
+    return float(episodes["flagged_steps"].sum() / episodes["inferences"].sum())
+
+
+def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
+    """(E,) what is drawn as a whole: the group of items that share pictures, or the item where none is known."""
+    return episodes["group_id" if "group_id" in episodes else "item_id"].to_numpy(dtype=str)
+
+
+def independent_items(episodes: "pd.DataFrame") -> float:
+    """How many items the success rate rests on: all of them, or fewer where those of a group answer alike.
+
+    The number of items over how much more the success rate varies between groups than it would if their items had
+    nothing in common.
+    """
+    correct = _correct(episodes)
+    residual = correct - correct.mean()
+    by_item = float((residual.groupby(episodes["item_id"]).sum() ** 2).sum())
+    by_group = float((residual.groupby(units_of(episodes)).sum() ** 2).sum())
+    items = int(episodes["item_id"].nunique())
+    return items if by_group <= by_item else items * by_item / by_group
+
+
+def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:
+    """Success rate by zone radius ε in metres, from where the cube ended: no episode runs again.
+
+    episodes: columns `distance_correct` and `distance_wrong`, metres; missing where the simulator broke, which
+    is no success. Empty for a table without these columns. Raises SceneError for a radius with overlapping zones.
+    """
+    columns = ["distance_correct", "distance_wrong"]
+    if not set(columns) <= set(episodes):
+        return {}
+    distances = [(correct, wrong) for correct, wrong in episodes[columns].astype(float).to_numpy()]
+    return {radius: success_at(distances, radius) for radius in radii}
+
+
+def paired_items(episodes: "pd.DataFrame") -> PairedItems:
+    """Items that ran in both layouts, by outcome; others are left out. Raises UsageError if nothing was acted."""
+    _refuse_listened(episodes)
+    outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
+    outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
+    right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)
+    group_of = dict(zip(episodes["item_id"], units_of(episodes), strict=True))
+    lead = ((right == 2).astype(int) - (wrong == 2)).groupby(outcomes.index.map(group_of)).sum()
+    both, both_wrong = int((right == 2).sum()), int((wrong == 2).sum())
+    return PairedItems(
+        both=both,
+        one=int((right == 1).sum()),
+        none=int((right == 0).sum()),
+        both_wrong=both_wrong,
+        p=_sign_test(int((lead > 0).sum()), int((lead != 0).sum())),
+    )
+
+
+def _sign_test(successes: int, trials: int) -> float:
+    """P(at least `successes` heads in `trials` fair tosses)."""
+    return float(sum(comb(trials, heads) for heads in range(successes, trials + 1)) / 2**trials)
+
+
+def _rate(values: "pd.Series[bool] | pd.Series[float]") -> float | None:
+    return float(values.mean()) if len(values) else None

@@ -1,0 +1,408 @@
+"""Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
+
+known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance, binding
+and twin. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side is
+right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.retention.behaviour.success_rate import units_of
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.estimators.cross_fit import random_halves
+from probe_kit.retention.estimators.retention import best_site
+from probe_kit.statistics.paired_tests import (
+    clopper_pearson,
+    fisher_p,
+    flip_p,
+    holm,
+    mcnemar_p,
+    overlap_p,
+)
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.control_scores import signal
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_results import ProbeResults
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Bools = NDArray[np.bool_]
+COIN = 0.25
+"""Share of items that a coin gets right in both layouts."""
+FRAME = "first_frame_sha256"
+PAIRS = (("known", "used"), ("encoded", "used"), ("known", "encoded"))
+OVERALL = "all"
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Whether two of the three are right of equally many items.
+
+    only_first, only_second: items on which they differ. p_mcnemar: exact over items; p_groups: the same, whole
+    groups of items turned together; p: the larger of the two. p_holm: over all categories and pairs.
+    """
+
+    first: str
+    second: str
+    only_first: int
+    only_second: int
+    p_mcnemar: float
+    p_groups: float
+    p: float
+    p_holm: float | None = None
+
+
+@dataclass(frozen=True)
+class Joined:
+    """One category, or all of them (`all`).
+
+    counts: items by known, encoded, used, such as `101` for known, not encoded, used; without probes `1-1`.
+    guessed: as many as coins would give. episodes: the same counts of single episodes; nothing is tested there.
+    signal: whether the probes beat chance and every control that was run, without which encoded means nothing;
+    None without probes, or over categories that differ in it. not_used: of the items known and encoded those the
+    action does not follow, with the exact 95 % interval of their share. p_linked: whether known and used go
+    together among encoded items: Fisher's exact test, over categories a permutation within them.
+    """
+
+    category: str
+    n_items: int
+    n_groups: int
+    known: int
+    encoded: int | None
+    used: int
+    counts: Mapping[str, int]
+    guessed: Mapping[str, float]
+    episodes: Mapping[str, int]
+    signal: bool | None
+    comparisons: tuple[Comparison, ...]
+    known_and_encoded: int | None = None
+    not_used: int | None = None
+    not_used_share: float | None = None
+    not_used_ci: tuple[float, float] | None = None
+    p_linked: float | None = None
+
+
+@dataclass(frozen=True)
+class KnownUsed:
+    """An asked and an acting run joined, item by item. view: of the probes; None without any.
+
+    notes: what a reader must know, a sentence each.
+    """
+
+    asked: str
+    acted: str
+    score: str
+    view: str | None
+    rows: tuple[Joined, ...]
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """A row per category and code of known, encoded, used: counts of items and episodes, and coins' share."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {
+                "category": row.category,
+                "known": code[0] == "1",
+                "encoded": None if code[1] == "-" else code[1] == "1",
+                "used": code[2] == "1",
+                "items": row.counts[code],
+                "guessed": row.guessed[code],
+                "episodes": row.episodes[code],
+            }
+            for row in self.rows
+            for code in row.counts
+        )
+
+
+def join(
+    asked: RunReader,
+    acted: RunReader,
+    results: ProbeResults | None = None,
+    view: str | None = None,
+    seed: int = 0,
+) -> KnownUsed:
+    """Join an asked run (as `scored` reads it) with an acting one and its probes.
+
+    results: probes of the acting run; None joins known and used only. view: one that was probed, by default the
+    first. seed: of the halves in which sites are chosen, and of permutations.
+    Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
+    frames differ or carry no hash.
+    """
+    _refuse_kinds(asked, acted)
+    pairs = _same_questions(asked, acted)
+    chosen = None if results is None else view or results.settings.views[0]
+    if results is not None and chosen not in results.settings.views:
+        raise UsageError(f"view {chosen!r} was not probed; probed were {', '.join(results.settings.views)}")
+    known, used = (_right(pairs[column]) for column in ("outcome_asked", "outcome"))
+    encoded = None if results is None or chosen is None else _encoded(pairs, results, chosen, seed)
+    whole, unprobed = _only_probed(_items(pairs, known, used, encoded))
+    signals = {} if results is None or chosen is None else _signals(results, chosen)
+    rows = [_joined(str(name), own, signals.get(str(name))) for name, own in whole.groupby("category", sort=False)]
+    if len(rows) > 1:
+        rows.append(_over_all(whole, rows, seed))
+    notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *_without_signal(rows)]
+    score = str(getattr(asked, "score", "text"))
+    return KnownUsed(asked.label, acted.label, score, chosen, tuple(_with_holm(rows)), tuple(notes))
+
+
+# -- the same questions ----------------------------------------------------------------------------------
+
+
+def _refuse_kinds(asked: RunReader, acted: RunReader) -> None:
+    if ask_of(asked) is None or ask_of(acted) is not None:
+        raise UsageError(
+            f"{asked.location} and {acted.location} are not an asked and an acting run, in this order; make them "
+            "with `probe-kit ask` and `probe-kit extract`"
+        )
+
+
+def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
+    """The episodes of both: columns of the acting run, and `outcome_asked`."""
+    for run in (asked, acted):
+        if FRAME not in run.episodes or run.episodes[FRAME].isna().any():
+            raise OtherFramesError(
+                f"{run.location} does not say what its first frames were; it was made before runs kept their "
+                "hash. Make it again with this version"
+            )
+    keys = ["item_id", "layout"]
+    for run in (asked, acted):
+        if run.episodes.duplicated(keys).any():
+            raise UsageError(
+                f"{run.location} holds an item more than once in a layout, such as in several wordings; join runs "
+                "that ask every item once"
+            )
+    there = asked.episodes[[*keys, "outcome", FRAME]]
+    pairs = acted.episodes.merge(there, on=keys, suffixes=("", "_asked"))
+    if pairs.empty:
+        raise UsageError(
+            f"{asked.location} and {acted.location} have no question in common; ask about the same suite"
+        )
+    other = pairs.loc[pairs[FRAME] != pairs[f"{FRAME}_asked"], "episode_id"]
+    if len(other):
+        raise OtherFramesError(
+            f"{len(other)} of {len(pairs)} episodes begin with another frame in {asked.location} than in "
+            f"{acted.location} ({', '.join(other[:_MOST_NAMED])} …): a reader and a policy that saw different "
+            "pictures cannot be joined. Repeat one of them with the --seed, --scene and suite of the other"
+        )
+    both: pd.DataFrame = pairs[pairs.groupby("item_id")["layout"].transform("nunique") == 2]
+    if both.empty:
+        raise UsageError(f"{asked.location} and {acted.location} share no item in both layouts; finish both runs")
+    return both.reset_index(drop=True)
+
+
+def _right(outcomes: "pd.Series[str]") -> Bools:
+    return (outcomes == "correct").to_numpy(bool)
+
+
+# -- encoded ---------------------------------------------------------------------------------------------
+
+
+def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str, seed: int) -> NDArray[np.float64]:
+    """(E,) whether the probe's decision is right, NaN where nothing was probed."""
+    found: dict[str, bool] = {}
+    for (_, name), curve in results.curves.items():
+        if name == view:
+            found |= dict(zip(curve.episodes.tolist(), encoded_decisions(curve, seed).tolist(), strict=True))
+    return np.array([found.get(episode, np.nan) for episode in pairs["episode_id"]], np.float64)
+
+
+def encoded_decisions(curve: Curve, seed: int = 0) -> Bools:
+    """(E,) held-out decisions of the backbone's probe, at a site that was chosen on other groups.
+
+    The groups are halved; in each half decisions are those of the site that is most often right in the other, the
+    first one on ties. The best site of all would be chosen by the luck that it is scored by.
+    """
+    stream = curve.backbone_stream
+    if stream is None:
+        raise UsageError("no stream of the vision-language model was probed: there is nothing encoded to join")
+    names, group_of = np.unique(curve.groups, return_inverse=True)
+    generator = np.random.default_rng(derive_seed("encoded", seed))
+    half = random_halves(generator, np.arange(names.size), names.size, 1)[0][group_of]
+    correct = curve.correct[curve.stream(stream)]
+    right = np.zeros(correct.shape[1], bool)
+    for side in (1, -1):
+        best = int(correct[:, half == -side].sum(axis=1).argmax())
+        right[half == side] = correct[best, half == side]
+    return right
+
+
+def _signals(results: ProbeResults, view: str) -> dict[str, bool]:
+    """By category, whether the best site of the backbone beats chance and every control that was run."""
+    found = {}
+    for (category, name), curve in results.curves.items():
+        stream = curve.backbone_stream
+        peak = None if stream is None or name != view else best_site(curve, stream)
+        if peak is not None:
+            found[category] = signal(results.controls.beats(category, view, str(peak.site), peak.p_fwe))
+    return found
+
+
+# -- counting --------------------------------------------------------------------------------------------
+
+
+def _items(
+    pairs: "pd.DataFrame", known: Bools, used: Bools, encoded: NDArray[np.float64] | None
+) -> "pd.DataFrame":
+    """A row per item: right in both layouts or not; its episodes' own marks as text."""
+    import pandas as pd
+
+    episodes = pd.DataFrame(
+        {
+            "item_id": pairs["item_id"],
+            "category": pairs["category"],
+            "group": units_of(pairs),
+            "known": known,
+            "used": used,
+            "encoded": np.nan if encoded is None else encoded,
+        }
+    )
+    episodes["marks"] = [_mark(*row) for row in episodes[["known", "encoded", "used"]].itertuples(index=False)]
+    by_item = episodes.groupby("item_id", sort=False)
+    items = by_item.agg({"category": "first", "group": "first", "known": "all", "used": "all", "marks": list})
+    items["encoded"] = by_item["encoded"].min().where(by_item["encoded"].count() == 2)
+    return items.reset_index()
+
+
+def _only_probed(items: "pd.DataFrame") -> "tuple[pd.DataFrame, list[str]]":
+    """Without items that were left out when others of their category were probed, and a sentence about them."""
+    probed = items["encoded"].notna()
+    dropped = ~probed & probed.groupby(items["category"]).transform("any")
+    if not dropped.any():
+        return items, []
+    return items[~dropped], [f"{int(dropped.sum())} items are left out: they were not probed in both layouts."]
+
+
+def _mark(known: bool, encoded: float, used: bool) -> str:
+    middle = "-" if np.isnan(encoded) else str(int(encoded))
+    return f"{int(known)}{middle}{int(used)}"
+
+
+def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
+    known, used = items["known"].to_numpy(bool), items["used"].to_numpy(bool)
+    values = items["encoded"].to_numpy(float)
+    probed = bool(len(values)) and not np.isnan(values).any()
+    encoded = values == 1 if probed else None
+    marks = ["1", "0"]
+    middle = marks if probed else ["-"]
+    sets = [known, *([] if encoded is None else [encoded]), used]
+    codes = [
+        _mark(*row) for row in zip(known, values if probed else np.full(len(known), np.nan), used, strict=True)
+    ]
+    every = ["".join(parts) for parts in product(marks, middle, marks)]
+    singles = [mark if probed else f"{mark[0]}-{mark[2]}" for own in items["marks"] for mark in own]
+    return Joined(
+        category=category,
+        n_items=len(items),
+        n_groups=int(items["group"].nunique()),
+        known=int(known.sum()),
+        encoded=None if encoded is None else int(encoded.sum()),
+        used=int(used.sum()),
+        counts={code: codes.count(code) for code in every},
+        guessed={code: len(items) * _by_coin(code) for code in every},
+        episodes={code: singles.count(code) for code in every},
+        signal=clear if probed else None,
+        comparisons=tuple(_comparisons(known, encoded, used, items["group"].to_numpy(str))),
+        **_kept(sets, encoded),
+    )
+
+
+def _by_coin(code: str) -> float:
+    """Share of items that three coins, or two, would give."""
+    return float(np.prod([COIN if mark == "1" else 1 - COIN for mark in code if mark != "-"]))
+
+
+def _comparisons(known: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]) -> list[Comparison]:
+    values = {"known": known, "used": used} | ({} if encoded is None else {"encoded": encoded})
+    found = []
+    for first, second in PAIRS:
+        if first in values and second in values:
+            here, there = values[first], values[second]
+            ps = mcnemar_p(here, there), flip_p(here, there, groups)
+            found.append(
+                Comparison(first, second, int((here & ~there).sum()), int((~here & there).sum()), *ps, max(ps))
+            )
+    return found
+
+
+def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
+    """What becomes of items that are known and encoded."""
+    if encoded is None:
+        return {}
+    known, _, used = sets
+    both = known & encoded
+    lost, count = int((both & ~used).sum()), int(both.sum())
+    return {
+        "known_and_encoded": count,
+        "not_used": lost,
+        "not_used_share": lost / count if count else None,
+        "not_used_ci": clopper_pearson(lost, count),
+        "p_linked": fisher_p(known[encoded], used[encoded]) if encoded.any() else None,
+    }
+
+
+def _over_all(items: "pd.DataFrame", rows: Sequence[Joined], seed: int) -> Joined:
+    signals = {row.signal for row in rows}
+    whole = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
+    if whole.encoded is None:
+        return whole
+    own = items[items["encoded"] == 1]
+    known, used = own["known"].to_numpy(bool), own["used"].to_numpy(bool)
+    p = overlap_p(known, used, own["category"].to_numpy(str), derive_seed("overlap", seed)) if len(own) else None
+    return replace(whole, p_linked=p)
+
+
+def _with_holm(rows: Sequence[Joined]) -> list[Joined]:
+    """The tests of all categories are one family; those over all categories are a summary and no part of it."""
+    single = [row for row in rows if row.category != OVERALL]
+    corrected = iter(holm([one.p for row in single for one in row.comparisons]))
+    found = [
+        replace(row, comparisons=tuple(replace(one, p_holm=next(corrected)) for one in row.comparisons))
+        for row in single
+    ]
+    return [*found, *(row for row in rows if row.category == OVERALL)]
+
+
+# -- what a reader must know -----------------------------------------------------------------------------
+
+
+def _missing(pairs: "pd.DataFrame", asked: RunReader, acted: RunReader) -> list[str]:
+    return [
+        f"{len(run.episodes) - len(pairs)} episodes of {run.location} have no counterpart and are left out."
+        for run in (asked, acted)
+        if len(run.episodes) > len(pairs)
+    ]
+
+
+def _of_picture(asked: RunReader) -> list[str]:
+    ask = ask_of(asked) or {}
+    notes = []
+    if ask.get("picture") != "frame":
+        notes.append(f"The reader was not shown the first frame (--picture {ask.get('picture')}).")
+    if ask.get("object") != "target":
+        notes.append(f"The reader was asked for the {ask.get('object')}, not for what the instruction names.")
+    return notes
+
+
+def _without_signal(rows: Sequence[Joined]) -> list[str]:
+    dull = [row.category for row in rows if row.signal is False and row.category != OVERALL]
+    if not dull:
+        return []
+    return [
+        f"In {', '.join(dull)} probes beat neither chance nor every control: nothing is encoded there, and counts "
+        "of encoded items are those of a probe that guesses."
+    ]

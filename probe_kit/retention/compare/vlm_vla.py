@@ -1,0 +1,138 @@
+"""VLM minus VLA: what a reader says of the first frames, against what a policy does in the same episodes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+from probe_kit.retention.behaviour.success_rate import units_of
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits, average, sr_estimate
+from probe_kit.retention.rows.row import MEAN
+from probe_kit.statistics.paired_tests import flip_p, holm
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class VlmGap:
+    """Share right of an asked run minus success rate of an acting one, in one category or over all (`mean`).
+
+    paired: whether both are of the same episodes, whose groups are then drawn together. same_frames: whether every
+    one of these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
+    flipped, of all items at once in the row `mean`; None unless paired. p_holm: over the categories of the pair.
+    """
+
+    asked: str
+    acted: str
+    category: str
+    paired: bool
+    same_frames: bool | None
+    n_items: int
+    accuracy: float
+    sr: float
+    vlm_gap: float
+    vlm_gap_ci: Limits
+    p: float | None = None
+    p_holm: float | None = None
+
+
+def vlm_gaps(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> list[VlmGap]:
+    """Every asked run minus every acting one that it can be compared with, per category and over all of them.
+
+    A policy whose network grew from one of the readers that were asked is compared with that one only.
+    names: what runs are called, by their location; by default their labels. Runs as `retention` reads them.
+    """
+    called = names or {str(run.location): run.label for run in runs}
+    asked = [run for run in runs if ask_of(run) is not None]
+    acted = [run for run in runs if ask_of(run) is None]
+    readers = {run.model for run in asked}
+    found: list[VlmGap] = []
+    for reader, policy in product(asked, acted):
+        source = _source(policy)
+        if source not in readers or source == reader.model:
+            found += _pair(reader, policy, called)
+    return found
+
+
+def _source(run: RunReader) -> str | None:
+    """The reader that a policy's network grew from, as its card says."""
+    certificate: Mapping[str, Mapping[str, str | None]] = getattr(run, "certificate", {})
+    return certificate.get("policy", {}).get("source")
+
+
+def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmGap]:
+    there = dict(list(policy.episodes.groupby("category", sort=False)))
+    rows, gaps = [], []
+    for category, here in reader.episodes.groupby("category", sort=False):
+        if category not in there:
+            continue
+        row, gap = _compare(str(category), here, there[category], (reader, policy), called)
+        rows.append(row)
+        gaps.append(gap)
+    if not rows:
+        return []
+    rows = [replace(row, p_holm=p) for row, p in zip(rows, holm([row.p for row in rows]), strict=True)]
+    return [*rows, _mean(rows, average(gaps), reader, policy)]
+
+
+def _compare(
+    category: str,
+    here: "pd.DataFrame",
+    there: "pd.DataFrame",
+    runs: tuple[RunReader, RunReader],
+    called: Mapping[str, str],
+) -> tuple[VlmGap, Estimate]:
+    reader, policy = runs
+    accuracy, sr = sr_estimate(here, reader.suite), sr_estimate(there, policy.suite)
+    gap = accuracy - sr
+    paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.units == sr.units
+    row = VlmGap(
+        asked=called[str(reader.location)],
+        acted=called[str(policy.location)],
+        category=category,
+        paired=paired,
+        same_frames=_same_frames(here, there),
+        n_items=int(here["item_id"].nunique()),
+        accuracy=accuracy.value,
+        sr=sr.value,
+        vlm_gap=gap.value,
+        vlm_gap_ci=gap.ci,
+        p=_p(here, there) if paired else None,
+    )
+    return row, gap
+
+
+def _p(here: "pd.DataFrame", there: "pd.DataFrame") -> float:
+    ordered = there.set_index("episode_id").loc[here["episode_id"]]
+    known, used = ((frame["outcome"] == "correct").to_numpy(bool) for frame in (here, ordered))
+    return flip_p(known, used, units_of(here))
+
+
+def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
+    column = "first_frame_sha256"
+    if column not in here or column not in there:
+        return None
+    both = here[["episode_id", column]].merge(there[["episode_id", column]], on="episode_id")
+    return bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all())
+
+
+def _mean(rows: Sequence[VlmGap], gap: Estimate, reader: RunReader, policy: RunReader) -> VlmGap:
+    categories = [row.category for row in rows]
+    paired = all(row.paired for row in rows)
+    kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (reader, policy)]
+    return replace(
+        rows[0],
+        category=MEAN,
+        paired=paired,
+        same_frames=None if None in (own := {row.same_frames for row in rows}) else own == {True},
+        n_items=sum(row.n_items for row in rows),
+        accuracy=sum(row.accuracy for row in rows) / len(rows),
+        sr=sum(row.sr for row in rows) / len(rows),
+        vlm_gap=gap.value,
+        vlm_gap_ci=gap.ci,
+        p=_p(*kept) if paired else None,
+        p_holm=None,
+    )

@@ -1,0 +1,91 @@
+"""What a figure is about, in one line: model, weights, suite, sizes, settings."""
+
+from dataclasses import dataclass
+from typing import Self
+
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
+
+RANDOM = "RANDOM WEIGHTS"
+SHOWN = 12
+"""Hex digits of a hash that a caption shows."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Where the numbers of a figure come from.
+
+    weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
+    n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
+    call: captured inference that was probed, None without probes.
+    """
+
+    model: str
+    random_weights: bool
+    weights: str | None
+    suite: str
+    n: str
+    settings: str
+    probes: str | None = None
+    target: str = "correct"
+    call: int | None = None
+
+    @classmethod
+    def of_run(cls, run: RunReader) -> Self:
+        """Of a run's behaviour."""
+        rule = getattr(run, "rule", "disc")
+        n = f"n = {len(run.episodes)} episodes" + ("" if rule == "disc" else f" by the rule {rule}")
+        return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
+
+    @classmethod
+    def of_results(cls, results: ProbeResults, view: str) -> Self:
+        """Of probes in one view."""
+        settings = results.settings
+        sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
+        n = f"n = {_span(sizes)} episodes per category"
+        return cls(
+            settings.model, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
+            results.key, settings.target, settings.call,
+        )  # fmt: skip
+
+    @classmethod
+    def of_row(cls, row: RetentionRow) -> Self:
+        """Of a row of the retention table, usually a mean."""
+        n = f"n = {row.n_episodes} episodes"
+        return cls(
+            row.label or row.model,
+            row.random_weights,
+            row.weights_sha256,
+            row.suite,
+            n,
+            row.run_settings,
+            row.probe_settings,
+            call=row.call,
+        )
+
+    @property
+    def parts(self) -> tuple[str, str, str, str, str, str, str]:
+        """What a line under a figure says, most important first; random weights are named in capitals.
+
+        Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
+        """
+        return (
+            f"{self.model} {RANDOM}" if self.random_weights else self.model,
+            self.suite,
+            self.n,
+            "" if self.call is None else f"call {self.call}",
+            f"target {self.target}" if self.target != "correct" else "",
+            f"probes {self.probes}" if self.probes else "",
+            f"weights {self.weights[:SHOWN]}" if self.weights else "",
+        )
+
+    @property
+    def line(self) -> str:
+        """Everything in one line, for a caption."""
+        return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
+
+
+def _span(numbers: list[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low}–{high}"

@@ -1,0 +1,25 @@
+"""Figures that notebooks show although pyplot does not know them and no `%matplotlib` was said."""
+
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from probe_kit.retention.displays.base.display import Picture, picture_of
+
+PRINT_DPI = 300
+
+
+class ShownFigure(Figure):
+    """A matplotlib figure like any other, that also shows itself and saves fit for print.
+
+    caption: what it is about, in full: model, weights, suite, sizes, probes, settings.
+    """
+
+    caption: str = ""
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Save, pixels at 300 per inch unless told otherwise."""
+        super().savefig(fname, **{"dpi": PRINT_DPI, **options})
+
+    def _repr_png_(self) -> Picture:
+        return picture_of(self)

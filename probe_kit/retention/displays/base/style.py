@@ -1,0 +1,218 @@
+"""What all figures share: colours, markers, axes without clutter, and the caption."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from numpy.typing import ArrayLike
+
+# Okabe and Ito's palette: apart for every kind of colour vision.
+BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
+
+DPI = 150
+ACCURACY = (20.0, 109.0)
+"""Percent along the axis of held-out accuracies, the same in every figure of every run."""
+ABOVE_CHANCE = (-30.0, 51.0)
+"""The same of accuracies above chance, in points."""
+_CAPTION_SIZE = 6.5
+_LEGEND_SIZE = 8.0
+_USED = 0.97  # of the width, by a caption
+
+
+@dataclass(frozen=True)
+class Line:
+    """How one series is drawn; colour is never the only difference."""
+
+    colour: str
+    marker: str
+    dash: str = "-"
+
+
+PARTS = MappingProxyType(
+    {
+        "backbone": Line(BLUE, "o"),
+        "action": Line(VERMILION, "s"),
+        "vision": Line(GREEN, "^"),
+        "bridge": Line(PURPLE, "D"),
+    }
+)
+"""How the streams of one part of a model are drawn."""
+
+SERIES = (
+    Line(BLUE, "o"),
+    Line(VERMILION, "s", "--"),
+    Line(GREEN, "^", "-."),
+    Line(PURPLE, "D", ":"),
+    Line(ORANGE, "v", (0, (5, 1))),  # type: ignore[arg-type]  # matplotlib also takes (offset, dashes)
+    Line(BLACK, "P", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+    Line(SKY, "X", "-"),
+)
+"""For models or roles, in order; an eighth one begins again."""
+
+
+def series(position: int) -> Line:
+    """How the series at `position` is drawn."""
+    return SERIES[position % len(SERIES)]
+
+
+def darker(colour: str) -> str:
+    """A shade of `#RRGGBB` that text can be read in."""
+    return "#" + "".join(f"{int(colour[at : at + 2], 16) * 6 // 10:02X}" for at in (1, 3, 5))
+
+
+def axes_for(ax: "Axes | None", width: float, height: float) -> "tuple[Axes, Figure | None]":
+    """The axes to draw on, and the figure if it was made for them.
+
+    ax: the caller's, or None for new ones of `width` × `height` inches, which a notebook then shows.
+    """
+    if ax is not None:
+        return ax, None
+    from matplotlib import pyplot as plt
+
+    from probe_kit.retention.displays.base.shown_figure import ShownFigure
+
+    figure, axes = plt.subplots(FigureClass=ShownFigure, figsize=(width, height), layout="constrained", dpi=DPI)
+    return axes, figure
+
+
+def panels(
+    count: int, width: float = 3.1, height: float = 2.5, columns: int | None = None, *, share: bool = True
+) -> "tuple[Figure, list[Axes]]":
+    """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row."""
+    from probe_kit.retention.displays.base.shown_figure import ShownFigure
+
+    across = columns or (2 if count == 4 else min(3, count))
+    rows = ceil(count / across)
+    figure = ShownFigure(figsize=(max(width * across, 6.2), height * rows + 1.1), layout="constrained", dpi=DPI)
+    grid = list(figure.subplots(rows, across, sharex=share, sharey=share, squeeze=False).flat)
+    for position in range(count, len(grid)):
+        grid[position].set_visible(False)
+        grid[position - across].tick_params(labelbottom=True)
+    return figure, grid[:count]
+
+
+def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
+    """Whole layer numbers below the axes."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xlim(-0.06 * layers - 0.2, 1.06 * (layers - 1) + 0.2)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=2))
+    if label:
+        axes.set_xlabel("layer", fontsize=8.5)
+
+
+def accuracy_axis(axes: "Axes") -> None:
+    """The fixed scale of accuracies; what lies below is marked at the lower edge by `mark_below`."""
+    axes.set_ylim(*ACCURACY)
+
+
+def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour: str) -> None:
+    """A mark at the lower edge, with the number, for every accuracy (percent) that the scale does not reach."""
+    for place, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
+        if value < ACCURACY[0]:
+            axes.plot([place], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
+            axes.annotate(
+                f"{value:.0f}", (place, ACCURACY[0] + 1.5), (0, 5), textcoords="offset points", fontsize=6.5,
+                ha="center", color=colour,
+            )  # fmt: skip
+
+
+def plain(axes: "Axes") -> None:
+    """No frame above and to the right, small tick labels."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+
+
+def caption(figure: "Figure | None", *certificates: Certificate) -> None:
+    """One line under the figure says what it is about; the rest is kept as `figure.caption`.
+
+    The line names every model once, then what all have in common, and is cut between its parts where the figure
+    is too narrow for all of them.
+    """
+    if figure is None:
+        return
+    known = tuple(dict.fromkeys(certificates))
+    figure.caption = "; ".join(certificate.line for certificate in known)  # type: ignore[attr-defined]
+    figure.supxlabel(_footer(known, figure.get_figwidth()), fontsize=_CAPTION_SIZE, color="0.25")
+
+
+def footer(figure: "Figure", text: str) -> None:
+    """A line under a figure that belongs to several runs at once, and its whole caption."""
+    figure.caption = text  # type: ignore[attr-defined]
+    parts = text.split(" · ")
+    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * figure.get_figwidth():
+        parts.pop()
+    figure.supxlabel(" · ".join(parts), fontsize=_CAPTION_SIZE, color="0.25")
+
+
+def _footer(certificates: Sequence[Certificate], width: float) -> str:
+    """As many parts as `width` inches hold, the first one always; what all certificates share comes once."""
+    parts = list(
+        dict.fromkeys(
+            ", ".join(dict.fromkeys(group)) for group in zip(*(c.parts for c in certificates), strict=True)
+        )
+    )
+    parts = [part for part in parts if part.strip(", ")]
+    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * width:
+        parts.pop()
+    return " · ".join(parts)
+
+
+def legend_above(figure: "Figure", handles: "Sequence[Artist]") -> None:
+    """A legend along the upper side, in as many columns as the figure has room for."""
+    labels = [str(handle.get_label()) for handle in handles]
+    widths = [text_width(label, _LEGEND_SIZE) for label in labels]
+    room = _USED * figure.get_figwidth()
+    fitting = [n for n in range(1, len(labels) + 1) if _legend_width(widths, n) <= room]
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=max(fitting, default=1), fontsize=_LEGEND_SIZE,
+        frameon=False,
+    )  # fmt: skip
+
+
+def _legend_width(widths: Sequence[float], columns: int) -> float:
+    """Inches of a legend, which fills column by column; each has a mark and gaps of five letters' width."""
+    rows, more = divmod(len(widths), columns)
+    total, start = 0.0, 0
+    for column in range(columns):
+        count = rows + (column < more)
+        total += max(widths[start : start + count]) + 5.2 * _LEGEND_SIZE / 72
+        start += count
+    return total
+
+
+def text_width(text: str, size: float) -> float:
+    """Inches that a line of text of `size` points takes."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    return float(TextPath((0, 0), text, prop=FontProperties(size=size)).get_extents().width) / 72
+
+
+def significance_handles(colour: str = "0.3") -> "list[Line2D]":
+    """The legend's entries for filled and open markers, which mean the same in every figure."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, label=FILLED),
+        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
+    ]
+
+
+SIGNAL = f"above chance and every control run, p < {SIGNIFICANCE}"
+"""What every filled marker and every dot of a probe is; the same words in legends and captions."""
+FILLED = f"filled: signal ({SIGNAL})"
+OPEN = "open: no signal"

@@ -1,0 +1,198 @@
+"""What can be read at each captured inference of an episode, counted from its beginning or from an event."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.scoring.events import EVENTS, Events
+from probe_kit.errors import UsageError
+from probe_kit.retention.estimators.retention import best_site
+from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.train.results.control_scores import signal
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_results import ProbeResults
+
+Shares = NDArray[np.float64]
+EventCalls = Mapping[str, Mapping[str, int]]
+"""Per event, by episode id, the captured inference before it."""
+_ENOUGH = 20  # relabellings, fewer than which have no 95 % point
+
+
+@dataclass(frozen=True)
+class CallLine:
+    """Held-out accuracy of a stream's best site by captured inference; arrays (C,), accuracies as shares.
+
+    low, high: 95 % interval over groups, the site held fixed. significant: above chance against all sites of the
+    stream, and above the controls that were run. null: what the best site of relabelled data stays below in 95 %,
+    NaN with few relabellings. episodes: how many got that far. part: of the model, see `Stream.part`.
+    """
+
+    stream: str
+    part: str
+    calls: NDArray[np.int64]
+    accuracy: Shares
+    low: Shares
+    high: Shares
+    significant: NDArray[np.bool_]
+    null: Shares
+    episodes: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class AlignedLine:
+    """The same counted from an event of each episode: 0 is the last inference before the action that brought it
+    about. Sites are those that are best at their call; (O,) offsets with at least `FEWEST` episodes.
+    """
+
+    stream: str
+    part: str
+    offsets: NDArray[np.int64]
+    accuracy: Shares
+    low: Shares
+    high: Shares
+    episodes: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class EventTimes:
+    """At which captured inference an event fell due: median and quartiles over the episodes that have it."""
+
+    event: str
+    median: float
+    low: float
+    high: float
+    share: float
+
+
+FEWEST = 10
+"""Episodes from which on an accuracy is shown."""
+
+
+@dataclass(frozen=True)
+class CallCurves:
+    """One category in one view over the captured inferences of a run.
+
+    results: the probes by call. events: when they fell due, as `event_calls` says; empty without trajectories.
+    """
+
+    results: Mapping[int, ProbeResults]
+    category: str
+    view: str
+    events: EventCalls
+
+    @classmethod
+    def of(
+        cls, results: Mapping[int, ProbeResults], category: str, view: str, events: EventCalls | None = None
+    ) -> Self:
+        """From probes by call, as `load_calls` gives them. events: as `event_calls` gives them.
+
+        Raises UsageError for probes of a single call, or without that category and view.
+        """
+        if len(results) < 2:
+            raise UsageError(
+                f"probes of call {', '.join(map(str, results))} make no curve over calls; extract with "
+                "--captured-calls N and fit them with `probe-kit train --call all`"
+            )
+        if lacking := [call for call, one in results.items() if (category, view) not in one.curves]:
+            raise UsageError(f"call {lacking[0]} has no probes of category {category!r} in view {view!r}")
+        return cls(results, category, view, events or {})
+
+    @property
+    def chance(self) -> float:
+        """Of the first call."""
+        return self._curves[next(iter(self._curves))].chance
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Those that were probed at every call, in order."""
+        curves = list(self._curves.values())
+        first = dict.fromkeys(site.stream for site in curves[0].sites)
+        return tuple(name for name in first if all(curve.stream(name).size for curve in curves))
+
+    def line(self, stream: str) -> CallLine:
+        """The stream's best site at each call."""
+        points = [self._point(call, curve, stream) for call, curve in self._curves.items()]
+        accuracy, low, high, significant, null, episodes = map(np.array, zip(*points, strict=True))
+        calls = np.array(list(self._curves), np.int64)
+        return CallLine(stream, self._part(stream), calls, accuracy, low, high, significant, null, episodes)
+
+    def aligned(self, stream: str, event: str) -> AlignedLine | None:
+        """The stream's best sites counted from an event; None where too few episodes have it."""
+        pools: dict[int, list[tuple[str, bool]]] = {}
+        for call, curve in self._curves.items():
+            right = curve.correct[curve.best(stream)]
+            for episode, group, hit in zip(curve.episodes, curve.groups, right, strict=True):
+                due = self.events.get(event, {}).get(str(episode))
+                if due is not None:
+                    pools.setdefault(call - due, []).append((str(group), bool(hit)))
+        kept = {offset: pools[offset] for offset in sorted(pools) if len(pools[offset]) >= FEWEST}
+        if not kept:
+            return None
+        found = [
+            self._interval(np.array([hit for _, hit in pool]), [g for g, _ in pool]) for pool in kept.values()
+        ]
+        accuracy, low, high = map(np.array, zip(*found, strict=True))
+        sizes = np.array([len(pool) for pool in kept.values()], np.int64)
+        offsets = np.array(list(kept), np.int64)
+        return AlignedLine(stream, self._part(stream), offsets, accuracy, low, high, sizes)
+
+    def event_times(self) -> list[EventTimes]:
+        """When the events of this category's episodes fell due; those that no episode has are left out."""
+        own = self._curves[min(self._curves)].episodes
+        found = []
+        for event, calls in self.events.items():
+            due = [calls[str(episode)] for episode in own if str(episode) in calls]
+            if due:
+                low, median, high = np.percentile(due, [25, 50, 75])
+                found.append(EventTimes(event, float(median), float(low), float(high), len(due) / len(own)))
+        return found
+
+    @property
+    def _curves(self) -> dict[int, Curve]:
+        return {call: one.curves[self.category, self.view] for call, one in self.results.items()}
+
+    def _part(self, stream: str) -> str:
+        curve = next(iter(self._curves.values()))
+        return curve.parts[int(curve.stream(stream)[0])]
+
+    def _interval(self, right: NDArray[np.bool_], groups: Sequence[Any]) -> tuple[float, float, float]:
+        suite = next(iter(self.results.values())).settings.suite
+        names = np.asarray(groups, dtype=str)
+        low, high = group_bootstrap(right[:, None], names, units_seed(names, suite))
+        return float(right.mean()), float(low[0]), float(high[0])
+
+    def _point(self, call: int, curve: Curve, stream: str) -> tuple[float, float, float, bool, float, int]:
+        peak = best_site(curve, stream)
+        assert peak is not None, "the stream was probed at every call"
+        row = curve.sites.index(peak.site)
+        beats = self.results[call].controls.beats(self.category, self.view, str(peak.site), peak.p_fwe)
+        best_null = curve.null[curve.stream(stream)]
+        null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= _ENOUGH else np.nan
+        return (
+            *self._interval(curve.correct[row], list(curve.groups)),
+            signal(beats),
+            float(null),
+            curve.labels.size,
+        )
+
+
+def event_calls(run: Any) -> EventCalls:
+    """Per event, by episode id, the last inference before the action that brought it about.
+
+    Nothing for a run without trajectories. Inference c decides actions c · k + 1 to (c + 1) · k, with k actions
+    executed per inference.
+    """
+    if not getattr(run, "has_trajectories", False):
+        return {}
+    executed = int(run.settings["execute"])
+    found: dict[str, dict[str, int]] = {event: {} for event in EVENTS}
+    for episode, trajectory in zip(run.episodes["episode_id"], run.trajectories, strict=True):
+        events = Events.of(trajectory)
+        for event in EVENTS:
+            frame = events.frame(event)
+            if frame is not None and frame > 0:
+                found[event][str(episode)] = (frame - 1) // executed
+    return found

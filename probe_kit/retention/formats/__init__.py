@@ -1,0 +1,1 @@
+"""The table as text, Markdown, LaTeX, HTML, JSON and data frame."""

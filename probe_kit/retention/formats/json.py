@@ -1,0 +1,33 @@
+"""The retention table as JSON."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.rows.row import RetentionRow
+
+
+def table_json(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference], beside: Mapping[str, Sequence[Any]]
+) -> str:
+    """See `RetentionTable.to_json`. beside: further lists of dataclasses by their name, shown if not empty."""
+    between_runs = [row for row in differences if row.run is not None]
+    between_groups = [row for row in differences if row.run is None]
+    several = len({row.run for row in rows}) > 1 and not any(row.group for row in rows)
+    lines = [asdict(row) | (_own(row, between_runs) if several else {}) for row in rows]
+    lists = {"differences": between_groups, **beside}
+    shown = {name: [asdict(one) for one in found] for name, found in lists.items() if found}
+    content = {"rows": lines, **shown} if shown else lines
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:
+    """What a row of one of several runs says of the others; a difference of behaviour stands in every view."""
+    found = [
+        asdict(one)
+        for one in differences
+        if (one.run, one.category) == (row.run, row.category) and one.view in (row.view, None)
+    ]
+    return {"differences": found}

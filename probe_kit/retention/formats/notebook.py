@@ -1,0 +1,70 @@
+"""The retention table as a notebook shows it: success rates, probes and retention on heat colours."""
+
+from collections.abc import Sequence
+from html import escape
+
+from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.formats.html import (
+    HtmlCell,
+    HtmlTable,
+    behaviour_table,
+    retention_table,
+)
+from probe_kit.retention.rows.row import RetentionRow
+
+_CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
+_INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of text
+
+
+def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
+    """The report's first tables, without its page: headings explain themselves when pointed at."""
+    found = [behaviour_table(rows, differences), retention_table(rows, differences)]
+    return _heading(rows) + "".join(_table(one) for one in found if one is not None)
+
+
+def _heading(rows: Sequence[RetentionRow]) -> str:
+    """Whose numbers these are, since a table of one model does not repeat its name."""
+    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
+    return f"<div>{escape(_models(rows))} on {escape(suites)}</div>" if rows else ""
+
+
+def _models(rows: Sequence[RetentionRow]) -> str:
+    return ", ".join(dict.fromkeys(map(model_name, rows)))
+
+
+def table_text(rows: Sequence[RetentionRow]) -> str:
+    """One line: how many rows, of which models."""
+    categories = len({row.category for row in rows})
+    models = _models(rows) or "no runs"
+    return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
+
+
+def _table(table: HtmlTable) -> str:
+    numeric = [column.numeric for column in table.columns]
+    head = "".join(
+        f'<th style="{_style(column.numeric)}" title="{escape(column.explanation)}">{escape(column.name)}</th>'
+        for column in table.columns
+    )
+    body = "".join(_row(cells, numeric) for cells in table.body)
+    foot = "".join(_row(cells, numeric, bold=True) for cells in table.foot)
+    title = f'<div style="margin-top:.6em"><b>{escape(table.title)}</b></div>'
+    return f"{title}<table><thead><tr>{head}</tr></thead><tbody>{body}{foot}</tbody></table>"
+
+
+def _row(cells: Sequence[HtmlCell], numeric: Sequence[bool], bold: bool = False) -> str:
+    return "<tr>" + "".join(_cell(cell, right, bold) for cell, right in zip(cells, numeric, strict=True)) + "</tr>"
+
+
+def _cell(cell: HtmlCell, numeric: bool, bold: bool) -> str:
+    style = _style(numeric)
+    style += f";background:{cell.heat}{_INK}" if cell.heat else ""
+    style += ";font-weight:bold" if bold or cell.strong else ""
+    style += ";color:#b00020" if cell.alarm else ""
+    style += ";font-style:italic" if cell.difference else ""
+    below = f"<br><small>{escape(cell.below)}</small>" if cell.below else ""
+    return f'<td style="{style}" title="{escape(cell.note)}">{escape(cell.text)}{below}</td>'
+
+
+def _style(numeric: bool) -> str:
+    return _CELL.format(align="right" if numeric else "left")

@@ -1,0 +1,220 @@
+"""What the tables say, in sentences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.text import NOT_ACTED, model_name, percent
+from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.retention.text import spell
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.results.control_scores import Beats
+
+_MOSTLY = 0.5  # share of episodes above which something is said first
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One number of a run's summary, and what it is."""
+
+    value: str
+    name: str
+    gloss: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A run and view in a few numbers and sentences. warnings: what would be misread without them."""
+
+    name: str
+    view: str | None
+    random_weights: bool
+    headlines: tuple[Headline, ...]
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+    by_category: tuple[tuple[str, str], ...]
+
+
+def summarise(rows: Sequence[RetentionRow]) -> Summary:
+    """The summary of one run and view. rows: its categories, and their mean."""
+    mean = next(row for row in rows if row.category == MEAN)
+    single = [row for row in rows if row.category != MEAN]
+    return Summary(
+        name=model_name(mean).replace(" (random weights)", ""),
+        view=mean.view,
+        random_weights=mean.random_weights,
+        headlines=tuple(_headlines(mean, single)),
+        sentences=tuple(_sentences(mean, single)),
+        warnings=tuple(_warnings(mean, single)),
+        by_category=tuple((spell(row.category), " ".join(read_row(row))) for row in single),
+    )
+
+
+def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
+    rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
+    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
+    if mean.prefix_accuracy is not None:
+        found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
+    if mean.action_accuracy is not None:
+        found.append(
+            Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
+        )
+    if mean.prefix_accuracy is not None and mean.action_accuracy is not None:
+        found.append(_retention_headline(mean, rows))
+    return found
+
+
+def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
+    if not mean.retention_defined or mean.retention_bounded is None:
+        return Headline("n/a", "retention", _why_not(rows))
+    return Headline(f"{mean.retention_bounded:.2f}", "retention, bounded", _interval_words(mean))
+
+
+def _interval_words(row: RetentionRow) -> str:
+    if row.retention_bounded_ci is None:
+        return "no interval"
+    low, high = row.retention_bounded_ci
+    return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
+
+
+def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    found = [_behaviour(mean, rows)]
+    if any(row.prefix_accuracy is not None for row in rows):
+        found.append(_knowledge(rows))
+    if any(row.retention is not None for row in rows):
+        found.append(_retention(mean, rows))
+    if mean.gap is not None and any(row.prefix_signal for row in rows):
+        found.append(
+            f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
+            f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
+        )
+    return found
+
+
+def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
+    if mean.listened:
+        return "The model was listened to at the first picture of every episode and did not act: no success rate."
+    knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
+    fails = [row for row in rows if row.regime == Regime.FAILURE]
+    text = f"The cube ended on the correct picture in {percent(mean.sr)} % of episodes, averaged over categories. "
+    text += f"In {_of(knows, rows)} that is more than guessing explains"
+    return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
+
+
+def _knowledge(rows: Sequence[RetentionRow]) -> str:
+    backbone = [row for row in rows if row.prefix_signal]
+    expert = [row for row in rows if row.action_signal]
+    text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
+    if any(row.action_accuracy is not None for row in rows):
+        text += f", and in the {rows[0].action_name} in {_of(expert, rows)}"
+    return f"{text}."
+
+
+def _judge(rows: Sequence[RetentionRow]) -> str:
+    """What had to be beaten."""
+    names = [name for name in ("binding", "twin") if any(row.prefix_beats.get(name) is not None for row in rows)]
+    *first, last = ["chance", *names]
+    return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
+
+
+def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
+    counted = [row for row in rows if row.retention_defined]
+    if not counted or mean.retention_bounded is None:
+        return f"Retention is not defined: {_why_not(rows)}."
+    left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
+    return (
+        f"Of what can be read in the backbone above chance, a share of {mean.retention_bounded:.2f} can still be "
+        f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
+    )
+
+
+def _why_not(rows: Sequence[RetentionRow]) -> str:
+    """What keeps categories from having a retention, each reason once."""
+    notes = [row.retention_note for row in rows if not row.retention_defined]
+    return "; ".join(dict.fromkeys(note.removeprefix("n/a (").removesuffix(")") for note in notes))
+
+
+def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    found = []
+    if mean.random_weights:
+        found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
+    if (mean.p_never_moved or 0) > _MOSTLY:
+        found.append(
+            f"The cube never moved in {percent(mean.p_never_moved)} % of episodes: the policy does not grasp, so "
+            "its success rate says nothing about what it knows."
+        )
+    elif (mean.p_oob or 0) > _MOSTLY:
+        found.append(f"The cube reached neither picture in {percent(mean.p_oob)} % of episodes.")
+    if mean.p_flagged:
+        found.append(
+            f"In {percent(mean.p_flagged)} % of its steps the policy put out something that is no action."
+        )
+    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
+    if biased:
+        found.append(f"The policy has a habit of going to one side in {_of(biased, rows)}.")
+    if mean.leaks:
+        found.append(
+            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
+            "believing a probe."
+        )
+    return found
+
+
+def read_row(row: RetentionRow) -> list[str]:
+    """One category in sentences."""
+    if row.sr is None:
+        found = [
+            f"Listened to in {row.n_episodes} episodes; it did not act."
+            if row.listened
+            else f"Success rate {row.regime_reason}."
+        ]
+    else:
+        right = round(row.sr * row.n_episodes)
+        found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
+    if row.items_both_right is not None:
+        items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
+        found.append(f"{row.items_both_right} of {items} questions right in both layouts.")
+    if row.prefix_accuracy is not None:
+        found.append(
+            f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
+            f"{row.prefix_depth:.2f}{_ties_words(row.prefix_ties)}: "
+            f"{_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
+        )
+    if row.action_accuracy is not None:
+        step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
+        found.append(
+            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}"
+            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_beats)}."
+        )
+    if row.retention_defined and row.retention_bounded is not None:
+        found.append(f"Bounded retention {row.retention_bounded:.2f} ({_interval_words(row)}).")
+    return found
+
+
+def _ties_words(ties: int | None) -> str:
+    return f" and at {ties} other site{'s' * (ties > 1)} as well" if ties else ""
+
+
+def _clear_words(p: float | None, beats: Beats) -> str:
+    if p is None:
+        return "not tested, for lack of relabellings"
+    controls = {"binding": "an untrained conjunction of pictures and words", "twin": "its twin"}
+    equals = [words for name, words in controls.items() if beats.get(name) is False]
+    clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
+    return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"
+
+
+def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """The shorter of the two lists: those that are in, or those that are not."""
+    rest = [row for row in rows if row not in part]
+    shown, prefix = (rest, "all but ") if len(rest) < len(part) else (part, "")
+    return prefix + ", ".join(spell(row.category) for row in shown)
+
+
+def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow], names: bool = True) -> str:
+    """How many of the categories, and which if not all."""
+    noun = "category" if len(rows) == 1 else "categories"
+    if len(part) == len(rows):
+        return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
+    named = f" ({_names(part, rows)})" if part and names else ""
+    return f"{len(part) or 'none'} of {len(rows)} {noun}{named}"

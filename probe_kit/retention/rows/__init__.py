@@ -1,0 +1,1 @@
+"""Rows of the retention table, and how they are built."""

@@ -1,0 +1,41 @@
+"""What stored interventions add to a row: does the action follow the pictures, and is what can be read used?
+
+Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing is played.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from probe_kit.intervene.kinds.image_swap.effects import Following
+from probe_kit.intervene.kinds.image_swap.verdict import control_for, judge
+from probe_kit.retention.rows.parts import Followed
+from probe_kit.retention.rows.row import RetentionRow
+
+
+def with_following(
+    row: RetentionRow,
+    found: Mapping[str, Following],
+    located: Mapping[str, Sequence[str]],
+    carried: Mapping[str, Sequence[str]],
+) -> RetentionRow:
+    """The row with what was found of its category, judged by its own probes.
+
+    found: by category; may be empty. located: places that carry it, by category, of those that were searched.
+    carried: directions that do.
+    """
+    own = found.get(row.category)
+    if own is None:
+        return row
+    encoded = row.prefix_signal if row.prefix_beats else None
+    category, control = row.category, control_for(row.category, found)
+    judged = judge(encoded, own, control, located.get(category), carried.get(category, ()))
+    part = Followed(
+        follows=own.follows,
+        against=own.against,
+        follows_net=own.net,
+        follows_net_ci=own.net_ci,
+        follows_p=own.p_follows,
+        used=judged.verdict,
+        used_note=judged.reason,
+    )
+    return replace(row, **vars(part))

@@ -1,0 +1,253 @@
+"""By which outcome rule a success rate was made, what else it leaves unsaid, and what the other rules say."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+
+import numpy as np
+
+from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES, rule_of
+from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour.success_rate import listened, shares_of, units_of
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits
+from probe_kit.statistics.bootstrap import bootstrap_ratios, group_means, units_seed
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ruled:
+    """The outcome rule, and what it gives away.
+
+    rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
+    n_answered, p_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped, sr_grasped:
+    the same of episodes in which both fingers ever touched the cube. p_answers_unmoved: share of answers whose
+    cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the picture in
+    whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes. p_both: share of
+    episodes whose cube counts for both pictures, which is called correct. sr_by_rule: by every rule, at the last
+    step. behaviour: shares of episodes by what hand and cube did.
+    What is about answers is there for every run with a success rate; the rest is None or empty where the run
+    keeps no trajectories.
+    """
+
+    rule: str = DEFAULT_RULE
+    rule_words: str = ""
+    last_steps: int = 1
+    n_answered: int | None = None
+    p_answered: float | None = None
+    sr_answered: float | None = None
+    sr_answered_ci: Limits | None = None
+    n_grasped: int | None = None
+    sr_grasped: float | None = None
+    sr_grasped_ci: Limits | None = None
+    p_answers_unmoved: float | None = None
+    sr_idle: float | None = None
+    idle_side: str | None = None
+    p_both: float | None = None
+    sr_by_rule: dict[str, float] = field(default_factory=dict)
+    behaviour: dict[str, float] = field(default_factory=dict)
+
+
+class Judgeable(Protocol):
+    """A run that keeps trajectories; see `probe_kit.extract.Run`."""
+
+    episodes: "pd.DataFrame"
+    settings: Mapping[str, Any]
+    behaviour: "pd.DataFrame"
+
+    def judged(self, rule: str, last_steps: int = 1) -> "pd.DataFrame":
+        """A row per episode."""
+
+    def under(self, rule: str, last_steps: int = 1) -> RunReader:
+        """The run with its outcomes by another rule."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A run by one rule. run: with its outcomes by that rule. verdicts, behaviour: None without trajectories."""
+
+    run: RunReader
+    rule: str
+    words: str
+    last_steps: int
+    verdicts: "Mapping[str, pd.DataFrame] | None" = None
+    behaviour: "pd.DataFrame | None" = None
+
+    @classmethod
+    def of(cls, run: RunReader, rule: str, last_steps: int = 1) -> Self:
+        """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule."""
+        if ask_of(run) is not None:
+            return cls(run, DEFAULT_RULE, "", 1)
+        scene = getattr(run, "settings", {}).get("scene")
+        words = "" if scene is None else rule_of(rule, scene).words
+        if scene is None or run.episodes.empty or not getattr(run, "has_trajectories", False):
+            return cls(run, rule, words, last_steps)
+        own = cast("Judgeable", run)
+        verdicts = {name: own.judged(name) for name in RULES}
+        return cls(own.under(rule, last_steps), rule, words, last_steps, verdicts, own.behaviour)
+
+    @property
+    def scored(self) -> bool:
+        """Whether there is a success rate by this rule: by the default rule it was stored with every run."""
+        return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
+
+    def part(self, episodes: "pd.DataFrame") -> Ruled:
+        """The row part of some of the episodes; their index is their position in the run."""
+        if not self.scored:
+            return Ruled(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
+        answered = 1 - shares_of(episodes, "oob")
+        rate = self._conditional(episodes, answered)
+        facts = {} if self.verdicts is None else self._facts(episodes, answered)
+        return Ruled(
+            rule=self.rule,
+            rule_words=self.words,
+            last_steps=self.last_steps,
+            n_answered=int((episodes["outcome"] != "oob").sum()),
+            p_answered=float(answered.mean()),
+            sr_answered=None if rate is None else rate.value,
+            sr_answered_ci=None if rate is None else rate.ci,
+            **facts,
+        )
+
+    def estimates(self, episodes: "pd.DataFrame") -> dict[str, Estimate]:
+        """`sr_answered` and `sr_grasped` with their draws, where they are defined."""
+        if not self.scored:
+            return {}
+        found = {"sr_answered": self._conditional(episodes, 1 - shares_of(episodes, "oob"))}
+        if self.behaviour is not None:
+            grasped = self.behaviour["grasped"].to_numpy(float)[episodes.index]
+            found["sr_grasped"] = self._conditional(episodes, grasped)
+        return {name: estimate for name, estimate in found.items() if estimate is not None}
+
+    def _facts(
+        self, episodes: "pd.DataFrame", answered: "np.ndarray[Any, np.dtype[np.float64]]"
+    ) -> dict[str, Any]:
+        assert self.verdicts is not None
+        assert self.behaviour is not None
+        verdicts = {name: of_rule.loc[episodes.index] for name, of_rule in self.verdicts.items()}
+        acted, own = self.behaviour.loc[episodes.index], verdicts[self.rule]
+        grasped = acted["grasped"].to_numpy(float)
+        rate = self._conditional(episodes, grasped)
+        stayed = answered[~acted["moved"].to_numpy(bool)].sum()
+        return {
+            "n_grasped": int(grasped.sum()),
+            "sr_grasped": None if rate is None else rate.value,
+            "sr_grasped_ci": None if rate is None else rate.ci,
+            "p_answers_unmoved": float(stayed / answered.sum()) if answered.any() else None,
+            "sr_idle": float((own["idle"] == "correct").mean()),
+            "idle_side": _idle_side(own["idle"], episodes["side_correct"]),
+            "p_both": float(own["both"].mean()),
+            "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
+            "behaviour": _behaviour(acted),
+        }
+
+    def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Estimate | None:
+        """Success where the weights are, whole groups of items drawn; None where there is no weight."""
+        if not weights.any():
+            return None
+        groups = units_of(episodes)
+        units = units_seed(groups, self.run.suite)
+        right = shares_of(episodes, "correct") * (weights > 0)
+        draws = bootstrap_ratios(right, weights, groups, units)
+        counts, tops = (group_means(part[:, None], groups)[:, 0] for part in (weights, right))
+        each = np.divide(tops, counts, out=np.full(counts.size, np.nan), where=counts > 0)
+        return Estimate(float(right.sum() / weights.sum()), draws, units, int((counts > 0).sum()), each)
+
+
+def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
+    """Where the untouched cube lies, by the rule."""
+    placed = {
+        "none" if zone == "oob" else side if zone == "correct" else {"left": "right", "right": "left"}[side]
+        for zone, side in zip(idle, sides, strict=True)
+    }
+    return placed.pop() if len(placed) == 1 else "both"
+
+
+def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
+    """Shares of episodes; of those that made a choice where there is one to make."""
+    found = {name: float(acted[name].mean()) for name in ("grasped", "moved", "released")}
+    for name in ("first_choice", "closer_to", "release_near"):
+        chosen = acted[name][acted[name].isin(["correct", "wrong"])]
+        found[f"{name}_made"] = len(chosen) / len(acted)
+        if len(chosen):
+            found[f"{name}_correct"] = float((chosen == "correct").mean())
+    found["correct_side_share"] = float(acted["correct_side_share"].mean())
+    return found
+
+
+AVERAGED = ("p_answered", "sr_answered", "sr_grasped", "p_answers_unmoved", "sr_idle", "p_both")
+"""Fields of which a row of category means holds the average."""
+
+
+def mean_part(rows: Sequence[Ruled], limits: Mapping[str, Limits | None]) -> Ruled:
+    """The part of a row that averages over categories; limits: of `sr_answered` and `sr_grasped`."""
+    first = rows[0]
+    sides = {row.idle_side for row in rows}
+    averages = {name: _mean([getattr(row, name) for row in rows]) for name in AVERAGED}
+    return Ruled(
+        rule=first.rule,
+        rule_words=first.rule_words,
+        last_steps=first.last_steps,
+        n_answered=_sum([row.n_answered for row in rows]),
+        n_grasped=_sum([row.n_grasped for row in rows]),
+        sr_answered_ci=limits.get("sr_answered"),
+        sr_grasped_ci=limits.get("sr_grasped"),
+        idle_side=sides.pop() if len(sides) == 1 else "both",
+        sr_by_rule=_mean_by_key([row.sr_by_rule for row in rows]),
+        behaviour=_mean_by_key([row.behaviour for row in rows]),
+        **averages,
+    )
+
+
+def _mean(values: Sequence[float | None]) -> Any:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def _sum(values: Sequence[int | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
+
+
+def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
+
+
+def rule_sentence(row: Ruled) -> str:
+    """What outcomes were judged by, and what the rule gives away; for captions."""
+    steps = f", mean of the last {row.last_steps} control steps (all, where there are fewer)" * (
+        row.last_steps > 1
+    )
+    text = f"outcome rule {row.rule}{f': {row.rule_words}' if row.rule_words else ''}{steps}"
+    if row.sr_idle is None:
+        return text
+    where = {
+        "none": "the untouched cube lies in neither zone",
+        "both": "the untouched cube lies in a zone of some episodes",
+    }.get(row.idle_side or "none", f"the untouched cube already lies in the zone of the {row.idle_side} picture")
+    return f"{text}; a policy that does nothing would score {100 * row.sr_idle:.1f} %, as {where}"
+
+
+def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
+    """Whether there are outcomes of a run by this rule; those by `disc` at the last step are always stored."""
+    if (rule, last_steps) == (DEFAULT_RULE, 1) or ask_of(run) is not None or listened(run.episodes):
+        return True
+    return bool(getattr(run, "has_trajectories", False))
+
+
+def by_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
+    """The run with its outcomes by a rule, for figures; as it is where it cannot be judged."""
+    if (rule, last_steps) == (DEFAULT_RULE, 1) or not getattr(run, "has_trajectories", False):
+        return run
+    return cast("Judgeable", run).under(rule, last_steps)
+
+
+def check_epsilons(rule: str, asked: bool) -> None:
+    """Radii are those of the rule `disc`. Raises UsageError where they are asked for with another one."""
+    if asked and rule != DEFAULT_RULE:
+        raise UsageError(f"zone radii belong to the outcome rule disc; {rule} has none. Leave out --epsilons")

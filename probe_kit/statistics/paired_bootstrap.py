@@ -1,0 +1,60 @@
+"""Is a probe better than a control on the same episodes? Tests with a group of items as the unit."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.statistics.label_permutations import p_value
+
+Matrix = NDArray[np.float64]
+
+DRAWS = 999
+
+
+def better_than_reference(correct: NDArray[np.bool_], reference: Matrix, groups: ArrayLike, seed: int) -> Matrix:
+    """Family-wise p (S,) of every site against one control: is its accuracy higher?
+
+    correct: (S, E). reference: (E,) what the control scores in each episode. groups: (E,). If a site is no better,
+    a group is as likely to speak for it as against it: the signs of the groups' differences are drawn anew, the
+    same for all sites, and the largest of them counts.
+    """
+    gain = _group_sums(correct - reference, groups)
+    signs = np.where(np.random.default_rng(seed).random((gain.shape[1], DRAWS)) < 0.5, -1.0, 1.0)
+    return p_value(gain.sum(axis=1), (gain @ signs).max(axis=0, keepdims=True))
+
+
+def better_than_best(
+    correct: NDArray[np.bool_], others: NDArray[np.bool_], groups: ArrayLike, seed: int
+) -> Matrix:
+    """Family-wise p (S,) of every site against the best of another model's: is its accuracy higher?
+
+    correct: (S, E). others: (S', E) on the same episodes. groups: (E,). If the models are alike, a group's scores
+    could as well have come from either: whole groups change places, and both best sites are chosen anew.
+    """
+    here, there = _group_sums(correct, groups), _group_sums(others, groups)
+    kept = (np.random.default_rng(seed).random((here.shape[1], DRAWS)) < 0.5).astype(float)
+    # A model that keeps its own groups and takes the other's elsewhere, site by site.
+    shared = min(len(here), len(there))
+    mixed_here = _mixed(here, there[_matching(len(here), shared)], kept)
+    mixed_there = _mixed(there, here[_matching(len(there), shared)], kept)
+    null = mixed_here.max(axis=0) - mixed_there.max(axis=0)
+    return p_value(here.sum(axis=1) - there.sum(axis=1).max(), null[None, :])
+
+
+def _mixed(own: Matrix, other: Matrix, kept: Matrix) -> Matrix:
+    """(S, draws) sums over groups, of `own` where `kept` and of `other` elsewhere."""
+    mixed: Matrix = own @ kept + other @ (1 - kept)
+    return mixed
+
+
+def _matching(count: int, shared: int) -> NDArray[np.intp]:
+    """Which of the other's sites stands for each of `count`: the one at the same place, or the last."""
+    matching: NDArray[np.intp] = np.minimum(np.arange(count), shared - 1)
+    return matching
+
+
+def _group_sums(values: NDArray[np.bool_] | Matrix, groups: ArrayLike) -> Matrix:
+    """(S, G) sums of (S, E) over the episodes of each group."""
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    sums = np.zeros((len(values), names.size))
+    np.add.at(sums.T, group_of, values.T.astype(np.float64))
+    return sums

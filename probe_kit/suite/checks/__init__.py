@@ -1,0 +1,1 @@
+"""Checks of a whole suite: rules and leakage."""

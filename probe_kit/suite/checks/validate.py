@@ -1,0 +1,100 @@
+"""`validate_suite`: every rule, and on request the leakage gates, in one report."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from probe_kit.suite.categories import category_of
+from probe_kit.suite.checks.leakage import Baseline, run_baselines, save_baselines
+from probe_kit.suite.manifest import read_suite
+from probe_kit.suite.suite import missing_categories
+from probe_kit.suite.validation.findings import Finding, listing, warning
+from probe_kit.suite.validation.rules import DECODING_RULES
+from probe_kit.suite.validation.warnings import WARNING_RULES
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is wrong with a suite and what one should know of it.
+
+    suite: its identity, or its folder if the card cannot be read. baselines: None if they were not run.
+    """
+
+    suite: str
+    missing: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    baselines: tuple[Baseline, ...] | None = None
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that make the suite unusable."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """All other findings."""
+        return tuple(finding for finding in self.findings if finding.severity == "warning")
+
+    @property
+    def ok(self) -> bool:
+        """Whether the suite is valid and, where baselines were run, no answer leaks."""
+        return not self.errors and all(baseline.ok for baseline in self.baselines or ())
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as plain values, every finding included."""
+        baselines = None if self.baselines is None else [asdict(b) | {"ok": b.ok} for b in self.baselines]
+        return {
+            "suite": self.suite,
+            "ok": self.ok,
+            "missing": list(self.missing),
+            "findings": [asdict(finding) for finding in self.findings],
+            "baselines": baselines,
+        }
+
+    def to_text(self) -> str:
+        """For a terminal: at most 20 findings of each rule, then the baselines, then the verdict."""
+        lines = [listing(self.errors), listing(self.warnings)]
+        lines += [f"{category_of(baseline.category).title}: {baseline}" for baseline in self.baselines or ()]
+        if self.missing:
+            lines.append(f"Not in this suite: {', '.join(category_of(slug).title for slug in self.missing)}.")
+        verdict = "valid" if self.ok else "not valid"
+        lines.append(f"{self.suite}: {verdict}, {len(self.errors)} errors, {len(self.warnings)} warnings")
+        return "\n".join(line for line in lines if line)
+
+
+def validate_suite(
+    folder: Path | str,
+    baselines: bool = False,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Report:
+    """A report on the suite in `folder`.
+
+    baselines: also runs the leakage gates and stores them in the suite's `baselines.json`; not on a suite with
+    errors. progress: called with categories done and categories in all. Raises UsageError if there is no suite.
+    """
+    folder = Path(folder).absolute()
+    suite, findings = read_suite(folder)
+    if suite is None:
+        return Report(str(folder), (), tuple(findings))
+    findings += [finding for rule in DECODING_RULES for finding in rule(suite)]
+    undecodable = any(finding.rule in ("E05", "E07") for finding in findings)
+    if not undecodable:
+        findings += [finding for rule in WARNING_RULES for finding in rule(suite)]
+    gates = None
+    if baselines and not any(finding.severity == "error" for finding in findings):
+        gates = run_baselines(suite, seed, progress)
+        save_baselines(suite, gates)
+        findings += _leaks(gates)
+    once = tuple(dict.fromkeys(findings))  # two pictures of two items can give one line twice
+    return Report(suite.identity, tuple(missing_categories(suite.items)), once, gates)
+
+
+def _leaks(baselines: tuple[Baseline, ...]) -> list[Finding]:
+    """W05: a baseline knows more than a coin."""
+    return [
+        warning("W05", category_of(baseline.category).title, str(baseline))
+        for baseline in baselines
+        if not baseline.ok
+    ]

@@ -1,0 +1,1 @@
+"""The source benchmarks, a module each."""

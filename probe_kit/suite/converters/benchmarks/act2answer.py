@@ -1,0 +1,210 @@
+"""Sets in Act2Answer's own format: `pairs.json`, `model_db.json` and a GLB per tile, taken over as they are."""
+
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.hashing import sha256_json
+from probe_kit.suite.card import new_suite
+from probe_kit.suite.categories import CATEGORIES, check_categories
+from probe_kit.suite.converters.benchmarks.act2answer_pairs import (
+    PAIRS,
+    REMEDY,
+    SOURCE,
+    Pair,
+    object_of,
+    read_pairs,
+)
+from probe_kit.suite.converters.benchmarks.glb import YAWS, Tile, read_tile
+from probe_kit.suite.converters.emission import TRANSFER_TYPES, StoredPicture, stored_picture
+from probe_kit.suite.converters.files import field_of, read_json
+from probe_kit.suite.converters.options import Act2AnswerOptions, options_from
+from probe_kit.suite.grouping import with_groups
+from probe_kit.suite.items import Item
+from probe_kit.suite.making import make_item
+from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.suite import Suite
+from probe_kit.suite.wording import VERBATIM, side_words
+
+VERSION = "1.0.0"
+TILES = "model_db.json"
+_URL = "https://github.com/CognitiveAISystems/Act2Answer"
+_SAME_SIZE = 0.001
+"""Metres by which a tile's mesh may differ from the box that its set scores."""
+
+
+class BoundingBoxWarning(UserWarning):
+    """A set scores its tiles as smaller or larger than they are drawn."""
+
+
+def convert_set(
+    root: Path, out: Path, categories: Sequence[str] | None, n: int, given: Mapping[str, Any]
+) -> Suite:
+    """The first `n` questions of the set in `root` as a suite in `out`; sides, words and pictures stay.
+
+    categories: the one that its questions are counted under; None for the one that the folder's name tells.
+    Raises UsageError, SuiteError naming file and record, MissingExtraError without trimesh.
+    """
+    options = options_from(Act2AnswerOptions, dict(given))
+    if options.tile_yaw not in YAWS:
+        raise UsageError(f"tile_yaw is {options.tile_yaw}; expected one of {', '.join(map(str, YAWS))} degrees")
+    if not root.is_dir():
+        raise UsageError(f"{SOURCE}: {root} is no folder. {REMEDY}")
+    category = _category(root, categories)
+    refuse_foreign_folder(out)
+    pairs = read_pairs(root)
+    assets = _Assets(root, options)
+    items = [assets.item(category, pair) for pair in pairs[:n]]
+    assets.compare_sizes()
+    card = {
+        "annotation_files": {name: sha256((root / name).read_bytes()).hexdigest() for name in (PAIRS, TILES)},
+        "source_url": _URL,
+    }
+    settings = asdict(options) | {"items_per_category": n, "source": SOURCE}
+    suite = new_suite(f"a2a-{SOURCE}-{root.resolve().name}", VERSION, with_groups(items), settings, card)
+    stats = {category: {"pool": len(pairs), "emitted": len(items)}, "notes": assets.notes}
+    return save_suite(suite, assets.files, stats, out)
+
+
+def _category(root: Path, asked: Sequence[str] | None) -> str:
+    """The category asked for, or the only one that the folder's name tells."""
+    if asked is not None:
+        if len(asked) != 1:
+            raise UsageError(f"{SOURCE}: a set has one category; {', '.join(asked) or 'none'} given.")
+        return check_categories(asked, list(CATEGORIES))[0]
+    words = set(re.findall(r"[a-z]+", root.resolve().name.lower()))
+    words |= {word.removesuffix("s") for word in words}
+    told = [slug for slug in CATEGORIES if set(slug.split("-")) <= words]
+    if len(told) != 1:
+        raise UsageError(
+            f"{SOURCE}: the folder's name {root.resolve().name!r} tells {' and '.join(told) or 'no category'}; "
+            f"say which one its questions are counted under: --categories with one of {', '.join(CATEGORIES)}"
+        )
+    return told[0]
+
+
+class _Assets:
+    """The tiles of a set, each read once. files: what the suite stores of them. notes: for its statistics."""
+
+    def __init__(self, root: Path, options: Act2AnswerOptions) -> None:
+        self._root, self._options = root, options
+        self._tiles: dict[str, tuple[Tile, StoredPicture]] = {}
+        self.files: dict[str, bytes] = {}
+        self.notes: list[str] = []
+
+    @cached_property
+    def _records(self) -> dict[str, Any]:
+        path = self._root / TILES
+        records = read_json(path, SOURCE, REMEDY)
+        if not isinstance(records, dict):
+            raise SuiteError(
+                f"{SOURCE}: {path} holds a {type(records).__name__}; expected an object by tile name."
+            )
+        return records
+
+    def item(self, category: str, pair: Pair) -> Item:
+        """One question. Raises SuiteError for a tile that is not described, unreadable, or equal to the other."""
+        left, right = (self._stored(name, pair) for name in (pair.left, pair.right))
+        if left.pixels_sha256 == right.pixels_sha256:
+            raise SuiteError(
+                f"{SOURCE}: question {pair.index}: tiles {pair.left!r} and {pair.right!r} show the same picture."
+            )
+        right_side = int(pair.answer == "right")
+        content = {
+            "set": self._root.resolve().name,
+            "index": pair.index,
+            "question": pair.question,
+            "answer": pair.answer,
+            "left": left.pixels_sha256,
+            "right": right.pixels_sha256,
+        }
+        phrase, article = object_of(pair.question)
+        return make_item(
+            SOURCE,
+            category,
+            pair.answer,
+            (left, right),
+            content,
+            transfer_type=TRANSFER_TYPES[category],
+            construction="native_pair",
+            instruction=pair.question,
+            object_phrase=phrase,
+            object_article=article,
+            polarity="none",
+            target_concept=pair.concepts[right_side],
+            distractor_concept=pair.concepts[1 - right_side],
+            pair_id=f"{SOURCE}-{category}-{sha256_json(sorted([left.pixels_sha256, right.pixels_sha256]))[:12]}",
+            rule_id=VERBATIM,
+            curation_status="rules-only",
+            license=self._options.license,
+            attribution=f"tiles of the set {self._root.resolve().name}; no licence is stated with them",
+            redistributable=False,
+            contains_real_face=self._options.contains_real_face or category == "celebrity",
+            source={
+                "benchmark": SOURCE,
+                "version": "unknown",
+                "split": "unknown",
+                "source_id": f"{self._root.resolve().name}#{pair.index}",
+                "url": _URL,
+                "question": pair.question,
+                "left_tile": pair.left,
+                "right_tile": pair.right,
+                "left_original_pixels_sha256": left.original_pixels,
+                "right_original_pixels_sha256": right.original_pixels,
+                "picture_operation": left.operation,
+            },
+            gen={},
+            side_word=bool(side_words(pair.question)),
+        )
+
+    def _stored(self, name: str, pair: Pair) -> StoredPicture:
+        if name not in self._tiles:
+            if name not in self._records:
+                raise SuiteError(
+                    f"{SOURCE}: question {pair.index} of {self._root / PAIRS} names the tile {name!r}, which "
+                    f"{self._root / TILES} does not describe. Correct one of the files."
+                )
+            tile = read_tile(self._root / "shapes" / name / "textured.glb", self._options.tile_yaw)
+            operation = (
+                "texture of the face that looks up, turned as it lies before the viewer, flattened on white"
+            )
+            stored = stored_picture("", tile.picture, operation)
+            # Tile names repeat from set to set; what ties questions together is the picture.
+            stored = stored_picture(f"{SOURCE}/{stored.original_pixels[:16]}", tile.picture, operation)
+            self._tiles[name] = tile, stored
+            self.files[stored.file_name] = stored.png
+        return self._tiles[name][1]
+
+    def compare_sizes(self) -> None:
+        """Warn, and note in the statistics, where the box that is scored is not the tile that is drawn."""
+        differing = list(self._unlike())
+        if differing:
+            name, scored, drawn = differing[0]
+            note = (
+                f"{len(differing)} of {len(self._tiles)} tiles are drawn larger or smaller than the box that is "
+                f"scored: {name} is {drawn:.4f} m wide and scored as {scored:.4f} m. Choose --tile-side for what "
+                "is drawn; outcome rules have their own size"
+            )
+            self.notes.append(note)
+            warnings.warn(f"{SOURCE}: {note}", BoundingBoxWarning, stacklevel=4)
+
+    def _unlike(self) -> Iterator[tuple[str, float, float]]:
+        for name, (tile, _) in self._tiles.items():
+            where = f"tile {name} of {self._root / TILES}"
+            box = field_of(self._records[name], "bbox", dict, SOURCE, where)
+            low, high = (field_of(box, end, list, SOURCE, where) for end in ("min", "max"))
+            scale = (self._records[name].get("scales") or [1])[0]
+            try:
+                scored = [float(upper) * float(scale) - float(lower) * float(scale)
+                          for lower, upper in zip(low, high, strict=True)]  # fmt: skip
+            except (TypeError, ValueError) as problem:
+                raise SuiteError(f"{SOURCE}: {where}: bbox or scales hold no numbers ({problem}).") from problem
+            drawn = [extent * float(scale) for extent in tile.size]
+            if any(abs(one - other) > _SAME_SIZE for one, other in zip(scored, drawn, strict=False)):
+                yield name, scored[0], drawn[0]

@@ -1,0 +1,1 @@
+"""Suites of a user's own questions and pictures."""

@@ -1,0 +1,158 @@
+"""Suites of one's own questions in a table: instruction, correct picture, wrong picture, group.
+
+instruction,correct,wrong,group,category
+Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
+"""
+
+import csv
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import sha256_json
+from probe_kit.suite.card import new_suite
+from probe_kit.suite.categories import check_slug
+from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, refuse_broken, shown, statistics_of
+from probe_kit.suite.grouping import with_groups
+from probe_kit.suite.items import Item, Side
+from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.suite import Suite
+
+COLUMNS = ("instruction", "correct", "wrong")
+FURTHER = ("group", "category", "object", "other_object")
+DEFAULT_CATEGORY = "questions"
+_RULE = "own-table"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    line: its number in the file, from 1. instruction: the imperative. correct, wrong: files, beside the table.
+    group: rows of one group are never in training and test at once; empty where pictures alone decide. object:
+    what the correct picture is called, part of the instruction. other_object: what the wrong one is called; empty
+    for its file's name.
+    """
+
+    line: int
+    instruction: str
+    correct: Path
+    wrong: Path
+    group: str
+    category: str
+    object: str
+    other_object: str
+
+
+def suite_from_csv(
+    table: Path | str,
+    folder: Path | str,
+    *,
+    name: str | None = None,
+    version: str = "1.0.0",
+    category: str = DEFAULT_CATEGORY,
+    terms: Terms,
+) -> Suite:
+    """The suite in `folder` that asks what the rows of `table` say; the answer lies left and right in turn.
+
+    Columns `instruction`, `correct` and `wrong` are needed; `group`, `category` (otherwise `category`), `object`
+    (otherwise what follows "on the" in the instruction) and `other_object` may be there. name: of the suite; None
+    for the table's. Two rows over the same two pictures that ask the other way round are twins.
+    Raises UsageError naming the line for a table that cannot be used, and SuiteError for a picture that cannot be
+    read, questions that break a rule, or a `folder` that holds anything else. Nothing is written then.
+    """
+    table, folder = Path(table), Path(folder)
+    rows = list(read_rows(table, category))
+    refuse_foreign_folder(folder)
+    name = name or table.stem
+    pictures: dict[str, bytes] = {}
+    drawn: list[tuple[Row, Shown, Shown]] = []
+    for row in rows:
+        correct, wrong = shown(row.correct, row.object), shown(row.wrong, row.other_object)
+        pictures |= {correct.file_name: correct.png, wrong.file_name: wrong.png}
+        drawn.append((row, correct, wrong))
+    items = list(_items(name, version, drawn, terms))
+    groups = {item.item_id: row.group for item, row in zip(items, rows, strict=True) if row.group}
+    suite = new_suite(name, version, with_groups(items, groups), {"rows": len(rows)})
+    refuse_broken(suite)
+    return save_suite(suite, pictures, statistics_of(suite), folder)
+
+
+def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> Iterator[Row]:
+    """The lines of the table. Raises UsageError for whatever cannot be a question, naming the line."""
+    try:
+        text = table.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{table} cannot be read as a table: {error}. Give a CSV file in UTF-8") from error
+    reader = csv.DictReader(text.splitlines())
+    columns = reader.fieldnames or []
+    missing = [column for column in COLUMNS if column not in columns]
+    unknown = [column for column in columns if column not in (*COLUMNS, *FURTHER)]
+    if missing or unknown:
+        raise UsageError(
+            f"{table} has the columns {', '.join(columns) or 'none'}; expected {', '.join(COLUMNS)} and, where "
+            f"wanted, {', '.join(FURTHER)}"
+        )
+    seen: dict[tuple[str, Path, Path], int] = {}
+    for record in reader:
+        row = _row(record, reader.line_num, table, category)
+        first = seen.setdefault((row.instruction, row.correct, row.wrong), row.line)
+        if first != row.line:
+            raise UsageError(f"{table}, lines {first} and {row.line} are the same question. Leave one out")
+        yield row
+    if not seen:
+        raise UsageError(f"{table} has no line below its heading; expected one per question")
+
+
+def _row(record: Mapping[str | None, str | None], line: int, table: Path, category: str) -> Row:
+    where = f"{table}, line {line}"
+    if None in record:
+        raise UsageError(f'{where} has more fields than the heading; put a text with commas between "quotes"')
+    cells = {str(column): (value or "").strip() for column, value in record.items()}
+    empty = [column for column in COLUMNS if not cells[column]]
+    if empty:
+        raise UsageError(f"{where} has no {' and no '.join(empty)}; every question needs {', '.join(COLUMNS)}")
+    asked = cells.get("object") or _object_of(cells["instruction"])
+    if asked is None or asked not in cells["instruction"]:
+        raise UsageError(
+            f"{where}: what is asked for cannot be told from {cells['instruction']!r}. Write it as "
+            "'Put the cube on the …', or name the words in a column `object`"
+        )
+    correct, wrong = (table.parent / cells[column] for column in ("correct", "wrong"))
+    other = cells.get("other_object") or f"what {wrong.stem} shows"
+    slug = check_slug(cells.get("category") or category)
+    return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, asked, other)
+
+
+def _object_of(instruction: str) -> str | None:
+    """The words behind the first "on" or "onto", without their article."""
+    words = instruction.split()
+    for number, word in enumerate(words):
+        if word.lower() in ("on", "onto"):
+            rest = words[number + 1 :]
+            return " ".join(rest[1:] if rest and rest[0].lower() in ("the", "a", "an") else rest) or None
+    return None
+
+
+def _items(name: str, version: str, drawn: list[tuple[Row, Shown, Shown]], terms: Terms) -> Iterator[Item]:
+    asked = Counter((row.category, frozenset((one.pixels, other.pixels))) for row, one, other in drawn)
+    orders = {(row.category, one.pixels, other.pixels) for row, one, other in drawn}
+    turns: dict[str, Iterator[int]] = {}
+    for row, correct, wrong in drawn:
+        twins = (
+            asked[row.category, frozenset((correct.pixels, wrong.pixels))] == 2
+            and (row.category, wrong.pixels, correct.pixels) in orders
+        )
+        content = sorted((correct.pixels, wrong.pixels)) + ([] if twins else [row.instruction])
+        pair_id = f"{name}-{row.category}-{sha256_json(content)[:12]}"
+        side: Side = "right" if next(turns.setdefault(row.category, count())) % 2 else "left"
+        if twins:  # the pictures lie where they lay when they were asked the other way round
+            side = "left" if correct.pixels < wrong.pixels else "right"
+        both = (correct, wrong) if side == "left" else (wrong, correct)
+        article = "the" if f"the {row.object}" in row.instruction else "none"
+        origin = Origin(name, version, row.category, pair_id, _RULE)
+        item_id = f"{pair_id}-{sha256_json([row.instruction, correct.pixels])[:8]}"
+        yield own_item(item_id, origin, row.instruction, article, both, side, terms)

@@ -1,0 +1,1 @@
+"""The categories of the embedded suite, a module each."""

@@ -1,0 +1,46 @@
+"""Shape: "triangle" against another outline that cannot be mistaken for it."""
+
+from itertools import combinations
+
+import numpy as np
+
+from probe_kit.suite.generators.drawing.figure import Figure, colored_outline, random_figure
+from probe_kit.suite.generators.drawing.outlines import OUTLINES
+from probe_kit.suite.generators.drawing.palette import COLORS
+from probe_kit.suite.generators.generator import Concept, Generator
+
+_HOLLOW_SHARE = 0.3
+_CONFUSABLE = (
+    {"square", "rectangle", "diamond", "parallelogram"},
+    {"trapezoid", "rectangle", "parallelogram"},
+    {"circle", "oval"},
+    {"pentagon", "hexagon"},
+)
+
+# "right triangle" can be drawn but not asked for: its name holds a side word.
+_NAMES = [name for name in OUTLINES if name != "right triangle"]
+
+
+def _distinct(one: Concept, other: Concept) -> bool:
+    return not any({one.name, other.name} <= family for family in _CONFUSABLE)
+
+
+def _figure(concept: Concept, rng: np.random.Generator) -> Figure:
+    color = str(rng.choice(list(COLORS)))
+    return random_figure(color, concept.name, "hollow" if rng.random() < _HOLLOW_SHARE else "plain", rng)
+
+
+def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Figure, Figure]:
+    return _figure(left, rng), _figure(right, rng)
+
+
+SHAPE = Generator(
+    category="shape",
+    pairs=tuple(
+        (one, other)
+        for one, other in combinations([Concept(name, name) for name in _NAMES], 2)
+        if _distinct(one, other)
+    ),
+    tiles=_tiles,
+    named=colored_outline,
+)

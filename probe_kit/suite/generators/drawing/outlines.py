@@ -1,0 +1,64 @@
+"""Fifteen outlines as polygons of equal area, so that ink says nothing about which one it is."""
+
+import numpy as np
+
+from probe_kit.suite.generators.drawing.canvas import Points, ellipse, polygon
+
+_AREA = 0.95**2  # in drawing units; the most that keeps every placement of every outline on its tile
+
+
+def _regular(corners: int) -> Points:
+    angles = np.linspace(0, 2 * np.pi, corners, endpoint=False) - np.pi / 2
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _star() -> Points:
+    star = _regular(10)
+    star[1::2] *= 0.48
+    return star
+
+
+def _heart() -> Points:
+    t = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    x = 16 * np.sin(t) ** 3
+    y = 13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t)
+    return np.stack([x, -y], axis=1)
+
+
+def _cross(arm: float = 0.38) -> Points:
+    quarter = polygon((arm, arm), (1, arm), (1, -arm))
+    turn = polygon((0, -1), (1, 0))
+    corners = [quarter]
+    for _ in range(3):
+        corners.append(corners[-1] @ turn)
+    return np.vstack(corners)
+
+
+def _matched(points: Points) -> Points:
+    """The same outline with the shared area and its bounding box centred on the origin."""
+    x, y = points.T
+    area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+    centred = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    matched: Points = centred * np.sqrt(_AREA / area)
+    matched.setflags(write=False)
+    return matched
+
+
+_DRAWN: dict[str, Points] = {
+    "circle": ellipse(0, 0, 1, 1)[:-1],
+    "oval": ellipse(0, 0, 1.6, 1)[:-1],
+    "triangle": _regular(3),
+    "right triangle": polygon((-1, 1), (1, 1), (-1, -0.9)),
+    "square": polygon((-1, -1), (1, -1), (1, 1), (-1, 1)),
+    "rectangle": polygon((-1.75, -1), (1.75, -1), (1.75, 1), (-1.75, 1)),
+    "trapezoid": polygon((-0.5, -0.65), (0.5, -0.65), (1.1, 0.65), (-1.1, 0.65)),
+    "parallelogram": polygon((-0.6, -0.65), (1.3, -0.65), (0.6, 0.65), (-1.3, 0.65)),
+    "diamond": polygon((0, -1.45), (1, 0), (0, 1.45), (-1, 0)),
+    "pentagon": _regular(5),
+    "hexagon": _regular(6),
+    "star": _star(),
+    "heart": _heart(),
+    "cross": _cross(),
+    "arrow": polygon((-1.1, -0.36), (0.1, -0.36), (0.1, -0.9), (1.1, 0), (0.1, 0.9), (0.1, 0.36), (-1.1, 0.36)),
+}
+OUTLINES: dict[str, Points] = {name: _matched(points) for name, points in _DRAWN.items()}

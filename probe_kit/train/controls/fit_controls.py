@@ -1,0 +1,171 @@
+"""Fitting the controls of probe results: what can be wrong with them is found before anything is fitted."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.label_permutations import site_p
+from probe_kit.statistics.paired_bootstrap import better_than_best
+from probe_kit.train.controls.baselines import Baseline, baseline_features, needed
+from probe_kit.train.controls.random_features import BindingInputs, binding_scores
+from probe_kit.train.crossval.category_problem import POOLED, category_problem
+from probe_kit.train.crossval.metrics import chance_level, correctness
+from probe_kit.train.data.labels import target_labels
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, Excess, TwinScore
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.settings import ProbeSettings
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Baselines that are still to be probed: features (E, D) by name, and what `binding` sees if it is one."""
+
+    features: Mapping[Baseline, NDArray[np.float32]]
+    binding: BindingInputs | None
+
+
+def prepare_baselines(
+    run: RunReader, names: Sequence[Baseline], suite: Path | None, stored: ProbeResults | None
+) -> Prepared:
+    """Features of the baselines `names` that `stored` does not have yet.
+
+    Before anything is probed, so that what is wrong with them is said first. Raises what `baseline_features`
+    raises.
+    """
+    missing = [name for name in names if stored is None or not _has(stored, name)]
+    features = {name: baseline_features(run, name, suite) for name in missing if name != BINDING}
+    binding = BindingInputs.of(run, needed(suite, BINDING)) if BINDING in missing else None
+    return Prepared(features, binding)
+
+
+def add_baselines(results: ProbeResults, run: RunReader, prepared: Prepared) -> ProbeResults:
+    """`results` with these baselines for every category; all sites are held against binding if it is one."""
+    controls = results.controls
+    for name, features in prepared.features.items():
+        controls = controls.with_baselines(_baseline_scores(results, run, name, features))
+    if prepared.binding is not None:
+        scores, excess = binding_scores(results, run, prepared.binding)
+        controls = controls.with_baselines(scores).with_excess(excess)
+    return replace(results, controls=controls)
+
+
+def _has(results: ProbeResults, name: str) -> bool:
+    stored = {score.category for score in results.controls.baselines if score.name == name}
+    return stored == set(results.settings.categories)
+
+
+def _baseline_scores(
+    results: ProbeResults, run: RunReader, name: Baseline, features: NDArray[np.float32]
+) -> Iterator[BaselineScore]:
+    settings, samples = results.settings, Samples.pooled(features)
+    for category in settings.categories:
+        problem = category_problem(run.episodes, category, settings)
+        probe = problem.probe(samples)
+        right = correctness(probe.decisions, problem.labels)
+        low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, settings.suite))
+        p = float(site_p(right.mean(keepdims=True), probe.null[None, :])[0])
+        yield BaselineScore(
+            name=name,
+            category=category,
+            accuracy=float(right.mean()),
+            ci=(float(low[0]), float(high[0])),
+            p=None if np.isnan(p) else p,
+            chance=chance_level(problem.labels),
+            n=problem.labels.size,
+        )
+
+
+def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
+    """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
+    if run.location.address == twin.location.address:
+        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
+    here, there = (_labels_by_episode(one, settings) for one in (run, twin))
+    if here != there:
+        raise UsageError(
+            f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
+            "are not the same. Extract both from the same suite."
+        )
+    if run.settings_sha256 == twin.settings_sha256:
+        raise UsageError(
+            f"{twin.location} is a copy of {run.location}, which cannot be its own twin; give other weights"
+        )
+
+
+def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[str, str, int]]:
+    """Id, instruction and label of every episode that is probed: what two runs must have in common."""
+    labels = target_labels(run.episodes, settings.target, settings.seed)
+    chosen = run.episodes["category"].isin(settings.categories) | (POOLED in settings.categories)
+    names, asked = (
+        run.episodes["episode_id"].astype(str),
+        run.episodes.get("instruction", run.episodes["episode_id"]),
+    )
+    return [
+        (name, str(instruction), label)
+        for name, instruction, label, kept in zip(names, asked, labels.tolist(), chosen, strict=True)
+        if kept and label >= 0
+    ]
+
+
+def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
+    """`results` held against the same probes of a twin. Raises UsageError if the twin saw other episodes."""
+    scores = [
+        score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
+    ]
+    excess = [one for place, curve in results.curves.items() for one in _twin_excess(results, place, curve, twin)]
+    return replace(results, controls=results.controls.with_twin(scores).with_excess(excess))
+
+
+def _twin_excess(
+    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
+) -> Iterator[Excess]:
+    """Every site of a stream against the best of the twin's."""
+    other = twin.curves[place]
+    for stream in dict.fromkeys(site.stream for site in curve.sites):
+        if not other.stream(stream).size:
+            continue
+        rows, others = curve.stream(stream), other.correct[other.stream(stream)]
+        seed = derive_seed(TWIN, results.settings.seed, *place, stream)
+        p = better_than_best(curve.correct[rows], others, curve.groups, seed)
+        best = float(others.mean(axis=1).max())
+        for row, of_site in zip(rows, p, strict=True):
+            yield Excess(TWIN, *place, str(curve.sites[row]), best, float(of_site))
+
+
+def _twin_scores(
+    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
+) -> Iterator[TwinScore]:
+    other = twin.curves[place]
+    if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
+        raise UsageError(
+            f"category {place[0]!r}: the twin {twin.settings.model!r} has {other.labels.size} episodes, this run "
+            f"{curve.labels.size}, and they are not the same. Extract both from the same suite."
+        )
+    pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
+    streams = [name for name in dict.fromkeys(site.stream for site in curve.sites) if other.stream(name).size]
+    pairs += [(curve.best(stream), other.best(stream), True) for stream in streams]
+    here, there = (
+        c.correct[[pair[side] for pair in pairs]].T.astype(float) for side, c in enumerate((curve, other))
+    )
+    seed = units_seed(curve.groups, results.settings.suite)
+    low, high = group_bootstrap(here - there, curve.groups, seed, bounds=GAINS)
+    for column, (row, twin_row, peak) in enumerate(pairs):
+        yield TwinScore(
+            *place,
+            site=str(curve.sites[row]),
+            twin_site=str(other.sites[twin_row]),
+            peak=peak,
+            accuracy=float(here[:, column].mean()),
+            twin_accuracy=float(there[:, column].mean()),
+            difference=float((here - there)[:, column].mean()),
+            ci=(float(low[column]), float(high[column])),
+            twin=twin.settings.model + (" (random weights)" if twin.settings.random_weights else ""),
+        )

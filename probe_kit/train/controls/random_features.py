@@ -1,0 +1,117 @@
+"""The control `binding`: what an untrained conjunction of pictures and words gives for free.
+
+Concepts recur in other groups of pictures, so a probe can itself learn which pixels answer which word, as soon as
+its features hold products of both. Any random nonlinear layer does. The control is such a layer, as wide as the
+site it is compared with, on the tiles and the words alone; a model that knows more than that must be better.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.statistics.paired_bootstrap import better_than_reference
+from probe_kit.train.controls.baselines import Features, suite_of, tile_pixels, word_counts
+from probe_kit.train.crossval.category_problem import CategoryProblem, category_problem
+from probe_kit.train.crossval.metrics import chance_level, correctness
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.results.control_scores import BINDING, BaselineScore, Excess
+from probe_kit.train.results.probe_results import ProbeResults
+
+SIDE = 12
+"""Pixels along a tile: enough for colours and coarse shapes."""
+LAYERS = 5
+"""Random layers that are tried; the most accurate one of a category counts, which errs towards silence."""
+
+
+@dataclass(frozen=True)
+class BindingInputs:
+    """What the random layers see, one row per episode of the run: (E, P) pixels and (E, W) word counts."""
+
+    pixels: Features
+    words: Features
+
+    @classmethod
+    def of(cls, run: RunReader, suite: Path) -> "BindingInputs":
+        """From the run's suite. Raises SuiteError for another one, UsageError without instructions."""
+        return cls(tile_pixels(run.episodes, suite_of(run, suite), SIDE), word_counts(run))
+
+    def layer(self, rows: NDArray[np.intp], width: int, seed: int) -> Features:
+        """(N, width) outputs of a random tanh layer, to which pictures and words give equal shares."""
+        generator = np.random.default_rng(seed)
+        parts = (_standardised(part[rows]) for part in (self.pixels, self.words))
+        mixed = [part @ generator.standard_normal((part.shape[1], width)) / part.shape[1] ** 0.5 for part in parts]
+        outputs: Features = np.tanh(mixed[0] + mixed[1]).astype(np.float32)
+        return outputs
+
+
+def binding_scores(
+    results: ProbeResults, run: RunReader, inputs: BindingInputs
+) -> tuple[list[BaselineScore], list[Excess]]:
+    """The control's accuracy per category, as wide as the backbone, and every site held against it.
+
+    A site is held against layers of its own stream's width, on the same folds.
+    """
+    scores, found = [], []
+    for category in results.settings.categories:
+        problem = category_problem(run.episodes, category, results.settings)
+        references = {
+            name: _reference(inputs, problem, stream.width, results.settings.seed)
+            for name, stream in run.streams.items()
+        }
+        first = references.get("backbone", next(iter(references.values())))
+        scores.append(_score(first, problem, category, results.settings.suite))
+        found += list(_held_against(results, category, references))
+    return scores, found
+
+
+def _reference(inputs: BindingInputs, problem: CategoryProblem, width: int, seed: int) -> NDArray[np.bool_]:
+    """(E,) where the best of the random layers is right."""
+    nothing = np.empty((problem.labels.size, 0), bool)
+    layers = (inputs.layer(problem.rows, width, derive_seed("binding", seed, number)) for number in range(LAYERS))
+    right = [
+        correctness(problem.fit(Samples.pooled(layer), nothing).decisions, problem.labels) for layer in layers
+    ]
+    return max(right, key=lambda one: int(one.sum()))
+
+
+def _score(right: NDArray[np.bool_], problem: CategoryProblem, category: str, suite: str) -> BaselineScore:
+    low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, suite))
+    return BaselineScore(
+        name=BINDING,
+        category=category,
+        accuracy=float(right.mean()),
+        ci=(float(low[0]), float(high[0])),
+        p=None,
+        chance=chance_level(problem.labels),
+        n=right.size,
+    )
+
+
+def _held_against(
+    results: ProbeResults, category: str, references: dict[str, NDArray[np.bool_]]
+) -> Iterator[Excess]:
+    for (name, view), curve in results.curves.items():
+        if name != category:
+            continue
+        for stream in dict.fromkeys(site.stream for site in curve.sites):
+            rows, reference = curve.stream(stream), references[stream]
+            seed = derive_seed(BINDING, results.settings.seed, category, view, stream)
+            p = better_than_reference(curve.correct[rows], reference.astype(float), curve.groups, seed)
+            for row, of_site in zip(rows, p, strict=True):
+                yield Excess(
+                    BINDING, category, view, str(curve.sites[row]), float(reference.mean()), float(of_site)
+                )
+
+
+def _standardised(columns: Features) -> NDArray[np.float64]:
+    """Columns that vary, with mean 0 and deviation 1."""
+    values = columns.astype(np.float64)
+    spread = values.std(axis=0)
+    centred: NDArray[np.float64] = (values - values.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    return centred

@@ -1,0 +1,1 @@
+"""Cross-validated probes of one site and category."""

@@ -1,0 +1,141 @@
+"""The probing problem of a category: which episodes, which labels, which folds, which relabellings."""
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.folds import fold_units
+from probe_kit.statistics.label_permutations import exchange_groups, flip_groups, smallest_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.crossval.metrics import chance_level
+from probe_kit.train.crossval.site_probe import NestedFold, SiteProbe, nested_folds, probe_site
+from probe_kit.train.data.labels import target_labels
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.settings import ProbeSettings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+POOLED = "all"
+"""Category that holds the episodes of all categories."""
+
+MOST_OF_ONE_SIDE = 0.75
+"""Share of episodes with the same correct side above which a category is refused; it is 0.5 if none is missing."""
+
+
+@dataclass(frozen=True)
+class CategoryProblem:
+    """What all sites of a category share: which episodes, their labels, folds and relabellings.
+
+    rows: (E,) positions in the run's episode table. labels: (E,). relabellings: (E, P). token_permutations: how
+    many of them are fitted where every token is a sample.
+    """
+
+    rows: NDArray[np.intp]
+    labels: NDArray[np.bool_]
+    items: NDArray[np.str_]
+    groups: NDArray[np.str_]
+    episodes: NDArray[np.str_]
+    folds: list[NestedFold]
+    relabellings: NDArray[np.bool_]
+    token_permutations: int
+
+    def probe(self, samples: Samples) -> SiteProbe:
+        """Probe one site; `samples` are those of all the run's episodes."""
+        drawn = self.relabellings if samples.pools else self.relabellings[:, : self.token_permutations]
+        return self.fit(samples.of(self.rows), drawn)
+
+    def fit(self, samples: Samples, relabellings: NDArray[np.bool_]) -> SiteProbe:
+        """Probe the samples of this category's episodes, and again for every column of (E, P) relabellings."""
+        return probe_site(samples, self.labels, relabellings, self.folds)
+
+
+def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:
+    """The probing problem of one category, or of all episodes for `POOLED`.
+
+    Raises TooFewGroupsError, UnbalancedEpisodesError and, for concept folds without concepts, UsageError.
+    """
+    defined = target_labels(episodes, settings.target, settings.seed)
+    chosen = (episodes["category"] == category).to_numpy() | (category == POOLED)
+    if settings.incomplete == "drop":
+        chosen &= _complete(episodes)
+    rows = np.flatnonzero(chosen & (defined >= 0))
+    table, labels = episodes.iloc[rows], defined[rows] == 1
+    groups = fold_units(table, settings.folds)
+    if settings.target != "chosen":
+        _check_balance(labels, category)
+    try:
+        folds = nested_folds(labels, groups, derive_seed("folds", settings.seed, category))
+    except TooFewGroupsError as error:
+        raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
+    relabellings = _relabel(table, labels, groups, category, settings, folds)
+    _check_power(relabellings.shape[1], category, settings)
+    return CategoryProblem(
+        rows=rows,
+        labels=labels,
+        items=table["item_id"].to_numpy(dtype=str),
+        groups=groups,
+        episodes=table["episode_id"].to_numpy(dtype=str),
+        folds=folds,
+        relabellings=relabellings,
+        token_permutations=settings.token_permutations,
+    )
+
+
+def _complete(episodes: "pd.DataFrame") -> NDArray[np.bool_]:
+    """(E,) whether all layouts that the run has are there of an episode's item."""
+    layouts = episodes.groupby("item_id")["layout"].transform("nunique")
+    complete: NDArray[np.bool_] = (layouts == episodes["layout"].nunique()).to_numpy()
+    return complete
+
+
+def _check_balance(labels: NDArray[np.bool_], category: str) -> None:
+    """Warn of sides that are not equally often correct; raise UnbalancedEpisodesError if one nearly always is."""
+    share = chance_level(labels) if labels.size else 0.5
+    if share == 0.5:
+        return
+    seen = (
+        f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
+        "of every item. Episodes are missing from the run."
+    )
+    if share > MOST_OF_ONE_SIDE:
+        raise UnbalancedEpisodesError(
+            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. Extract the missing episodes again, or "
+            "leave out the other layout of their items (--incomplete drop, incomplete='drop')."
+        )
+    warnings.warn(f"{seen} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
+
+
+def _check_power(relabellings: int, category: str, settings: ProbeSettings) -> None:
+    """Warn where the groups allow no result to be significant."""
+    if relabellings < settings.permutations and (least := smallest_p(relabellings)) >= SIGNIFICANCE:
+        warnings.warn(
+            f"category {category!r}: its groups allow {relabellings} relabellings, the smallest possible p is "
+            f"{least:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
+            stacklevel=4,
+        )
+
+
+def _relabel(
+    table: "pd.DataFrame",
+    labels: NDArray[np.bool_],
+    groups: NDArray[np.str_],
+    category: str,
+    settings: ProbeSettings,
+    folds: list[NestedFold],
+) -> NDArray[np.bool_]:
+    """(E, P) relabellings, without those that leave a training fold with a single class: they have no probe."""
+    seed = derive_seed("relabelling", settings.seed, category)
+    count = max(settings.permutations, settings.token_permutations)
+    if settings.target == "chosen":
+        drawn = exchange_groups(labels, groups, table["item_id"], table["layout"], count, seed)
+    else:
+        drawn = flip_groups(labels, groups, count, seed)
+    shares = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
+    return drawn[:, ((shares > 0) & (shares < 1)).all(axis=0)]

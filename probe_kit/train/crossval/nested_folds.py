@@ -1,0 +1,72 @@
+"""Nested, grouped cross-validation: the folds, the grid of C, and what an outer fold's probes are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.train.solver.backend import Array, to_numpy
+from probe_kit.train.solver.projection import Coordinates
+
+Matrix = NDArray[np.float64]
+
+STRENGTHS: Matrix = np.array([1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
+OUTER_FOLDS = 5
+INNER_FOLDS = 4
+
+
+@dataclass(frozen=True)
+class NestedFold:
+    """An outer fold, and the inner folds that divide its training side to choose C."""
+
+    outer: Fold
+    inner: list[Fold]
+
+
+def nested_folds(labels: NDArray[np.bool_], groups: ArrayLike, seed: int) -> list[NestedFold]:
+    """Outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
+
+    labels, groups: (E,). Raises TooFewGroupsError.
+    """
+    group_of = np.asarray(groups)
+    return [
+        NestedFold(
+            outer,
+            [
+                Fold(outer.train[inner.train], outer.train[inner.test])
+                for inner in grouped_folds(labels[outer.train], group_of[outer.train], INNER_FOLDS, seed)
+            ],
+        )
+        for outer in grouped_folds(labels, groups, OUTER_FOLDS, seed)
+    ]
+
+
+@dataclass(frozen=True)
+class FittedFold:
+    """The probes of one outer fold.
+
+    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column.
+    weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
+    training samples along them.
+    """
+
+    decisions: Matrix
+    strengths: Matrix
+    weights: Matrix
+    intercept: float
+    spread: float
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, weights: Array, decisions: Matrix, strengths: Matrix) -> "FittedFold":
+        """With the first column of `weights` (R, K), found in `coordinates`."""
+        raw, intercept = coordinates.raw_weights(weights[:, 0])
+        along = float(np.std(to_numpy(coordinates.train @ weights[:, 0])))
+        length = float(np.linalg.norm(raw))
+        return cls(decisions, strengths, raw, intercept, along / length if length else 0.0)
+
+
+def least_loss(loss: Matrix) -> NDArray[np.intp]:
+    """(...) position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
+    chosen: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
+    return chosen

@@ -1,0 +1,1 @@
+"""What probes are fitted on: samples and labels of a run."""

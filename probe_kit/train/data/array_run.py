@@ -1,0 +1,122 @@
+"""A run made of arrays you already have."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.sites import Site, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.extract.store.format.rows import TokenBlock
+
+
+@dataclass(frozen=True)
+class ArrayRun:
+    """A `RunReader` over features in memory, for activations that were not recorded by probe_kit.
+
+    path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
+    features: (E, D) per site and view, rows in the order of `episodes`. token_features: per site and role (None
+    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too.
+    Raises UsageError if an array has another number of rows or dimensions.
+    """
+
+    path: Path
+    model: str
+    suite: str
+    episodes: "pd.DataFrame"
+    features: Mapping[tuple[Site, str], NDArray[np.floating]]
+    random_weights: bool = False
+    weights_sha256: str | None = None
+    token_features: Mapping[tuple[Site, str | None], tuple[NDArray[np.floating], NDArray[np.bool_]]] = field(
+        default_factory=dict
+    )
+
+    def __post_init__(self) -> None:
+        for (site, view), array in self.features.items():
+            if array.ndim != 2 or len(array) != len(self.episodes):
+                raise UsageError(
+                    f"features of {site}, view {view!r}, have shape {array.shape}; "
+                    f"expected ({len(self.episodes)}, D), one row per episode"
+                )
+
+    @property
+    def label(self) -> str:
+        """The model's name."""
+        return self.model
+
+    @property
+    def location(self) -> Location:
+        """The folder `path`."""
+        return locate(self.path)
+
+    @cached_property
+    def settings_sha256(self) -> str:
+        """Hash of all features: other arrays are another run."""
+        pooled = [[str(site), view, _sha256(array)] for (site, view), array in self.features.items()]
+        tokens = [
+            [str(site), f"tokens:{role}", _sha256(values), _sha256(mask)]
+            for (site, role), (values, mask) in self.token_features.items()
+        ]
+        return sha256_json(sorted(pooled) + sorted(tokens))
+
+    @property
+    def streams(self) -> Mapping[str, Stream]:
+        """Streams by name, as far as their sites are there."""
+        return {name: self._stream(name) for name in dict.fromkeys(site.stream for site, _ in self.features)}
+
+    def views(self, stream: str) -> Sequence[str]:
+        """Views of a stream."""
+        return list(dict.fromkeys(view for site, view in self.features if site.stream == stream))
+
+    def sites(self, stream: str) -> Sequence[Site]:
+        """Sites of a stream, in the order of `features`."""
+        return list(dict.fromkeys(site for site, _ in self.features if site.stream == stream))
+
+    def column(self, site: Site, view: str) -> NDArray[np.float32]:
+        """(E, D) features of one site. Raises UnknownSiteError."""
+        if (site, view) not in self.features:
+            raise UnknownSiteError(f"there are no features of {site}, view {view!r}")
+        return self.features[site, view].astype(np.float32)
+
+    def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(E, T, D) values and (E, T) mask of one site. Raises UnknownSiteError."""
+        if (site, role) not in self.token_features:
+            raise UnknownSiteError(f"there are no tokens of {site}, role {role!r}")
+        values, mask = self.token_features[site, role]
+        return values.astype(np.float32), mask
+
+    def token_mask(self, site: Site, role: str | None = None) -> NDArray[np.bool_]:
+        """(E, T) mask of one site. Raises UnknownSiteError."""
+        return self.tokens(site, role)[1]
+
+    def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
+        """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
+        from probe_kit.extract.store.format.rows import TokenBlock
+
+        yield TokenBlock(0, *self.tokens(site, role))
+
+    def _stream(self, name: str) -> Stream:
+        found = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
+        steps = {site.iteration for site, _ in found} - {None}
+        return Stream(
+            name,
+            layers=1 + max(site.layer for site, _ in found),
+            width=found[0][1].shape[1],
+            iterations=len(steps) or None,
+        )
+
+
+def _sha256(array: NDArray[np.generic]) -> str:
+    return sha256(np.ascontiguousarray(array).tobytes()).hexdigest()

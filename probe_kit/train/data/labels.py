@@ -1,0 +1,47 @@
+"""What a probe is asked to read: the correct side, the chosen side, or a shuffled control."""
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.data.run_reader import refuse_several_wordings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Target = Literal["correct", "chosen", "shuffled"]
+Incomplete = Literal["keep", "drop"]
+INCOMPLETE: dict[str, str] = {
+    "keep": "items of which a layout is missing take part with the other",
+    "drop": "they do not: the classes are balanced again",
+}
+TARGETS: dict[str, str] = {
+    "correct": "side of the correct picture",
+    "chosen": "side on which the cube was placed; episodes outside both zones are left out",
+    "shuffled": "control: side of the correct picture, flipped for a random half of the items",
+}
+
+
+def target_labels(episodes: "pd.DataFrame", target: Target, seed: int) -> NDArray[np.int8]:
+    """Label of every episode, (E,): 1 left, 0 right, −1 where the target is not defined.
+
+    Raises UsageError for an unknown target, and for episodes of several wordings.
+    """
+    refuse_several_wordings(episodes)
+    if target == "chosen":
+        return _left_is_one(episodes["side_placed"])
+    labels = _left_is_one(episodes["side_correct"])
+    if target == "correct":
+        return labels
+    if target == "shuffled":
+        flipped = flip_items(labels == 1, episodes["item_id"], 1, derive_seed("shuffled target", seed))
+        return flipped[:, 0].astype(np.int8)
+    raise UsageError(f"unknown target {target!r}; expected one of {', '.join(TARGETS)}")
+
+
+def _left_is_one(sides: "pd.Series[str]") -> NDArray[np.int8]:
+    return np.select([sides == "left", sides == "right"], [np.int8(1), np.int8(0)], np.int8(-1))

@@ -1,0 +1,131 @@
+"""What a probe learns from: one sample per episode (pooled views), or one per token."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.train.data.run_reader import RunReader, Tokens
+from probe_kit.train.solver.backend import Array, to_device, to_numpy
+from probe_kit.train.solver.row_subset import ChosenRows, Features
+
+TOKENS = "tokens"
+"""View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Features of M samples that belong to E episodes.
+
+    features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are chosen.
+    counts: (E,) samples per episode.
+    means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the samples.
+    """
+
+    features: Features
+    counts: NDArray[np.intp]
+    means: Array
+
+    @classmethod
+    def pooled(cls, column: NDArray[np.floating]) -> "Samples":
+        """One sample per episode, from (E, D)."""
+        return cls(column, np.ones(len(column), np.intp), column)
+
+    @classmethod
+    def tokens(cls, blocks: Iterable[Tokens], mask: NDArray[np.bool_]) -> "Samples":
+        """One sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
+
+        Holds one block and the tokens themselves, no padding.
+        """
+        counts = mask.sum(axis=1)
+        row_of = np.cumsum(mask).reshape(mask.shape) - 1
+        features: NDArray[np.floating] | None = None
+        for block in blocks:
+            if features is None:
+                features = np.empty((counts.sum(), block.values.shape[-1]), block.values.dtype)
+            rows = row_of[:, block.start : block.start + block.mask.shape[1]][block.mask]
+            features[rows] = block.values[block.mask]
+        assert features is not None, "every episode has a token"
+        sums = np.add.reduceat(features, _starts(counts), axis=0, dtype=np.float64)
+        return cls(ChosenRows.all(features), counts, sums / counts[:, None])
+
+    @property
+    def pools(self) -> bool:
+        """Whether every episode is a single sample."""
+        return len(self.counts) == len(self.features)
+
+    def broken(self) -> NDArray[np.intp]:
+        """Episodes with a feature that is NaN or infinite: such a sample shows in its episode's mean."""
+        means = to_numpy(self.means)
+        return np.flatnonzero(~np.isfinite(means).all(axis=1))
+
+    def of(self, episodes: NDArray[np.intp]) -> "Samples":
+        """The samples of some episodes, in this order."""
+        counts = self.counts[episodes]
+        shift = _starts(self.counts)[episodes] - _starts(counts)
+        rows = np.repeat(shift, counts) + np.arange(counts.sum())
+        return Samples(self.features[rows], counts, self.means[episodes])
+
+    def repeat(self, of_episodes: NDArray[Any]) -> NDArray[Any]:
+        """(M, K): what is true of each episode (E, K), for each of its samples."""
+        return np.repeat(of_episodes, self.counts, axis=0)
+
+    def to(self, device: str | None) -> "Samples":
+        """The same with features and means as torch tensors on `device`; unchanged without one."""
+        if isinstance(self.features, ChosenRows):
+            return Samples(self.features.to(device), self.counts, to_device(self.means, device))
+        return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
+
+
+def sites_of(run: RunReader, view: str) -> list[Site]:
+    """Sites of probed streams that have `view`; a role's tokens are where its mean is. Raises UnknownSiteError."""
+    probed = [name for name, stream in run.streams.items() if stream.probed]
+    if view == TOKENS:
+        return [site for stream in probed for site in run.sites(stream)]
+    pooled = f"mean:{role_of(view)}" if is_token_view(view) else view
+    having = [stream for stream in probed if resolve_view(pooled, run.views(stream)) in run.views(stream)]
+    sites = [site for stream in having for site in run.sites(stream)]
+    if not sites:
+        known = sorted({name for stream in run.streams for name in run.views(stream)})
+        raise UnknownSiteError(
+            f"{run.location} has no view {view!r}; it has: {', '.join(known)}, and with stored tokens: {TOKENS} "
+            f"or {TOKENS}:ROLE for every mean:ROLE"
+        )
+    return sites
+
+
+def is_token_view(view: str) -> bool:
+    """Whether every token is a sample in `view`."""
+    return view.partition(":")[0] == TOKENS
+
+
+def role_of(view: str) -> str | None:
+    """The role whose tokens a token view takes, None for all but padding."""
+    return view.partition(":")[2] or None
+
+
+def read_samples(run: RunReader, view: str, site: Site) -> Samples:
+    """All samples of one site. Raises NonFiniteActivationError naming the first broken episode."""
+    if is_token_view(view):
+        role = role_of(view)
+        samples = Samples.tokens(run.iter_token_blocks(site, role), run.token_mask(site, role))
+    else:
+        samples = Samples.pooled(run.column(site, view))
+    broken = samples.broken()
+    if broken.size:
+        raise NonFiniteActivationError(
+            f"{site}, view {view!r}, of {run.location} holds NaN or infinity in {broken.size} of "
+            f"{len(samples.counts)} episodes, the first {run.episodes['episode_id'].iloc[broken[0]]!r}; expected "
+            "finite features. Extract these episodes again."
+        )
+    return samples
+
+
+def _starts(counts: NDArray[np.intp]) -> NDArray[np.intp]:
+    starts: NDArray[np.intp] = np.cumsum(counts) - counts
+    return starts

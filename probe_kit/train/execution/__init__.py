@@ -1,0 +1,1 @@
+"""Where probes are fitted: this process, processes, or a Ray cluster."""

@@ -1,0 +1,40 @@
+"""Probing many columns of features: in this process, in several, or on a Ray cluster."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from probe_kit.train.execution.executor import Columns, Crew, CrewSettings, Key, Probed, Problems, probe_column
+from probe_kit.train.execution.processes import ProcessCrew
+from probe_kit.train.execution.ray import RayCrew
+
+
+def probe_columns(columns: Columns, problems: Problems, settings: CrewSettings) -> Iterator[tuple[Key, Probed]]:
+    """The probes of every column by category, as they are done.
+
+    Raises MissingExtraError if Ray is asked for and not installed, WorkerDiedError if a worker process dies, and
+    what a worker raises.
+    """
+    jobs = settings.jobs or 1
+    if settings.ray is not None:
+        yield from _side_by_side(columns, RayCrew(problems, settings.ray, settings.jobs))
+    elif jobs > 1:
+        yield from _side_by_side(columns, ProcessCrew(problems, jobs))
+    else:
+        for key, samples in columns:
+            yield key, probe_column(samples, problems, settings.device)
+
+
+def _side_by_side(columns: Columns, crew: Crew) -> Iterator[tuple[Key, Probed]]:
+    waiting: dict[Any, Key] = {}
+    with crew:
+        for key, samples in columns:
+            waiting[crew.submit(samples)] = key
+            if len(waiting) > crew.size:  # one column ahead, so that memory holds no more than that
+                yield from _finished(crew, waiting)
+        while waiting:
+            yield from _finished(crew, waiting)
+
+
+def _finished(crew: Crew, waiting: dict[Any, Key]) -> Iterator[tuple[Key, Probed]]:
+    for task in crew.first_of(list(waiting)):
+        yield waiting.pop(task), crew.result(task)

@@ -1,0 +1,246 @@
+"""Probe every site of a run: `train_probes`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from probe_kit._terminal.notebook import notebook_progress
+from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
+from probe_kit.statistics.folds import FoldUnit
+from probe_kit.train.controls.baselines import Baseline
+from probe_kit.train.controls.fit_controls import add_baselines, add_twin, check_twin, prepare_baselines
+from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
+from probe_kit.train.data.captured_call import at_call
+from probe_kit.train.data.labels import Incomplete, Target
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
+from probe_kit.train.execution.dispatch import probe_columns
+from probe_kit.train.execution.executor import CrewSettings, Key, Probed
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_directions import Direction
+from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
+from probe_kit.train.results.resume import Unfinished
+from probe_kit.train.results.store import is_stored, load_results, save_results, stamp_of_run
+from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.solver.backend import check_device
+
+Progress = Callable[[int, int, str], None]
+"""Called with (sites done, sites in all, what was just done)."""
+
+
+def train_probes(
+    run: RunReader,
+    categories: Sequence[str] | None = None,
+    views: Sequence[str] = ("mean",),
+    *,
+    permutations: int = 200,
+    token_permutations: int = 59,
+    target: Target = "correct",
+    call: int = 0,
+    folds: FoldUnit = "groups",
+    incomplete: Incomplete = "keep",
+    controls: Sequence[Baseline] = (),
+    suite: Path | None = None,
+    twin: RunReader | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    device: str | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> ProbeResults:
+    """Probe every site of every stream for `target`, per category and view, and store the results in the run.
+
+    categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
+    `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'.
+    permutations: relabellings behind the p-values, of which token views, many times as dear, take the first
+    `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
+    out. folds: `concepts` also keeps items about the same two concepts together.
+    incomplete: `drop` leaves out items of which an episode is missing.
+    controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`,
+    which need the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
+    What is no better than `binding` and the twin is no signal, whatever its p-value.
+    jobs: processes that probe, this one alone by default; with more than one, a script needs
+    `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
+    ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
+    machine; `jobs` is then how many sites at once, by default as many as it has cores.
+
+    progress: by default a bar in a notebook, nothing elsewhere.
+
+    The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
+    interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
+    stored before all of it is fitted: where this raises, `load_results` finds what it found before.
+    Raises RunIncompleteError for a run without episodes, NoProbesError for one without activations,
+    UnknownCategoryError, UnknownSiteError for a view no stream has, TooFewGroupsError, UnbalancedEpisodesError,
+    ProbeNotConvergedError, UsageError, and SuiteError for another suite.
+    """
+    _check_options(views, permutations, token_permutations, jobs, device, ray)
+    crew = CrewSettings(jobs, device, ray)
+    if len(run.episodes) == 0:
+        raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
+    run = at_call(run, call)
+    asked = _settings(
+        run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
+    )
+    sweep = _Sweep.of(run, asked, crew, progress)
+    prepared = prepare_baselines(run, controls, suite, sweep.stored)
+    beside = None
+    if twin is not None:
+        twin = at_call(twin, call)
+        other = _settings(
+            twin, asked.categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
+        )
+        check_twin(run, twin, other)
+        beside = _Sweep.of(twin, other, crew, progress)
+    results = add_baselines(sweep.results(), run, prepared)
+    if beside is not None:
+        others = beside.results()
+        results = add_twin(results, others)
+        beside.keep(others, asked=False)
+    return sweep.keep(results, asked=True)
+
+
+def _check_options(
+    views: Sequence[str],
+    permutations: int,
+    token_permutations: int,
+    jobs: int | None,
+    device: str | None,
+    ray: str | None,
+) -> None:
+    """Raise UsageError for what can be seen to be wrong without looking at the run."""
+    check_device(device)
+    if device is not None and ((jobs or 1) > 1 or ray is not None):
+        raise UsageError(
+            f"device {device!r} is used by one process, got jobs={jobs}, ray={ray!r}. Leave `jobs` and `ray` out."
+        )
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"jobs={jobs}; expected at least 1 process, or None")
+    if min(permutations, token_permutations) < 0:
+        raise UsageError(
+            f"permutations={permutations}, token_permutations={token_permutations}; expected 0 or more (0: no p)"
+        )
+    if not views or len(set(views)) < len(views):
+        raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """What is to be probed in one run. stored: its results, if the same was probed before."""
+
+    run: RunReader
+    settings: ProbeSettings
+    stored: ProbeResults | None
+    problems: Mapping[str, CategoryProblem]
+    keys: tuple[Key, ...]
+    crew: CrewSettings
+    progress: Progress | None
+
+    @classmethod
+    def of(
+        cls, run: RunReader, settings: ProbeSettings, crew: CrewSettings, progress: Progress | None
+    ) -> "_Sweep":
+        """Nothing is probed yet, but what can be wrong is found."""
+        if is_stored(run.location, settings.key):
+            return cls(run, settings, load_results(run, settings.key), {}, (), crew, progress)
+        problems = {name: category_problem(run.episodes, name, settings) for name in settings.categories}
+        keys = tuple((view, site) for view in settings.views for site in sites_of(run, view))
+        return cls(run, settings, None, problems, keys, crew, progress)
+
+    def results(self) -> ProbeResults:
+        """Those that are stored, or new ones that are not stored yet."""
+        return _fit(self) if self.stored is None else self.stored
+
+    def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
+        """Store `results` and give them as they are read back."""
+        save_results(results, self.run.location, asked=asked)
+        Unfinished.of(self.run.location, self.settings.key).discard()
+        return load_results(self.run, self.settings.key)
+
+
+def _settings(
+    run: RunReader,
+    categories: Sequence[str] | None,
+    views: Sequence[str],
+    target: Target,
+    folds: FoldUnit,
+    incomplete: Incomplete,
+    permutations: int,
+    token_permutations: int,
+    seed: int,
+    call: int,
+) -> ProbeSettings:
+    if not run.streams:
+        raise NoProbesError(f"{run.location} has no activations to probe: policy {run.model!r} has no streams.")
+    known = list(dict.fromkeys(run.episodes["category"]))
+    for category in categories or ():
+        if category not in (*known, POOLED):
+            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
+    return ProbeSettings(
+        model=run.label,
+        random_weights=run.random_weights,
+        weights=run.weights_sha256,
+        suite=run.suite,
+        run_settings=run.settings_sha256,
+        episodes=episodes_sha256(run),
+        categories=tuple(categories or known),
+        views=tuple(views),
+        target=target,
+        permutations=permutations,
+        seed=seed,
+        token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
+        call=call,
+        folds=folds,
+        incomplete=incomplete,
+    )
+
+
+def _fit(sweep: _Sweep) -> ProbeResults:
+    probes = _probe_all(sweep)
+    curves = {
+        (category, view): _curve(sweep.run, problem, category, view, probes)
+        for category, problem in sweep.problems.items()
+        for view in sweep.settings.views
+    }
+    directions = {
+        (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
+        for (view, site), found in probes.items()
+        for category, probe in found.items()
+    }
+    return ProbeResults(sweep.settings, curves, directions, stamp=stamp_of_run(sweep.run))
+
+
+def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
+    """Every view and site, in order, for every category; what a former sweep finished is read back."""
+    keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run))
+    probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
+    progress = sweep.progress or notebook_progress("sites probed")
+    columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)
+    for key, found in probe_columns(columns, sweep.problems, sweep.crew):
+        unfinished.keep(*key, found)
+        probes[key] = found
+        if progress is not None:
+            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
+    return {key: probes[key] for key in keys}
+
+
+def _curve(
+    run: RunReader, problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]
+) -> Curve:
+    found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
+    fold_of = np.empty(problem.labels.size, dtype=np.int64)
+    for number, fold in enumerate(problem.folds):
+        fold_of[fold.outer.test] = number
+    return Curve(
+        sites=tuple(found),
+        labels=problem.labels,
+        episodes=problem.episodes,
+        items=problem.items,
+        groups=problem.groups,
+        fold_of=fold_of,
+        decisions=np.stack([probe.decisions for probe in found.values()]),
+        strengths=np.stack([probe.strengths for probe in found.values()]),
+        null=np.stack([probe.null for probe in found.values()]),
+        parts=tuple(str(run.streams[site.stream].part) for site in found),
+    )

@@ -1,0 +1,1 @@
+"""Probe results: tables, curves, controls; stored with their run."""

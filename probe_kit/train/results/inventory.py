@@ -1,0 +1,150 @@
+"""What a run holds: `probe-kit run show`."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from probe_kit.errors import NoProbesError
+from probe_kit.extract.store.format.bundles import Bundle
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.resume import unfinished_sweeps
+from probe_kit.train.results.store import is_current, load_results, read_controls, read_probes, settings_of
+from probe_kit.train.settings import FORMAT
+
+
+@dataclass(frozen=True)
+class StoredProbes:
+    """One set of probe results, or what is known of a set written by another version.
+
+    created: when they were fitted. controls: baselines and, last, `twin: NAME`. state: `used` if `retention` reads
+    them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others by now,
+    `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
+    run is in its items' own words.
+    """
+
+    key: str
+    state: str
+    created: str
+    target: str = ""
+    views: tuple[str, ...] = ()
+    categories: tuple[str, ...] = ()
+    permutations: int = 0
+    token_permutations: int = 0
+    seed: int = 0
+    call: int = 0
+    controls: tuple[str, ...] = ()
+    wording: str = ""
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """A run and what is stored with it.
+
+    episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
+    in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone.
+    protected: whether a changed byte is found, as it is not in runs of former versions. probes: oldest first.
+    unfinished: finished sites of interrupted sweeps, by key.
+    """
+
+    run: str
+    model: str
+    random_weights: bool
+    weights_sha256: str | None
+    suite: str
+    settings_sha256: str
+    categories: tuple[str, ...]
+    episodes: int
+    planned: int
+    failed: int
+    outcomes: Mapping[str, int]
+    protected: bool
+    streams: Mapping[str, str]
+    probes: tuple[StoredProbes, ...]
+    unfinished: Mapping[str, int]
+    wordings: Mapping[str, int] = field(default_factory=dict)
+
+
+def inventory(run: Any) -> Inventory:
+    """List what `run`, a RunReader, holds; runs that were not made by probe_kit say less."""
+    episodes = run.episodes
+    return Inventory(
+        run=str(run.location),
+        model=run.model,
+        random_weights=run.random_weights,
+        weights_sha256=run.weights_sha256,
+        suite=run.suite,
+        settings_sha256=run.settings_sha256,
+        categories=tuple(dict.fromkeys(episodes["category"].astype(str))),
+        episodes=len(episodes),
+        planned=getattr(run, "planned", len(episodes)),
+        failed=len(getattr(run, "failed", ())),
+        outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
+        protected=getattr(run, "protected", True),
+        streams={name: _words(run, name) for name in run.streams},
+        probes=tuple(stored_probes(run)),
+        unfinished=unfinished_sweeps(run.location),
+        wordings={name: len(run.in_wording(name).episodes) for name in getattr(run, "wordings", ())},
+    )
+
+
+def _in_wordings(run: Any) -> list[Any]:
+    """The run in each of its wordings, which is what probes are fitted on; itself if it has none."""
+    return [run.in_wording(name) for name in getattr(run, "wordings", ())] or [run]
+
+
+def stored_probes(run: Any) -> list[StoredProbes]:
+    """Every set of probe results of a run, oldest first."""
+    readers = _in_wordings(run)
+    used = {_used(one) for one in readers}
+    found = [_probes(readers, bundle, used) for bundle in read_probes(run.location).values()]
+    return sorted(found, key=lambda probes: (probes.created, probes.key))
+
+
+def _used(run: RunReader) -> str | None:
+    try:
+        return load_results(run).key
+    except NoProbesError:
+        return None
+
+
+def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
+    key, header = bundle.key, bundle.head
+    created = str(header.get("created", ""))
+    if not _readable(header):
+        return StoredProbes(key, "other version", created)
+    settings = settings_of(header)
+    current = [run for run in readers if is_current(settings, run)]
+    state = "used" if key in used else "other" if current else "other episodes"
+    wording = getattr(current[0], "wording", None) if current else None
+    return StoredProbes(
+        key=key,
+        state=state,
+        created=created,
+        target=settings.target,
+        views=settings.views,
+        categories=settings.categories,
+        permutations=settings.permutations,
+        token_permutations=settings.token_permutations,
+        seed=settings.seed,
+        call=settings.call,
+        controls=_controls(bundle),
+        wording=wording or "",
+    )
+
+
+def _readable(header: Mapping[str, Any]) -> bool:
+    settings = header.get("settings")
+    return isinstance(settings, Mapping) and settings.get("format") == FORMAT
+
+
+def _controls(bundle: Bundle) -> tuple[str, ...]:
+    controls = read_controls(bundle)
+    names = dict.fromkeys(score.name for score in controls.baselines)
+    twins = dict.fromkeys(f"twin: {score.twin}" for score in controls.twin)
+    return (*names, *twins)
+
+
+def _words(run: RunReader, name: str) -> str:
+    stream = run.streams[name]
+    steps = f" × {stream.iterations} iterations" if stream.iterations else ""
+    return f"{stream.layers} layers{steps}, width {stream.width}; views {', '.join(run.views(name))}"

@@ -1,0 +1,139 @@
+"""Probe results: a table of scores, and the out-of-fold decisions behind it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from probe_kit.errors import UnknownSiteError
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.statistics.label_permutations import site_p, smallest_p
+from probe_kit.train.crossval.metrics import balanced_accuracy, fold_auc, log_loss
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.control_scores import Controls, signal
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_directions import Direction, Place
+from probe_kit.train.results.summary import results_html, results_text
+from probe_kit.train.settings import ProbeSettings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, repr=False)
+class ProbeResults:
+    """Probes of one run under one set of settings.
+
+    curves: one per (category, view). directions: the probes' weights per (category, view, site). controls: what
+    the probes are held against, as far as that was asked for.
+    created: when they were fitted (UTC, ISO 8601); not part of the key. stamp: hash of the commits they were
+    fitted to, empty for arrays in memory.
+    """
+
+    settings: ProbeSettings
+    curves: Mapping[tuple[str, str], Curve]
+    directions: Mapping[Place, Direction] = field(default_factory=dict)
+    controls: Controls = field(default_factory=Controls)
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
+    stamp: str = ""
+
+    def __repr__(self) -> str:
+        return results_text(self.settings)
+
+    def _repr_html_(self) -> str:
+        return results_html(self.settings, self.scores)
+
+    @property
+    def key(self) -> str:
+        """Hash of the settings."""
+        return self.settings.key
+
+    @cached_property
+    def scores(self) -> "pd.DataFrame":
+        """One row per category, view and site.
+
+        `accuracy` with its 95 % interval over groups (`ci_low`, `ci_high`), `p` of the site alone, `p_fwe`
+        against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per
+        outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
+        consistent within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`:
+        no p-value can be lower with so many relabellings. `beats_binding`, `beats_twin`: whether the site is
+        better than that control, missing where it was not run; `signal`: than chance, family-wise, and every
+        control that was run.
+        """
+        import pandas as pd
+
+        rows = [
+            row
+            for (category, view), curve in self.curves.items()
+            for row in _score_rows(self, category, view, curve)
+        ]
+        kinds = {"iteration": "Int64", "beats_binding": "boolean", "beats_twin": "boolean"}
+        return pd.DataFrame(rows).astype(kinds)
+
+    def direction(self, category: str, view: str, site: Site) -> Direction:
+        """The probes' weights at a site, in raw features. Raises UnknownSiteError if it was not probed."""
+        try:
+            return self.directions[category, view, site]
+        except KeyError:
+            raise UnknownSiteError(
+                f"there is no direction of {site}, category {category!r}, view {view!r}; probed were the sites of "
+                f"categories {', '.join(self.settings.categories)} in views {', '.join(self.settings.views)}"
+            ) from None
+
+
+def episodes_sha256(run: RunReader) -> str:
+    """Identity of the episodes a run holds now."""
+    return sha256_json(sorted(run.episodes["episode_id"].astype(str)))
+
+
+def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -> list[dict[str, Any]]:
+    settings, folds, correct = results.settings, curve.folds(), curve.correct
+    accuracy = correct.mean(axis=1)
+    low, high = group_bootstrap(correct.T, curve.groups, units_seed(curve.groups, settings.suite))
+    p, p_fwe, control = site_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
+    beats = [
+        results.controls.beats(category, view, str(site), float(p_site))
+        for site, p_site in zip(curve.sites, p_fwe, strict=True)
+    ]
+    return [
+        {
+            "model": settings.model,
+            "random_weights": settings.random_weights,
+            "target": settings.target,
+            "category": category,
+            "view": view,
+            "site": str(site),
+            "stream": site.stream,
+            "part": part,
+            "layer": site.layer,
+            "depth": curve.depth(site),
+            "iteration": site.iteration,
+            "accuracy": accuracy[row],
+            "ci_low": low[row],
+            "ci_high": high[row],
+            "balanced_accuracy": balanced_accuracy(curve.decisions[row], curve.labels),
+            "auc": fold_auc(curve.decisions[row], curve.labels, folds),
+            "log_loss": float(log_loss(curve.decisions[row], curve.labels)),
+            "p": p[row],
+            "p_fwe": p_fwe[row],
+            "control_accuracy": control[row],
+            "selectivity": accuracy[row] - control[row],
+            "n": curve.labels.size,
+            "items": np.unique(curve.items).size,
+            "groups": curve.n_groups,
+            "chance": curve.chance,
+            "C": " ".join(f"{strength:g}" for strength in curve.strengths[row]),
+            "fold_accuracy": " ".join(f"{correct[row, fold.test].mean():.4f}" for fold in folds),
+            "settings": settings.key,
+            "smallest_p": smallest_p(curve.null.shape[1]),
+            "beats_binding": beats[row]["binding"],
+            "beats_twin": beats[row]["twin"],
+            "signal": signal(beats[row]),
+        }
+        for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True))
+    ]

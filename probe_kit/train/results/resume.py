@@ -1,0 +1,61 @@
+"""What an interrupted sweep left: probes of single sites, from which the same command continues."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from probe_kit.extract.run_layout import PROBES
+from probe_kit.extract.store.format.bundles import PARTIAL
+from probe_kit.extract.store.format.resume_pieces import Pieces
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.train.crossval.site_probe import SiteProbe
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """Probes of single sites, kept until the sweep they belong to is complete."""
+
+    pieces: Pieces
+
+    @classmethod
+    def of(cls, run: Location, key: str, stamp: str = "") -> "Unfinished":
+        """Those of the sweep that will be stored as `key`. stamp: hash of the commits that it reads."""
+        return cls(Pieces.of(run, PROBES, key, stamp, "the same `probe-kit train` then probes the site again"))
+
+    @property
+    def folder(self) -> str:
+        """Where they lie in the run."""
+        return self.pieces.folder
+
+    def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
+        """The probes of a site by category, or None if the sweep did not get that far.
+
+        Raises RunDamagedError if they were changed, or are of another site or of other commits.
+        """
+        arrays = self.pieces.read(f"{view}+{site}")
+        if arrays is None:
+            return None
+        return {
+            category: SiteProbe(**{part: arrays[f"{category}/{part}"] for part in SiteProbe.__annotations__})
+            for category in dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays)
+        }
+
+    def keep(self, view: str, site: Site, probes: Mapping[str, SiteProbe]) -> None:
+        """Store the probes of a site by category."""
+        arrays = {
+            f"{category}/{part}": array
+            for category, probe in probes.items()
+            for part, array in vars(probe).items()
+        }
+        self.pieces.keep(f"{view}+{site}", arrays)
+
+    def discard(self) -> None:
+        """Remove everything: the sweep is complete."""
+        self.pieces.discard()
+
+
+def unfinished_sweeps(run: Location) -> dict[str, int]:
+    """Number of finished sites of every sweep that was interrupted or failed, by the key its results will have."""
+    parts = (key.split("/") for key in run.keys(PROBES))
+    names = [own[1] for own in parts if len(own) > 2 and own[1].startswith(".") and own[1].endswith(PARTIAL)]
+    return {name[1:].removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}

@@ -1,0 +1,244 @@
+"""Where probe results live: `RUN/probes/<key>/`, complete or not there.
+
+Results are there when their settings are, which are written last, with the hashes of all else; see `bundles`.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.extract.run_layout import PROBES
+from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.train.data.captured_call import at_call, captured_calls
+from probe_kit.train.data.labels import Target
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_directions import StoredDirections, save_directions
+from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
+from probe_kit.train.settings import FORMAT, ProbeSettings
+
+SCORES, DECISIONS = "scores.csv", "decisions.npz"
+DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
+
+
+def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = True) -> None:
+    """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
+
+    asked: whether somebody asked for these probes, which `load_results` then prefers to all older ones, rather
+    than needing them in passing, as the twin of another run.
+    """
+    location = locate(run)
+    if not is_stored(location, results.key):
+        files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
+        _write(location, results.key, _header(results, asked), files | _controls(results))
+        return
+    stored = {key: bundle.head for key, bundle in read_probes(location).items()}
+    header, found = stored[results.key], _controls(results)
+    if asked and results.key != max(_ours(stored), key=lambda key: _rank(key, stored[key])):
+        header = {**header, "asked": _now()}
+    if found or header != stored[results.key]:
+        _write(location, results.key, header, {**found, **({SCORES: _scores(results)} if found else {})})
+    else:
+        tidy_bundle(location, PROBES, results.key)
+
+
+def _write(run: Location, key: str, header: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
+    write_bundle(run, PROBES, key, header, files)
+
+
+def _header(results: ProbeResults, asked: bool) -> dict[str, Any]:
+    return {
+        "settings": asdict(results.settings),
+        "created": results.created,
+        "asked": _now() if asked else "",
+        "stamp": results.stamp,
+    }
+
+
+def _scores(results: ProbeResults) -> bytes:
+    return results.scores.to_csv(index=False).encode()
+
+
+def _decisions(results: ProbeResults) -> bytes:
+    file = BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **_pack(results.curves))
+    return file.getvalue()
+
+
+def _directions(results: ProbeResults) -> bytes:
+    file = BytesIO()
+    save_directions(results.directions, file)
+    return file.getvalue()
+
+
+def _controls(results: ProbeResults) -> dict[str, bytes]:
+    """What the probes were held against, as a file; nothing where nothing was controlled."""
+    if results.controls == Controls():
+        return {}
+    return {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}
+
+
+def is_stored(run: Location, key: str) -> bool:
+    """Whether complete results called `key` are there."""
+    return run.exists(f"{PROBES}/{key}/{HEAD}")
+
+
+def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
+    """The stored results called `key`, or else the newest for `target` on the episodes the run has now.
+
+    The newest are of the first captured inference; those of later ones are read by their key.
+
+    key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
+    they were fitted then or read back. Results of another format, written by another version of probe_kit, are
+    passed over. Raises NoProbesError if there are none, UsageError for a key that is not there, and
+    RunDamagedError if any results of the run were changed, lost their settings, or are of other activations.
+    """
+    location = run.location
+    probes = read_probes(location)
+    stored = _ours({name: bundle.head for name, bundle in probes.items()})
+    if key is not None:
+        found = [name for name in stored if name == key] or [
+            name for name in stored if key and name.startswith(key)
+        ]
+        if len(found) != 1:
+            raise UsageError(
+                f"{location} has {'several' if found else 'no'} probe results {key!r}; it has: "
+                f"{', '.join(stored) or 'none'}"
+            )
+        return _read(run, probes[found[0]])
+    asked = [(name, settings_of(header)) for name, header in stored.items()]
+    current = [name for name, settings in asked if (settings.target, settings.call) == (target, 0)]
+    current = [name for name in current if is_current(settings_of(stored[name]), run)]
+    if not current:
+        raise NoProbesError(_why_none(run, target, len(probes)))
+    newest = max(current, key=lambda name: _rank(name, stored[name]))
+    return _read(run, probes[newest])
+
+
+def is_current(settings: ProbeSettings, run: RunReader) -> bool:
+    """Whether probes of these settings are of the episodes that the run has now."""
+    if settings.run_settings != run.settings_sha256 or settings.call >= max(captured_calls(run), 1):
+        return False
+    return settings.episodes == episodes_sha256(at_call(run, settings.call))
+
+
+def _why_none(run: RunReader, target: Target, stored: int) -> str:
+    if not run.streams:
+        return f"{run.location} has no activations to probe: the policy {run.model!r} has no streams."
+    others = f" (of {stored} stored, none: other episodes, another target or another version)" if stored else ""
+    return (
+        f"{run.location} has no probes for target {target!r} on its episodes{others}. "
+        f"Run `probe-kit train {run.location}`."
+    )
+
+
+def _rank(key: str, header: Mapping[str, Any]) -> tuple[str, str, str]:
+    """What is newest has the highest; results of former versions count as asked for when they were made."""
+    return str(header.get("asked", header["created"])), str(header["created"]), key
+
+
+def _ours(headers: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    return {name: header for name, header in headers.items() if header["settings"].get("format") == FORMAT}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+def _pack(curves: Mapping[tuple[str, str], Curve]) -> dict[str, Any]:
+    """Arrays by `category/view/member`; views hold no slash."""
+    return {
+        f"{category}/{view}/{name}": np.array([str(own) for own in value]) if isinstance(value, tuple) else value
+        for (category, view), curve in curves.items()
+        for name, value in vars(curve).items()
+    }
+
+
+def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
+    members: dict[tuple[str, str], dict[str, Any]] = {}
+    for name, value in arrays.items():
+        category, view, member = name.rsplit("/", 2)
+        members.setdefault((category, view), {})[member] = value
+    return {
+        pair: Curve(
+            **{
+                **found,
+                "sites": tuple(Site.parse(str(name)) for name in found["sites"]),
+                "parts": tuple(str(part) for part in found.get("parts", ())),
+            }
+        )
+        for pair, found in members.items()
+    }
+
+
+def read_probes(run: Location) -> dict[str, Bundle]:
+    """Every complete result by key, of whatever version. Raises RunDamagedError for one that was changed."""
+    return read_bundles(run, PROBES)
+
+
+def settings_of(header: Mapping[str, Any]) -> ProbeSettings:
+    """The settings of results of this version's format. Raises RunDamagedError."""
+    stored = header["settings"]
+    try:
+        lists = {name: tuple(stored[name]) for name in ("categories", "views")}
+        return ProbeSettings(**{**stored, **lists})
+    except (KeyError, TypeError) as error:
+        raise RunDamagedError(
+            f"stored probes of format {FORMAT} have settings that cannot be theirs: {error}. Remove the folder in "
+            f"{PROBES}/ whose settings.json says {str(stored)[:80]} …, and run the same `probe-kit train` again"
+        ) from error
+
+
+def read_controls(bundle: Bundle) -> Controls:
+    """What results were held against so far. Raises RunDamagedError."""
+    return Controls.from_json(json.loads(bundle.read(CONTROLS))) if bundle.has(CONTROLS) else Controls()
+
+
+def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
+    settings = settings_of(bundle.head)
+    _refuse_foreign(run, bundle, settings)
+    try:
+        with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
+            curves = _unpack(arrays)
+    except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder}/{DECISIONS} cannot be read: {error}. Remove {bundle.folder} and run "
+            "the same `probe-kit train` again"
+        ) from error
+    return ProbeResults(
+        settings,
+        curves,
+        StoredDirections(bundle, DIRECTIONS),
+        read_controls(bundle),
+        bundle.head["created"],
+        bundle.head.get("stamp", ""),
+    )
+
+
+def _refuse_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
+    """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
+    stamp, now = bundle.head.get("stamp", ""), stamp_of_run(run)
+    if stamp == now or not (stamp and now):
+        return
+    if settings.run_settings != run.settings_sha256 or is_current(settings, run):
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder} holds probes of other activations than the run has: they were fitted "
+            f"to commits {stamp[:12]}, here are {now[:12]}. Remove it and run the same `probe-kit train` again"
+        )
+
+
+def stamp_of_run(run: RunReader) -> str:
+    """Hash of the commits of a run; empty for one whose settings are the hash of all its numbers."""
+    return str(getattr(run, "stamp", ""))

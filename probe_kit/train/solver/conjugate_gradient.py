@@ -1,0 +1,77 @@
+"""Conjugate gradients for many problems on the same samples, one column each: every product is one of matrices."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probe_kit.train.solver.backend import Array, namespace
+from probe_kit.train.solver.design_matrix import Design
+
+MAX_CG_STEPS = 100
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Newton steps, (R, K), and what they change in the decisions: Z · step, (N, K), which costs no product more.
+
+    unsettled: numbers of the columns that were not found in time, and are nothing.
+    """
+
+    step: Array
+    change: Array
+    unsettled: Array
+
+
+def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array) -> Steps:
+    """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
+
+    penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S.
+    """
+    xp = namespace(gradient)
+    size = xp.linalg.norm(gradient, axis=0).clip(np.finfo(float).tiny)
+    spectrum = design.spectrum
+    penalty, rest, curvature, precision = (
+        xp.asarray(part, dtype=spectrum.dtype) for part in (penalty, -gradient / size, curvature, precision)
+    )
+    live = xp.arange(rest.shape[1], device=rest.device)
+    found, changed, step, change = (
+        make(part) for make in (xp.empty_like, xp.zeros_like) for part in (rest, curvature)
+    )
+    diagonal = penalty + spectrum * curvature.mean(axis=0)
+    direction = rest / diagonal
+    slope = _dots(rest, direction)
+    bent, scaled = xp.empty_like(curvature), xp.empty_like(rest)
+    for _ in range(MAX_CG_STEPS):
+        along = design @ direction
+        product = design.gather(xp.multiply(curvature, along, out=bent))
+        product += xp.multiply(penalty, direction, out=scaled)
+        length = slope / _dots(direction, product)
+        step += xp.multiply(length, direction, out=scaled)
+        along *= length
+        change += along
+        product *= length
+        rest -= product
+        keep = _dots(rest, rest) > precision**2
+        if not keep.any():
+            if len(live) < len(size):
+                found[:, live], changed[:, live] = step, change
+                step, change = found, changed
+            return Steps(step * size, change * size, live[keep])
+        if not keep.all():
+            found[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
+            live, slope, precision = live[keep], slope[keep], precision[keep]
+            rest, direction, diagonal, curvature, step, change = (
+                part[:, keep] for part in (rest, direction, diagonal, curvature, step, change)
+            )
+            bent, scaled = xp.empty_like(curvature), xp.empty_like(rest)
+        xp.divide(rest, diagonal, out=scaled)
+        previous, slope = slope, _dots(rest, scaled)
+        direction *= slope / previous
+        direction += scaled
+    found[:, live], changed[:, live] = 0.0, 0.0
+    return Steps(found * size, changed * size, live)
+
+
+def _dots(left: Array, right: Array) -> Array:
+    """(K,) products of columns."""
+    return namespace(left).einsum("rk,rk->k", left, right)

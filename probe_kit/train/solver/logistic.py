@@ -1,0 +1,282 @@
+"""Many L2-regularised logistic regressions on the same samples, solved exactly and at once.
+
+The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
+Samples come in principal coordinates (`features.Coordinates`), whose columns are nearly orthogonal: there the
+Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
+need a few products each, and all label columns share them as matrix–matrix products.
+
+Through many samples, products are float32 between two points that are known exactly: decisions and sums there are
+float64, and float32 only adds what changed since. Whether a solution is accepted is decided at an exact point, so
+that the precision of a step shapes the way, never the optimum. numpy arrays or torch tensors: samples on a GPU are
+solved there.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
+from probe_kit.train.solver.backend import Array, keep_freed_memory, namespace
+from probe_kit.train.solver.conjugate_gradient import newton_steps
+from probe_kit.train.solver.design_matrix import Design
+
+MAX_NEWTON_STEPS = 100
+MAX_STEPS_BETWEEN = 10
+"""Newton steps by products in float32 from one exact point to the next."""
+COARSEST, FINEST = 0.1, 1e-5
+"""Relative precision of a step: what any is worth, and what is rounding in float32."""
+NEAR = 2e-2
+"""Relative gradient after which one more step in float32 is made, before a point is looked at exactly."""
+GAIN = 1e-5
+"""Share of an exact point's gradient that steps in float32 leave: less would be their rounding."""
+EXACT = 1e-12
+"""Share of an objective that is rounding in float64."""
+SAFETY = 0.3
+"""Share of the tolerance that they aim at, so that the exact gradient is below it."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where problems, one column each, are, and what is known there.
+
+    weights: (R, K). decisions: (N, K) Z · weights. loss: (K,) of all samples. misfit: (N, K) 1 − P(label).
+    pulled: (R, K) Zᵀ · (signs ∘ misfit).
+    """
+
+    weights: Array
+    decisions: Array
+    loss: Array
+    misfit: Array
+    pulled: Array
+
+    def like(self) -> "_Point":
+        """As many points, of which nothing is known yet."""
+        return _Point(*(namespace(part).empty_like(part) for part in vars(self).values()))
+
+    def only(self, chosen: Array) -> "_Point":
+        """Some of them."""
+        return _Point(*(part[..., chosen] for part in vars(self).values()))
+
+    def put(self, chosen: Array, others: "_Point") -> None:
+        """`others` in the place of some."""
+        for part, other in zip(vars(self).values(), vars(others).values(), strict=True):
+            part[..., chosen] = other
+
+
+@dataclass(frozen=True)
+class _Problems:
+    """Problems still to be solved, one column each, and where they are."""
+
+    samples: Design
+    columns: Array
+    strength: Array  # (K,)
+    rounding: Array  # (K,) gradients as small as this are zero
+    signs: Array  # (N, K) labels as −1 and +1
+    at: _Point
+
+    def only(self, chosen: Array) -> "_Problems":
+        """Some of them."""
+        if chosen.all():
+            return self
+        columns, strength, rounding = self.columns[chosen], self.strength[chosen], self.rounding[chosen]
+        return _Problems(
+            self.samples.of(chosen), columns, strength, rounding, self.signs[:, chosen], self.at.only(chosen)
+        )
+
+
+class LogisticSolver:
+    """Solves every column of a label matrix for one C after another, each warm-started by the one before.
+
+    samples: N samples in R orthogonal columns, the last one all ones for the intercept.
+    tolerance: a solution is accepted when ‖gradient‖ ≤ tolerance · ‖w‖. The objective is 1-strongly convex in w,
+    so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
+    """
+
+    def __init__(self, samples: Design, tolerance: float = 1e-9) -> None:
+        self.samples = samples
+        self.tolerance = tolerance
+        spectrum = samples.spectrum
+        self.xp = namespace(spectrum)
+        self.penalty = self.xp.ones_like(spectrum[:, :1])
+        self.penalty[-1] = 0.0
+        self.rounding = 1e-15 * (spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
+
+    def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
+        """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
+
+        Raises ProbeNotConvergedError rather than return a column that is not at its optimum, and
+        TooFewGroupsError for a column with a single class, which has no optimum.
+        """
+        refuse_single_class(labels)
+        signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.penalty.device) - 1.0
+        yield from self.path_of_signs(signs, strengths)
+
+    def path_of_signs(self, signs: Array, strengths: Iterable[float | Array]) -> Iterator[Array]:
+        """`path` for labels as −1 and +1, (N, K); a sample with 0 is none. A C may be (K,), one per column."""
+        if self._narrow is not self.samples:
+            keep_freed_memory()
+        shape = self.samples.shape[1], signs.shape[1]
+        weights = self.xp.zeros(shape, dtype=signs.dtype, device=signs.device)
+        at = self._point(self.samples, signs, weights, self.xp.zeros_like(signs))
+        for strength in strengths:
+            at = self._solved(signs, strength, at)
+            yield at.weights
+
+    def _solved(self, signs: Array, strength: float | Array, start: _Point) -> _Point:
+        """The optima of labels −1/+1 (N, K), found from points `start` that are known exactly."""
+        xp = self.xp
+        solved = start.like()
+        each = xp.ones_like(start.weights[-1])
+        columns = xp.arange(signs.shape[1], device=signs.device)
+        todo = _Problems(self.samples, columns, each * strength, each * self.rounding, signs, start)
+        for _ in range(MAX_NEWTON_STEPS):
+            gradient, size, relative = self._gradient(todo)
+            # Negated, so that NaN stays open and ends in an error.
+            open_ = ~((relative <= self.tolerance) | (size <= todo.rounding * todo.strength))
+            solved.put(todo.columns[~open_], todo.at.only(~open_))
+            if not open_.any():
+                return solved
+            todo, gradient, relative = todo.only(open_), gradient[:, open_], relative[open_]
+            if self._narrow is self.samples:
+                todo = replace(todo, at=self._stepped(todo, gradient, relative))
+            else:
+                todo = replace(todo, at=self._led(todo, gradient, relative))
+        raise ProbeNotConvergedError(
+            f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
+            f"C={todo.strength[0]:g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst "
+            f"relative gradient {relative.max():.1e}, expected at most {self.tolerance:.0e}. "
+            "Look for extreme feature values."
+        )
+
+    def _led(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+        """Exact points behind steps in float32; where those led astray, behind a single one that was looked at."""
+        weights = self._led_nearer(todo, gradient, relative)
+        led = self._point(todo.samples, todo.signs, weights, todo.samples @ weights)
+        before, after = self._objective(todo.strength, todo.at), self._objective(todo.strength, led)
+        astray = ~(after <= before + EXACT * abs(before))
+        if astray.any():
+            led.put(astray, self._stepped(todo.only(astray), gradient[:, astray], relative[astray]))
+        return led
+
+    def _stepped(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+        """The exact points behind one Newton step."""
+        step, change = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
+        if self._narrow is not self.samples:
+            change = todo.samples @ step
+        return self._moved(todo, gradient, step, change, is_exact=True)
+
+    def _led_nearer(self, todo: _Problems, gradient: Array, relative: Array) -> Array:
+        """(R, K) weights nearer to the optimum, by products in float32 that add to what is known exactly.
+
+        The last step is not looked back at: the exact point does that.
+        """
+        weights = self.xp.empty_like(todo.at.weights)
+        goal = (GAIN * relative).clip(min=SAFETY * self.tolerance)
+        todo = replace(todo, columns=self.xp.arange(len(relative), device=relative.device))
+        for _ in range(MAX_STEPS_BETWEEN):
+            step, change = self._newton_steps(todo, gradient, relative, goal)
+            far = relative > NEAR
+            weights[:, todo.columns[~far]] = todo.at.weights[:, ~far] + step[:, ~far]
+            if not far.any():
+                return weights
+            todo, goal = todo.only(far), goal[far]
+            if not far.all():
+                gradient, step, change = gradient[:, far], step[:, far], change[:, far]
+            todo = replace(todo, at=self._moved(todo, gradient, step, change, is_exact=False))
+            gradient, _, relative = self._gradient(todo)
+        weights[:, todo.columns] = todo.at.weights
+        return weights
+
+    def _gradient(self, todo: _Problems) -> tuple[Array, Array, Array]:
+        """(R, K) of the objective; its norm (K,), and that in units of the weights."""
+        xp, at = self.xp, todo.at
+        gradient = self.penalty * at.weights
+        gradient -= todo.strength * at.pulled
+        size = xp.linalg.norm(gradient, axis=0)
+        scale = xp.maximum(xp.linalg.norm(at.weights[:-1], axis=0), size)
+        return gradient, size, size / scale.clip(np.finfo(float).tiny)
+
+    def _newton_steps(
+        self, todo: _Problems, gradient: Array, relative: Array, goal: Array | float
+    ) -> tuple[Array, Array]:
+        """(R, K) steps, as precise as `goal` asks, the relative gradient that is wanted, and Z · steps, (N, K)."""
+        curvature = todo.strength * todo.at.misfit * (1 - todo.at.misfit)
+        if todo.samples.small:
+            step = self._exact_newton_steps(todo.samples, gradient, curvature)
+            return step, todo.samples @ step
+        # More than the point has, or is asked, is wasted work.
+        precision = self.xp.maximum(relative, (goal / relative).clip(min=FINEST)).clip(max=COARSEST)
+        found = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
+        for column in found.unsettled:  # one after another: all Hessians may be more than the memory holds
+            one = gradient[:, column, None], curvature[:, column, None]
+            found.step[:, column] = self._exact_newton_steps(self.samples, *one)[:, 0]
+            found.change[:, column] = self.samples @ found.step[:, column]
+        return found.step, found.change
+
+    @cached_property
+    def _narrow(self) -> Design:
+        """What steps are found with."""
+        return self.samples.narrow()
+
+    def _exact_newton_steps(self, samples: Design, gradient: Array, curvature: Array) -> Array:
+        hessians = samples.moments(curvature)
+        diagonal = self.xp.arange(len(gradient))
+        hessians[:, diagonal, diagonal] += self.penalty[:, 0]
+        return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
+
+    def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
+        """The points along `step`, which is halved per column until the objective falls enough.
+
+        is_exact: whether what is known of them is float64; else float32 adds to what is.
+        """
+        here = todo.at
+        value, slope = self._objective(todo.strength, here), (gradient * step).sum(axis=0)
+        length = self.xp.ones_like(slope)
+        noise = (EXACT if is_exact else 1e-6) * abs(value)
+        weights, decisions = here.weights + step, here.decisions + change
+        while True:
+            loss, misfit = _losses(todo.signs * decisions)
+            bound = value + 1e-4 * length * slope + noise
+            too_far = self._value(todo.strength, weights, loss) > bound
+            if not too_far.any():
+                break
+            length[too_far] /= 2
+            weights, decisions = here.weights + length * step, here.decisions + length * change
+        if is_exact:
+            pulled = todo.samples.gather(todo.signs * misfit)
+        else:
+            narrow = self._narrow
+            more = self.xp.asarray(todo.signs * (misfit - here.misfit), dtype=narrow.spectrum.dtype)
+            pulled = here.pulled + narrow.gather(more)
+        return _Point(weights, decisions, loss, misfit, pulled)
+
+    def _point(self, samples: Design, signs: Array, weights: Array, decisions: Array) -> _Point:
+        """What is known at `weights`, in float64."""
+        loss, misfit = _losses(signs * decisions)
+        return _Point(weights, decisions, loss, misfit, samples.gather(signs * misfit))
+
+    def _objective(self, strength: Array, at: _Point) -> Array:
+        return self._value(strength, at.weights, at.loss)
+
+    def _value(self, strength: Array, weights: Array, loss: Array) -> Array:
+        return strength * loss + 0.5 * self.xp.square(weights[:-1]).sum(axis=0)
+
+
+def refuse_single_class(labels: NDArray[np.bool_]) -> None:
+    """Raise TooFewGroupsError for a column of (N, K) training labels that has no optimum."""
+    if (labels.all(axis=0) | ~labels.any(axis=0)).any():
+        raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
+
+
+def _losses(margins: Array) -> tuple[Array, Array]:
+    """(K,) sums of log(1 + exp(−m)) over (N, K) margins, and each one's negative slope, 1 − P(label)."""
+    xp = namespace(margins)
+    small = -abs(margins)
+    xp.exp(small, out=small)
+    loss = (xp.log1p(small) + (-margins).clip(0.0)).sum(axis=0)
+    misfit = xp.maximum(small, xp.asarray(margins <= 0, dtype=small.dtype))
+    misfit /= 1.0 + small
+    return loss, misfit

@@ -1,0 +1,87 @@
+"""However a command ends, it says one thing, gives a code, and shows no traceback."""
+
+import errno
+import os
+import re
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from probe_kit._terminal.error_reporting import tell
+from probe_kit.cli import Commands
+from probe_kit.errors import CheckpointError, WeightsError
+
+
+def ended(error: BaseException) -> tuple[int, str]:
+    """A command that raises `error`, as the command line ends it."""
+    app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
+
+    @app.callback()
+    def _before() -> None: ...
+
+    @app.command()
+    def fail() -> None:
+        raise error
+
+    answer = CliRunner().invoke(app, ["fail"])
+    return answer.exit_code, " ".join(answer.output.split())
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "the same command continues"),
+        (WeightsError("torn"), 3, "WeightsError: torn"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/x"), 3, "the disk of run/x is full"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 3, "is full"),
+        (OSError(errno.EROFS, os.strerror(errno.EROFS), "run"), 3, "the disk of run is read-only"),
+        (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), "run"), 3, "quota"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "there"),
+            2,
+            "there cannot be used: Permission denied",
+        ),
+        (FileNotFoundError(errno.ENOENT, "No such file", "there"), 2, "there cannot be used"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "a" * 300), 2, "too long"),
+        (OSError(errno.ELOOP, "Too many levels of symbolic links", b"loop"), 2, "loop cannot be used"),
+        (SystemExit(0), 1, "sys.exit with 0"),
+        (SystemExit("bye"), 1, "sys.exit with 'bye'"),
+    ],
+)
+def test_what_can_be_foreseen_has_its_message_and_code(error: BaseException, code: int, words: str) -> None:
+    ended_with, said = ended(error)
+    assert ended_with == code
+    assert words in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "error",
+    [KeyError("x"), ValueError("one\ntwo"), MemoryError(), RecursionError("deep"), OSError(5, "I/O error")],
+)
+def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    code, said = ended(error)
+    assert code == 1
+    assert type(error).__name__ in said
+    assert "Traceback" not in said
+    (file,) = tmp_path.iterdir()
+    assert str(file) in said.replace(" ", "") or file.name in said.replace(" ", "")
+    assert re.search(r"Traceback.*in fail", file.read_text(), re.DOTALL)
+
+
+def test_a_traceback_that_cannot_be_written_is_said_to_be_lost(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    assert tell(KeyError("x")) == 1
+    assert "set TMPDIR" in capsys.readouterr().err
+
+
+def test_what_an_error_says_is_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
+    error = CheckpointError("[bold]config[/] \x1b[31m")
+    error.add_note("in [red]this\u202e")
+    assert tell(error) == 3
+    said = capsys.readouterr().err
+    assert "[bold]config[/] ␛[31m" in said
+    assert "in [red]this\ufffd" in said

@@ -1,0 +1,79 @@
+"""Names that others chose reach the terminal as text, in every command that shows them."""
+
+import shutil
+import tarfile
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit.cli import app
+from probe_kit.hooks import registry
+from probe_kit.hooks.contract.family import Family
+from probe_kit.suite import Suite
+
+NAME = "[bold]x[red] [no-end] \x1b[31m\u202e\x9b2J"
+SHOWN = "[bold]x[red] [no-end] ␛[31m\ufffd\ufffd2J"
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in a folder of that name."""
+    place = tmp_path_factory.mktemp("hostile")
+    with tarfile.open(GOLDEN / "run-schema-1" / "runs.tar.xz") as packed:
+        packed.extractall(place / "runs", filter="data")
+    there = next(place.glob("runs/**/run.json")).parent
+    return there.rename(place / NAME)
+
+
+def said(*words: object) -> str:
+    answer = CliRunner().invoke(app, list(map(str, words)))
+    assert "Unforeseen" not in answer.output
+    assert "Traceback" not in answer.output
+    assert not UNSAFE.search(answer.output), answer.output
+    return " ".join(answer.output.split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "verify"), ("run", "verify", "--deep"), ("run", "verify", "--json"), ("run", "show"),
+        ("run", "show", "--json"), ("run", "seal"), ("retention",), ("retention", "--format", "json"),
+        ("retention", "--format", "csv"), ("retention", "--format", "latex"),
+        ("retention", "--format", "markdown"),
+        ("models", "--run"), ("train", "--views", "nothing"), ("export", "--format", "nothing"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, ...]) -> None:
+    said(*words, run)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "show", NAME), ("retention", NAME), ("train", NAME), ("export", NAME, "--format", "h5"),
+        ("models", "--run", NAME), ("suite", "list", NAME), ("suite", "validate", NAME), ("suite", "show", NAME),
+        ("extract", "--model", "expert", "--suite", NAME),
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)  # fmt: skip
+def test_a_path_that_is_not_there_is_named_as_text(words: tuple[str, ...], tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert SHOWN in said(*words)
+
+
+def test_a_suite_in_a_folder_of_a_hostile_name_is_shown_as_text(small_suite: Suite, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small_suite.folder, tmp_path / NAME))
+    said("suite", "list", folder)
+    (folder / "suite.json").write_text(f'{{"schema_version": "{SHOWN}"}}')
+    assert "[bold]x[red] [no-end]" in said("suite", "validate", folder)
+
+
+def test_what_a_third_party_says_of_its_family_is_shown_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    family = Family("mine", NAME, None, "x:y", streams=NAME, notes=NAME)
+    monkeypatch.setattr(registry, "known_families", lambda: {"mine": family})
+    assert said("models").count(SHOWN) == 3

@@ -1,0 +1,136 @@
+"""The verdict over a row, and the truths the organisms were made to have."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from probe_kit._terminal.console import out
+from probe_kit.demo.organisms import (
+    EARLY,
+    ORGANISMS,
+    OTHER_TWINS,
+    RANDOM_TWIN,
+    READER,
+    STATE_USED,
+    TRAINED,
+    Finding,
+    measured,
+    settings_of,
+    source_of,
+    to_rich,
+)
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract import extract_run
+from probe_kit.intervene import Follow, Words, intervene_on
+from probe_kit.retention import RetentionRow
+from probe_kit.retention.behaviour.success_rate import regime
+from probe_kit.retention.report.category_summary import verdict
+from probe_kit.suite import Suite
+
+
+def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
+    """p: of the backbone's best site against chance."""
+    chance = None if p is None else p < 0.05
+    return RetentionRow(
+        run="run", model="pi0-tiny", random_weights=False, weights_sha256="0" * 64, suite="suite@1",
+        run_settings="s", probe_settings="p", category="color", view="mean", n_episodes=48, n_items=24, sr=sr,
+        regime=regime(sr, 0.14, 1 - sr, 0.0)[0], prefix_accuracy=0.9, prefix_p_fwe=p,
+        prefix_beats={"chance": chance, "binding": None, "twin": None} | beats,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sr", "p", "expected"),
+    [
+        (0.9, 0.005, "used"),
+        (0.64, 0.005, "encoded, unused"),
+        (0.02, 0.005, "encoded, unused"),
+        (0.5, 0.2, "absent"),
+        (0.5, None, "absent"),
+        (0.9, 0.2, "acted on, not found"),
+    ],
+)
+def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_on(
+    sr: float, p: float | None, expected: str
+) -> None:
+    assert verdict(row(sr, p)) == expected
+
+
+@pytest.mark.parametrize("control", ["binding", "twin"])
+def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
+    """Color of the random twin had p = 0.005 against chance, and knew nothing."""
+    assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
+    assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, unused"
+
+
+def test_organisms_differ_in_one_truth_at_a_time() -> None:
+    assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "encoded, unused")
+    assert (EARLY.expected("color"), EARLY.expected("state")) == ("encoded, unused", "encoded, unused")
+    assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
+    assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
+    twins = [one for one in ORGANISMS if one.random_weights]
+    assert twins == [RANDOM_TWIN, *OTHER_TWINS]
+    assert [one.weights_seed for one in twins] == [0, 1, 2]
+    assert {one.expected(category) for one in twins for category in ("color", "state")} == {"absent"}
+
+
+@pytest.mark.parametrize(
+    ("p", "limits", "shown", "expected"),
+    [
+        (0.005, (-0.1, 0.2), True, "encoded, unused"),
+        (0.005, (-0.1, 0.2), False, "inconclusive"),
+        (0.005, (-0.1, 0.3), True, "inconclusive"),
+        (0.3, (-0.1, 0.2), True, "inconclusive"),
+    ],
+)
+def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
+    p: float, limits: tuple[float, float], shown: bool, expected: str
+) -> None:
+    alone = replace(row(0.4, p), used="inconclusive", follows_net_ci=limits)
+    assert measured(alone, shown) == expected
+    assert measured(replace(alone, used="used"), shown) == "used"
+
+
+def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
+    """Its pictures are exchanged before its own weights; those of another seed are refused."""
+    twin = replace(OTHER_TWINS[0], max_steps=1)
+    settings = replace(settings_of(twin, small_suite), categories=("color",), items=2, video="none", env_workers=0)
+    run = extract_run(settings, tmp_path / "run")
+    assert len(intervene_on(run, Follow(), source_of(twin, small_suite)).table) == 1
+    with pytest.raises(SettingsMismatchError, match="weights"):
+        intervene_on(run, Words(), source_of(RANDOM_TWIN, small_suite))
+
+
+def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
+    everybody = (READER, *ORGANISMS)
+    assert len({one.name for one in everybody}) == len({one.folder for one in everybody}) == len(everybody)
+
+
+def test_the_table_shows_the_margin_that_decides() -> None:
+    """Over 48 episodes Δ is 14.1 points, over their 24 items 20.0, and that is what the verdict rests on."""
+    shown = replace(row(0.66, 0.3), delta=0.1414, delta_regime=0.2001)
+    with out.capture() as printed:
+        out.print(to_rich([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
+    text = printed.get()
+    assert "20.0" in text
+    assert "14.1" not in text
+
+
+def test_the_table_counts_the_true_verdicts() -> None:
+    findings = [
+        Finding("trained", "color", "used", "used", row(0.9, 0.005)),
+        Finding("trained", "state", "encoded, unused", "absent", row(0.5, 0.3)),
+    ]
+    with out.capture() as printed:
+        out.print(to_rich(findings), width=100)
+    text = printed.get()
+    assert "1 of 2 verdicts are true" in text
+    assert "encoded" in text
+
+
+@pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
+def test_a_reader_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
+    assert verdict(replace(row(sr, None), kind="asks")) == expected
+    assert READER.expected("state") == "known"
+    assert READER.expected("counting") == "unknown"

@@ -1,0 +1,113 @@
+"""A policy written by others costs its own episodes, by name, whatever its code does."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import CheckpointError, EpisodesFailedError, PolicyFailedError
+from probe_kit.extract import ExtractSettings, extract_run, open_run
+from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.suite import Suite, build_suite
+
+CALLS_BEFORE = 2
+"""Inferences that go well: the first is made twice, with hooks and without."""
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
+
+
+def settings(suite: Suite) -> ExtractSettings:
+    return ExtractSettings(
+        "pi0-tiny",
+        random_weights=True,
+        suite=suite.folder,
+        scene=SceneSpec(max_steps=2),
+        env_workers=0,
+        frames="none",
+    )
+
+
+def leave(_: Any) -> Any:
+    sys.exit(0)
+
+
+def fall(_: Any) -> Any:
+    raise KeyError("no such thing")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (leave, r"PolicyFailedError: pi0-tiny failed while it acted: it called sys.exit\(0\)"),
+        (fall, "PolicyFailedError: pi0-tiny failed while it acted: KeyError: 'no such thing'"),
+        (lambda chunks: chunks * np.nan, r"ActionError: action .* is not finite \(NaN or infinity\)"),
+        (lambda chunks: chunks[:, :, :6], r"PolicyFailedError: the policy gave a ndarray of shape \(1, \d+, 6\)"),
+        (lambda chunks: chunks[0], "PolicyFailedError: the policy gave a ndarray of shape"),
+        (lambda _: None, "PolicyFailedError: the policy gave a NoneType of shape"),
+    ],
+    ids=["exit", "error", "NaN", "too short", "no batch", "None"],
+)
+def test_what_a_policy_does_wrong_gives_its_episodes_up_by_name(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Any, words: str
+) -> None:
+    act, calls = Pi0.act, iter(range(1000))
+
+    def spoiled(self: Pi0, *arguments: Any) -> Any:
+        chunks = act(self, *arguments)
+        return chunks if next(calls) < CALLS_BEFORE else spoil(chunks)
+
+    monkeypatch.setattr(Pi0, "act", spoiled)
+    with pytest.raises(EpisodesFailedError) as caught:
+        extract_run(settings(suite), tmp_path / "run")
+    assert len(caught.value.__notes__) == 3
+    from re import search
+
+    assert all(search(words, note) for note in caught.value.__notes__), caught.value.__notes__
+    assert all("a2a-embedded-color" in note for note in caught.value.__notes__)
+    assert len(open_run(tmp_path / "run", allow_partial=True).episodes) == 1
+
+
+def exiting_loader(*_: Any) -> Any:
+    sys.exit(0)
+
+
+def raising_loader(*_: Any) -> Any:
+    return {}["hidden_size"]
+
+
+@pytest.mark.parametrize(
+    ("loader", "error", "words"),
+    [
+        ("exiting_loader", PolicyFailedError, r"mine cannot be loaded: its code called sys.exit\(0\)"),
+        ("raising_loader", CheckpointError, "mine cannot be loaded from what it brings: KeyError: 'hidden_size'"),
+        ("no_loader", CheckpointError, "mine cannot be loaded from .*AttributeError"),
+    ],
+)
+def test_a_family_that_cannot_load_says_so_by_name(loader: str, error: type[Exception], words: str) -> None:
+    module = sys.modules[__name__]
+    sys.modules["their_family"] = module
+    family = Family("mine", "theirs", None, f"their_family:{loader}")
+    try:
+        with pytest.raises(error, match=words):
+            family.load(None)
+    finally:
+        del sys.modules["their_family"]
+
+
+def test_a_family_that_is_wrong_about_itself_breaks_no_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    from probe_kit.extract.model_commands import _model_rows
+    from probe_kit.hooks import registry
+
+    broken = Family("mine", "theirs", None, "x:y", packages=(("nowhere.at.all", "extra"),))
+    known = {**registry.known_families(), "mine": broken}
+    monkeypatch.setattr(registry, "known_families", lambda: known)
+    rows = {row["model"]: row["ready"] for row in _model_rows(None)}
+    assert "cannot be told" in rows["mine"]
+    assert rows["pi0-tiny"] == "yes"

@@ -1,0 +1,79 @@
+"""Prompts are the paper's words, and places that a prompt cannot have are refused."""
+
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.vqa.phrases import Phrase
+from probe_kit.extract.vqa.templates import P1, P2, SEEN, TEMPLATES, Template, find_template, sides
+
+RED = Phrase("red shape", "the")
+CHOICE = "\n\nA left\nB right\n\nAnswer with the option's letter from the given choices directly."
+
+
+def test_the_three_prompts_read_as_in_the_paper() -> None:
+    assert SEEN.render(RED) == (
+        "Do you see the red shape? Answer yes or no. If yes, specify where: left, center, or right."
+    )
+    assert P1.render(RED) == ('Do you see the red shape? If yes, specify where: "left" or "right".' + CHOICE)
+    assert P2.render(RED) == "Put cube on red shape" + CHOICE
+    assert list(TEMPLATES) == ["seen", "p1", "p2"]
+
+
+def test_a_name_without_an_article_gets_none() -> None:
+    assert SEEN.render(Phrase("Ada Lovelace", "")).startswith("Do you see Ada Lovelace?")
+
+
+@pytest.mark.parametrize("template", TEMPLATES.values(), ids=TEMPLATES)
+def test_the_swapped_order_exchanges_the_sides_and_nothing_else(template: Template) -> None:
+    plain, swapped = (template.render(RED, order) for order in template.orders)
+    exchanged = swapped.replace("left", "#").replace("right", "left").replace("#", "right")
+    assert plain != swapped
+    assert exchanged.replace('"right" or "left"', '"left" or "right"') == plain
+    assert sides("original") == sides("swapped")[::-1] == ("left", "right")
+
+
+def test_which_prompts_take_letters_and_which_take_no() -> None:
+    assert [(one.lettered, one.yes_or_no, one.tokens) for one in TEMPLATES.values()] == [
+        (False, True, 24),
+        (True, False, 8),
+        (True, False, 8),
+    ]
+
+
+def test_a_file_is_a_prompt_of_its_own_name(tmp_path: Path) -> None:
+    file = tmp_path / "my prompt.txt"
+    file.write_text("Where is the {object}?\n(A) {A}\n(B) {B}\n")
+    mine = find_template(str(file))
+    assert mine.name == "my-prompt"
+    assert mine.lettered
+    assert mine.render(RED, "swapped") == "Where is the red shape?\n(A) right\n(B) left"
+    file.write_text("Where is {object}, on the left or on the right?")
+    free = find_template(str(file))
+    assert (free.lettered, free.orders) == (False, ("original",))
+    assert free.sha256 != mine.sha256
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("Where is it? A {A} B {B}", "places A, B; expected {object} once"),
+        ("Where is {object}? A {A}", "{A} and {B} once each or not at all"),
+        ("Where is {object} of {color}?", "place {color}"),
+        ("{object}, {object}", "once"),
+        ("Is {object} B {B} or A {A}? A {A}", "once each"),
+    ],
+)
+def test_places_that_no_prompt_has_are_refused(text: str, match: str) -> None:
+    with pytest.raises(UsageError, match=match):
+        Template("mine", text)
+
+
+def test_an_unknown_prompt_and_a_binary_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no prompt 'p3'; known: seen, p1, p2"):
+        find_template("p3")
+    file = tmp_path / "picture.png"
+    file.write_bytes(b"\x89PNG\xff")
+    with pytest.raises(UsageError, match="no UTF-8 text"):
+        find_template(str(file))

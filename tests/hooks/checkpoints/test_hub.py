@@ -1,0 +1,57 @@
+"""Without a network the hub is given up within seconds, and what the cache holds is used."""
+
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoints import hub
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
+
+
+@pytest.fixture
+def silent() -> Iterator[str]:
+    """An address that takes connections and never says a word."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.fixture(autouse=True)
+def _online(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(hub, "PATIENCE", 0.3)
+
+
+@pytest.mark.parametrize("address", ["http://127.0.0.1:9", "http://nowhere.invalid", "no address"])
+def test_a_hub_out_of_reach_is_said_within_seconds(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", address)
+    started = time.monotonic()
+    with pytest.raises(
+        CheckpointError, match=r"cannot fetch 'some/model' from the hub \(.*the cache has no copy\)"
+    ):
+        checkpoint_folder("some/model")
+    assert (
+        time.monotonic() - started < 20
+    )  # of a busy machine; the hub's own client takes that long when it is idle
+
+
+def test_a_hub_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch, silent: str) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", silent)
+    assert hub.unreachable() == f"{silent} says nothing for 0.3 s"  # whichever clock runs out first
+
+
+def test_offline_mode_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(hub, "urlopen", lambda *_, **__: pytest.fail("it was asked"))
+    assert "offline mode" in hub.unreachable()
+
+
+@pytest.mark.parametrize("name", ["some/[bold]", "some/..", "some/" + "a" * 200, "~nobody/x", "some/\x1b[31m"])
+def test_names_that_no_hub_has_are_refused_as_checkpoints(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(hub, "urlopen", lambda *_, **__: (_ for _ in ()).throw(OSError("no network")))
+    with pytest.raises(CheckpointError):
+        checkpoint_folder(name)

@@ -1,0 +1,73 @@
+"""Attention that is computed once more is what was paid: weighed with it, values give what was read."""
+
+import pytest
+import torch
+from torch.nn import functional
+from transformers import DynamicCache, LlamaConfig, LlamaModel
+
+from probe_kit.errors import UnsupportedInterventionError
+from probe_kit.hooks.families.shared.attention_weights import on_the_prompt, recomputed, returned, shares, weighed
+from probe_kit.models.xiaomi.transformer import Attention
+
+
+def test_shares_are_those_of_torchs_own_attention_under_either_kind_of_mask() -> None:
+    torch.manual_seed(0)
+    queries, keys, values = (torch.randn(2, heads, tokens, 8) for heads, tokens in ((4, 3), (2, 5), (2, 5)))
+    seen = torch.rand(2, 1, 3, 5) > 0.3
+    seen[..., 0] = True
+    every = values.repeat_interleave(2, dim=1)
+    expected = functional.scaled_dot_product_attention(
+        queries, keys.repeat_interleave(2, dim=1), every, attn_mask=seen, scale=0.5
+    )
+    added = torch.zeros(2, 1, 3, 5).masked_fill(~seen, torch.finfo(torch.float32).min)
+    for mask in (seen, added):
+        torch.testing.assert_close(shares(queries, keys, 0.5, {"attention_mask": mask}) @ every, expected)
+
+
+def test_llamas_last_position_is_weighed_as_eager_attention_weighs_it() -> None:
+    """Over the prompt and over every token behind it, with fewer heads for keys than for queries."""
+    torch.manual_seed(0)
+    config = LlamaConfig(
+        vocab_size=11, hidden_size=32, intermediate_size=16, num_hidden_layers=2, num_attention_heads=4,
+        num_key_value_heads=2, max_position_embeddings=32,
+    )  # fmt: skip
+    config._attn_implementation = "eager"
+    network, cache = LlamaModel(config).eval(), DynamicCache(config=config)
+    attentions = [layer.self_attn for layer in network.layers]
+    told: dict[str, dict[tuple[int, int], torch.Tensor]] = {"returned": {}, "recomputed": {}}
+
+    def noting(name: str):
+        return on_the_prompt(lambda block, iteration, weights: told[name].update({(block, iteration): weights}))
+
+    with (
+        torch.inference_mode(),
+        weighed(attentions, noting("returned"), returned),
+        weighed(attentions, noting("recomputed"), recomputed),
+    ):
+        for ids in ([[1, 2, 3, 4, 5, 6]], [[7]], [[8]]):
+            network(input_ids=torch.tensor(ids), past_key_values=cache, use_cache=True)
+    assert told["returned"].keys() == {(block, iteration) for block in (0, 1) for iteration in (0, 1, 2)}
+    for read, weights in told["returned"].items():
+        assert weights.shape == (1, 4, 1, 5)  # the prompt without its last token
+        torch.testing.assert_close(told["recomputed"][read], weights)
+
+
+def test_xiaomis_weights_on_its_values_are_what_its_attention_reads() -> None:
+    torch.manual_seed(0)
+    attention = Attention(32, 8, 2).eval()
+    stream, cache = torch.randn(2, 4, 32), (torch.randn(2, 2, 5, 8), torch.randn(2, 2, 5, 8))
+    rotation = (torch.randn(2, 4, 8), torch.randn(2, 4, 8))
+    mask = torch.ones(2, 1, 4, 9, dtype=torch.bool)
+    mask[1, :, :, :2] = False
+    with torch.inference_mode():
+        read = attention(stream, cache, rotation, mask)
+        weights = attention.weights(stream, cache, rotation, mask)
+        values = attention._parts(stream, cache, rotation)[2]
+        again = attention.o_proj((weights @ values).transpose(1, 2).flatten(2))
+    torch.testing.assert_close(again, read)
+    assert (weights[1, :, :, :2] == 0).all()
+
+
+def test_an_attention_of_another_kind_is_refused() -> None:
+    with pytest.raises(UnsupportedInterventionError, match="Exchange the memory"):
+        recomputed(torch.nn.Identity(), (), {}, None)

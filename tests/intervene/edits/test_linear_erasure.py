@@ -1,0 +1,187 @@
+"""Erasing an answer: what LEACE promises, held against scikit-learn; what the others and the controls do."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sklearn.covariance import ledoit_wolf_shrinkage
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LinearRegression, LogisticRegression
+
+from probe_kit.errors import UsageError
+from probe_kit.intervene.edits.linear_erasure import (
+    Eraser,
+    Method,
+    Tokens,
+    fit_control,
+    fit_eraser,
+    leace_direction,
+    ledoit_wolf,
+)
+
+POSITIONS, WIDTH = 3, 12
+METHODS = [Method.of(name) for name in ("leace", "mean-difference:2", "inlp:3")]
+
+
+def drawn(episodes: int = 120, gap: float = 2.0, seed: int = 0) -> tuple[Tokens, NDArray[np.bool_]]:
+    """Correlated noise, and an answer that lies elsewhere at every position."""
+    draw = np.random.default_rng(seed)
+    left = draw.permutation(np.arange(episodes) % 2 == 0)
+    noise = draw.normal(size=(episodes, POSITIONS, WIDTH)) @ draw.normal(size=(WIDTH, WIDTH))
+    where = draw.normal(size=(POSITIONS, WIDTH))
+    values = noise + gap * left[:, None, None] * where + 5.0
+    return Tokens(values, np.ones((episodes, POSITIONS), bool)), left
+
+
+def test_after_leace_no_linear_probe_reads_anything_in_what_it_was_fitted_on() -> None:
+    """Of any position, and of their mean: least squares explain nothing, logistic regression gives the prior."""
+    tokens, left = drawn()
+    erased = fit_eraser(tokens, left, Method())(tokens.values)
+    views = [erased[:, position] for position in range(POSITIONS)] + [erased.mean(axis=1)]
+    for before, after in zip([tokens.values[:, 0]] * len(views), views, strict=True):
+        assert LinearRegression().fit(before, left).score(before, left) > 0.3
+        assert LinearRegression().fit(after, left).score(after, left) == pytest.approx(0, abs=1e-8)
+        assert LinearDiscriminantAnalysis().fit(after, left).decision_function(after).std() < 1e-3
+        probe = LogisticRegression(C=1e4, max_iter=2000, tol=1e-8).fit(after, left)
+        np.testing.assert_allclose(probe.predict_proba(after)[:, 1], left.mean(), atol=1e-3)
+
+
+def test_leace_changes_the_least_of_all_that_leave_nothing_to_read() -> None:
+    """Than the projection on the difference of means, and than INLP as soon as that leaves nothing either."""
+    tokens, left = drawn(400)
+    centred, _ = tokens.centred()
+    values, label = centred[:, 0], left - left.mean()
+    removed, read = leace_direction(values, label, shrinkage=0.0)
+    own = float((np.outer(values @ read, removed) ** 2).sum())
+    along = removed / np.linalg.norm(removed)
+    assert own < float(((values @ along) ** 2).sum())
+    only = Tokens(tokens.values[:, :1], tokens.present[:, :1])
+    for rank in range(1, WIDTH + 1):
+        rest = fit_eraser(only, left, Method("inlp", rank))(only.values)
+        score = LinearRegression().fit(rest[:, 0], left).score(rest[:, 0], left)
+        if score < 0.01:
+            break
+    assert score < 0.01
+    assert own < float(((rest - only.values) ** 2).sum())
+
+
+def test_leace_is_the_projection_of_its_paper() -> None:
+    """W⁺ P W with W the whitening matrix and P the projection on the whitened covariance with the answer."""
+    tokens, left = drawn()
+    values = tokens.centred()[0][:, 0]
+    label = left - left.mean()
+    covariance = values.T @ values / len(values)
+    sizes, axes = np.linalg.eigh(covariance)
+    whiten, unwhiten = (axes @ np.diag(sizes**power) @ axes.T for power in (-0.5, 0.5))
+    seen = whiten @ (values.T @ label)
+    expected = unwhiten @ np.outer(seen, seen) / (seen @ seen) @ whiten
+    removed, read = leace_direction(values, label, shrinkage=0.0)
+    np.testing.assert_allclose(np.outer(removed, read), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("episodes", [9, 40, 300])
+def test_the_covariance_is_shrunk_as_ledoit_and_wolf_say(episodes: int) -> None:
+    draw = np.random.default_rng(episodes)
+    values = draw.normal(size=(episodes, 50)) * draw.uniform(0.1, 3, 50)
+    centred = values - values.mean(axis=0)
+    assert ledoit_wolf(centred) == pytest.approx(ledoit_wolf_shrinkage(centred, assume_centered=True))
+
+
+def test_fewer_episodes_than_dimensions_are_erased_as_well() -> None:
+    tokens, left = drawn(10)
+    erased = fit_eraser(tokens, left, Method())(tokens.values)
+    gap = erased[left].mean(axis=0) - erased[~left].mean(axis=0)
+    np.testing.assert_allclose(gap, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_every_way_takes_the_difference_of_means_and_its_control_does_not(method: Method) -> None:
+    tokens, left = drawn(gap=4.0)
+    own = fit_eraser(tokens, left, method)
+    control = fit_control(tokens, left, method, own, np.random.default_rng(0))
+
+    def gap(values: NDArray[np.float64]) -> float:
+        return float(np.linalg.norm(values[left].mean(axis=0) - values[~left].mean(axis=0)))
+
+    before, after, beside = (gap(values) for values in (
+        tokens.values, own(tokens.values), control(tokens.values),
+    ))  # fmt: skip
+    assert after < 0.5 * before
+    assert beside > after + 0.3 * before
+    assert own.removed.shape == control.removed.shape
+
+
+@pytest.mark.parametrize("method", METHODS[1:], ids=str)
+def test_directions_are_orthonormal_and_controls_stand_beside_them(method: Method) -> None:
+    tokens, left = drawn()
+    own = fit_eraser(tokens, left, method)
+    control = fit_control(tokens, left, method, own, np.random.default_rng(0))
+    for mine, other in zip(own.removed, control.removed, strict=True):
+        np.testing.assert_allclose(mine @ mine.T, np.eye(method.rank), atol=1e-5)
+        np.testing.assert_allclose(other @ other.T, np.eye(method.rank), atol=1e-5)
+        np.testing.assert_allclose(mine @ other.T, 0, atol=1e-5)
+
+
+def test_the_label_of_a_leace_control_is_uncorrelated_with_the_answer() -> None:
+    tokens, left = drawn()
+    own = fit_eraser(tokens, left, Method())
+    control = fit_control(tokens, left, Method(), own, np.random.default_rng(0))
+    rest = control(tokens.values)[:, 0]
+    assert LinearRegression().fit(rest, left).score(rest, left) > 0.3
+
+
+def test_a_position_with_too_few_episodes_is_left_as_it_is() -> None:
+    tokens, left = drawn()
+    tokens.present[5:, 2] = False
+    erase = fit_eraser(tokens, left, Method())
+    assert erase.fitted.tolist() == [True, True, False]
+    erased = erase(tokens.values)
+    np.testing.assert_array_equal(erased[:, 2], tokens.values[:, 2])
+    assert (erased[:, :2] != tokens.values[:, :2]).any()
+    np.testing.assert_array_equal(erase(tokens.values[:, :2]), erased[:, :2])
+    with pytest.raises(UsageError, match="4 episodes of either answer"):
+        fit_eraser(tokens.only(np.arange(3)), left[:3], Method())
+
+
+def test_erasing_is_in_place_of_nothing_else() -> None:
+    """The means over both answers stay, and an eraser without a direction changes no bit."""
+    tokens, left = drawn()
+    for method in METHODS:
+        erased = fit_eraser(tokens, left, method)(tokens.values)
+        np.testing.assert_allclose(erased.mean(axis=0), tokens.values.mean(axis=0), atol=1e-4)
+    none = np.zeros((1, 1, WIDTH))
+    means = tokens.values.mean(axis=0)
+    still = Eraser(means, none, none, np.ones(POSITIONS, bool))
+    np.testing.assert_array_equal(still(tokens.values), tokens.values)
+
+
+@pytest.mark.parametrize("name", ["", "lace", "leace:2", "inlp:0", "inlp:x", "mean-difference:-1"])
+def test_ways_that_are_none_are_refused(name: str) -> None:
+    with pytest.raises(UsageError):
+        Method.of(name)
+
+
+def test_ways_have_names() -> None:
+    assert [str(Method.of(name)) for name in ("leace", "inlp", "mean-difference:2")] == [
+        "leace", "inlp:5", "mean-difference:2",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "there"), [("mean-difference:4", POSITIONS), ("mean-difference:999", WIDTH), ("inlp:13", WIDTH)]
+)
+def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, there: int) -> None:
+    tokens, left = drawn()
+    with pytest.raises(UsageError, match=f"asks for .* have {there} to find; expected .*:{there} or fewer"):
+        fit_eraser(tokens, left, Method.of(name))
+
+
+@pytest.mark.parametrize(("way", "most"), [("mean-difference", 1), ("inlp", 2)])
+def test_controls_that_find_no_room_beside_it_are_refused(way: str, most: int) -> None:
+    """In four dimensions a control of three directions has one that is beside, and would be called equal."""
+    tokens, left = drawn()
+    narrow = Tokens(tokens.values[..., : 2 * most], tokens.present)
+    fits = {rank: fit_eraser(narrow, left, Method.of(f"{way}:{rank}")) for rank in (most, most + 1)}
+    control = fit_control(narrow, left, Method.of(f"{way}:{most}"), fits[most], np.random.default_rng(0))
+    assert (np.linalg.norm(control.removed, axis=-1) > 0.99).all()
+    with pytest.raises(UsageError, match=f"leaves room for {most - 1} random directions"):
+        fit_control(narrow, left, Method.of(f"{way}:{most + 1}"), fits[most + 1], np.random.default_rng(0))

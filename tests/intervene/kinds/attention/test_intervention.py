@@ -1,0 +1,233 @@
+"""Attention as an intervention that changes nothing: what is noted, stored and said of it."""
+
+import json
+import shutil
+from dataclasses import replace
+from math import ceil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import CaptureChangedActionError, CaptureError, UnsupportedInterventionError, UsageError
+from probe_kit.extract import Run, open_run, verify_run
+from probe_kit.hooks.capturing.attention import AttentionMass, attention
+from probe_kit.hooks.registry import find_family
+from probe_kit.intervene import (
+    Attention,
+    Effects,
+    Source,
+    Weighed,
+    intervene_on,
+    load_effects,
+    stored_attention,
+)
+from probe_kit.intervene.kinds.attention.intervention import Noting, by_role
+from probe_kit.intervene.kinds.attention.table import weighed_table
+from probe_kit.intervene.replay.conditions import Replayed
+from probe_kit.intervene.replay.image_tokens import TILES
+from probe_kit.intervene.replay.session import Bench
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+BLOCKS, ITERATIONS, HEADS = 3, 10, 8
+STEPS = 4
+"""Of the recorded run's episodes."""
+
+
+@pytest.fixture(scope="module")
+def noted(copy: Run, source: Source, twin: "Policy") -> Effects:
+    return intervene_on(copy, Attention(categories=("color",), items=2), source, load=lambda *_: twin)
+
+
+@pytest.fixture
+def weighed(noted: Effects) -> Weighed:
+    assert noted.attention is not None
+    return noted.attention
+
+
+def test_it_is_what_the_policy_tells_by_block_iteration_and_head(bench: Bench, weighed: Weighed) -> None:
+    """By hand, on the words of one question."""
+    (question, _) = bench.questions(str(weighed.episodes[0]).partition(":")[0])
+    row, role = list(weighed.episodes).index(question.episode_id), weighed.roles.index("language")
+    words = bench.policy.roles([question.seen])["backbone"][0].mask("language")
+    with attention(bench.policy) as mass:
+        bench.act(question.seen, question.seed)
+    assert weighed.mass.shape == (4, BLOCKS, ITERATIONS, HEADS, len(weighed.roles))
+    for (block, step), weights in mass.by_head.items():
+        expected = weights[0][:, words].sum(axis=-1)
+        np.testing.assert_allclose(weighed.mass[row, block, step, :, role], expected, rtol=1e-5)
+    by_head, by_role_alone = mass.heads_on(words), mass.on(words)
+    for read, share in by_head.items():
+        np.testing.assert_allclose(share.mean(axis=1), by_role_alone[read])
+
+
+def test_noting_changes_no_action_bit_for_bit(noted: Effects) -> None:
+    said = noted.certificate["attention"]
+    assert (said["inferences"], said["blocks"], said["iterations"], said["heads"]) == (
+        4,
+        BLOCKS,
+        ITERATIONS,
+        HEADS,
+    )
+    assert said["largest_change"] == 0.0
+    assert noted.certificate["replay"]["equal"] == 4
+    found = Replayed(
+        np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)), np.zeros(1),
+        mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
+    )  # fmt: skip
+    with pytest.raises(CaptureChangedActionError, match="1e-06"):
+        Attention().told([Noting("backbone", ("all",))], found)
+
+
+def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: Weighed) -> None:
+    shares = weighed.shares()
+    assert set(TILES) <= set(weighed.roles)
+    np.testing.assert_allclose(shares["all"] + shares["own"], 1)
+    rest = sum(shares[role] for role in weighed.roles if role not in ("all", *TILES))
+    np.testing.assert_allclose(rest, shares["all"], atol=1e-6)
+    np.testing.assert_allclose(
+        shares["image.correct"] + shares["image.other"], shares["image.left"] + shares["image.right"]
+    )
+    left = weighed.sides == "left"
+    np.testing.assert_array_equal(shares["image.correct"][left], shares["image.left"][left])
+    np.testing.assert_array_equal(shares["image.correct"][~left], shares["image.right"][~left])
+    apart = weighed.toward_correct("suite")
+    assert set(apart) == set(range(BLOCKS))
+    for block, (value, (low, high)) in apart.items():
+        own = shares["image.correct"][:, block] - shares["image.other"][:, block]
+        assert value == pytest.approx(own.mean())
+        assert low <= value <= high
+
+
+def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -> None:
+    """One block is never read; an episode has two calls, the other one."""
+    mass = np.arange(3 * 2 * 2 * 2, dtype=np.float32).reshape(3, 2, 2, 2, 1) / 100
+    mass[:, 1] = np.nan
+    mass[:, 0, 1, :] += np.float32(0.5)
+    weighed = Weighed(
+        ("all",), np.array(["a", "a", "b"]), np.array(["g", "g", "h"]), np.array(["color"] * 3),
+        np.array(["left", "left", "right"]), np.array([0, 1, 0]), mass,
+    )  # fmt: skip
+    (row, _) = weighed.rows(("block",))
+    cells = mass[:, 0, :, :, 0].astype(float)
+    assert (row.role, row.block, row.iteration, row.n_episodes) == ("all", 0, None, 2)
+    assert row.share == pytest.approx((cells[:2].mean() + cells[2].mean()) / 2)
+    by_call = weighed.frame(("block", "call")).query("role == 'all'")
+    assert by_call["call"].tolist() == [0, 1]
+    assert by_call["share"].iloc[1] == pytest.approx(cells[1].mean())
+    assert list(weighed.frame(("head",)).columns) == ["category", "role", "head", "share", "n_episodes"]
+    assert weighed.toward_correct("suite") == {}
+    again = Weighed.from_bytes(weighed.to_bytes())
+    np.testing.assert_array_equal(again.mass, mass)
+    assert again.to_bytes() == weighed.to_bytes()
+    with pytest.raises(UsageError, match="no axis 'layer'"):
+        weighed.rows(("layer",))  # type: ignore[arg-type]
+
+
+def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: Weighed) -> None:
+    mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
+    mass[..., at["special"]] = np.nan
+    mass[0, ..., at["image.left"]] = np.nan
+    hidden = replace(weighed, mass=mass)
+    found = {row.role: row.share for row in hidden.rows(())}
+    assert "special" not in found
+    assert found["image.left"] == pytest.approx(float(mass[1:, ..., at["image.left"]].mean()), rel=1e-5)
+    values = (hidden.shares()["image.correct"] - hidden.shares()["image.other"])[1:, 1]
+    assert hidden.toward_correct("suite")[1][0] == pytest.approx(values.mean())
+    every = replace(weighed, mass=np.where(np.arange(mass.shape[-1]) == at["special"], np.nan, weighed.mass))
+    assert weighed_table(every, "suite", "of").parts[0].headings == tuple(
+        role for role in weighed_table(weighed, "suite", "of").parts[0].headings if role != "special"
+    )
+
+
+def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, noted: Effects) -> None:
+    assert any("no cause" in note for note in noted.notes)
+    assert noted.verdicts == {}
+    assert noted.changes == noted.rows == []
+    assert load_effects(copy, kind="attention").to_csv() == noted.to_csv()
+    assert set(stored_attention(copy)) == {"color"}
+
+
+def test_the_command_shows_a_table_json_and_csv(copy: Run, noted: Effects) -> None:
+    def ask(style: str) -> str:
+        options = ["--kind", "attention", "--categories", "color", "--items", "2", "--format", style]
+        told = CliRunner().invoke(app, ["intervene", str(copy.path), *options])
+        assert told.exit_code == 0
+        assert f"stored as {noted.key}" in told.stderr
+        assert "no cause" in " ".join(told.stderr.split())
+        return told.stdout
+
+    shown = " ".join(ask("table").split())
+    assert "What does it weigh?" in shown
+    assert "correct − other" in shown
+    assert "block 02" in shown
+    found = json.loads(ask("json"))
+    assert found["certificate"]["attention"]["stream"] == "backbone"
+    assert {"category", "role", "block", "iteration", "head", "share"} <= found["effects"][0].keys()
+    assert ask("csv").splitlines()[0] == "category,role,block,iteration,head,share,n_episodes"
+    assert len(found["effects"]) == BLOCKS * ITERATIONS * HEADS * len({row["role"] for row in found["effects"]})
+
+
+def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: Source, twin: "Policy") -> None:
+    asked = Attention(categories=("shape",), items=1, roles=("language",), readout="shadow")
+    effects = intervene_on(copy, asked, source, load=lambda *_: twin)
+    assert effects.attention is not None
+    assert effects.attention.roles == ("all", "language")
+    calls = effects.attention.calls
+    assert calls.tolist() == 2 * list(range(ceil(STEPS / int(copy.settings["execute"]))))
+    assert effects.certificate["attention"]["largest_change"] == 0.0
+    assert effects.to_rich() is not None
+
+
+def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
+    copy: Run, noted: Effects, source: Source, twin: "Policy", tmp_path: Path
+) -> None:
+    mine = open_run(shutil.copytree(copy.path, tmp_path / "run"))
+    folder = mine.path / "interventions" / noted.key
+    shutil.rmtree(folder)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    asked = Attention(categories=("color",), items=2)
+    with pytest.raises(KeyboardInterrupt):
+        intervene_on(mine, asked, source, load=lambda *_: twin, progress=stop)
+    intervene_on(mine, asked, source, load=lambda *_: twin)
+    file = folder / "attention.npz"
+    for name in ("attention.npz", "episodes.npz", "effects.csv", "certificate.json"):
+        assert (folder / name).read_bytes() == (copy.path / "interventions" / noted.key / name).read_bytes()
+    file.write_bytes(file.read_bytes()[:-1] + b"?")
+    assert any("attention.npz" in problem for problem in verify_run(mine.path, deep=True).problems)
+
+
+def test_what_cannot_be_told_is_refused_by_name(bench: Bench) -> None:
+    for asked, family, missing in (
+        (Attention(), "internvla-m1", "attention"),
+        (Attention(roles=("image.left",)), "magma", "tiles"),
+    ):
+        with pytest.raises(UnsupportedInterventionError, match=f"{family} does not support.*{missing}"):
+            list(map(find_family(family).check_intervention, asked.needs))
+    with pytest.raises(UsageError, match=r"no token of backbone plays 'smell'; there are image"):
+        Attention(roles=("smell",)).conditions(bench)
+    with pytest.raises(UsageError, match="give each once"):
+        Attention(roles=("image", "image"))
+
+
+def test_blocks_with_other_numbers_of_heads_are_no_table() -> None:
+    weights = np.ones((1, 2, 3), np.float32) / 3
+    mass = AttentionMass({(0, 0): weights, (2, 1): weights})
+    found = by_role(mass, [np.array([True, False, True]), None])
+    assert found.shape == (3, 2, 2, 2)
+    assert np.isnan(found[..., 1]).all()
+    found = found[..., :1]
+    np.testing.assert_allclose(found[0, 0], 2 / 3)
+    assert np.isnan(found[1]).all()
+    assert np.isnan(found[0, 1]).all()
+    for other in (weights[:, :1], np.concatenate([weights, weights])):
+        with pytest.raises(CaptureError, match="as many heads"):
+            by_role(replace(mass, by_head={**mass.by_head, (1, 0): other}), [np.array([True] * 3)])

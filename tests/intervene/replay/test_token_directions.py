@@ -1,0 +1,131 @@
+"""Directions of the tokens themselves: where which token is marked is the answer, and the mean holds nothing."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.extract import Run
+from probe_kit.hooks import Site, capture
+from probe_kit.intervene import ClosedLoop, Interchange, Source, Steer, intervene_on
+from probe_kit.intervene.edits.linear_erasure import Method, Tokens
+from probe_kit.intervene.edits.sites import places
+from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.token_directions import TokenAxes, bases_of
+from probe_kit.intervene.replay.token_features import Gathered, by_episode, fit_by_fold
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+SITE = Site("backbone", 2)
+GROUPS, POSITIONS, WIDTH = 10, 6, 12
+
+
+def marked(mark: np.ndarray, seed: int = 0) -> Gathered:
+    """Four episodes per group: the first half of the tokens is marked for left, the second half for right."""
+    draw = np.random.default_rng(seed)
+    left = np.tile([True, False], 2 * GROUPS)
+    values = 0.05 * draw.normal(size=(left.size, POSITIONS, WIDTH))
+    first = np.arange(POSITIONS) < POSITIONS // 2
+    values += np.where(left[:, None] == first, 0.5, -0.5)[..., None] * mark
+    groups = np.repeat([f"g{number}" for number in range(GROUPS)], 4)
+    names = tuple(f"episode-{row}" for row in range(left.size))
+    return Gathered(names, groups, left, Tokens(values, np.ones(values.shape[:2], bool)))
+
+
+def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
+    mark = np.eye(WIDTH)[3]
+    own = marked(mark)
+    pooled = own.tokens.values.mean(axis=1)
+    difference = pooled[own.left].mean(axis=0) - pooled[~own.left].mean(axis=0)
+    assert np.linalg.norm(difference) < 0.05
+    fits = fit_by_fold(own, SITE, "image", Method.of("mean-difference:1"), 2, 0, "color")
+    found = by_episode(own, fits)
+    assert set(found) == {"mean-difference:1", "control-1", "control-2"}
+    for episode in own.episodes:
+        (direction,) = found["mean-difference:1"][episode].removed[0]
+        assert abs(float(direction @ mark)) > 0.99
+        for name in ("control-1", "control-2"):
+            (control,) = found[name][episode].removed[0]
+            assert np.linalg.norm(control) == pytest.approx(1.0)
+            assert abs(float(control @ direction)) < 1e-9
+
+
+def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
+    own, method = marked(np.eye(WIDTH)[3]), Method.of("mean-difference:2")
+    before = by_episode(own, fit_by_fold(own, SITE, "image", method, 1, 0, "color"))
+    spoilt = own.tokens.values.copy()
+    mine = own.groups == "g4"
+    spoilt[mine] = 100 * np.random.default_rng(1).normal(size=spoilt[mine].shape)
+    other = Gathered(own.episodes, own.groups, own.left, Tokens(spoilt, own.tokens.present))
+    after = by_episode(other, fit_by_fold(other, SITE, "image", method, 1, 0, "color"))
+    same = [
+        np.array_equal(before[str(method)][name].removed, after[str(method)][name].removed)
+        for name in own.episodes
+    ]
+    assert all(np.array(same)[mine])
+    assert not all(same)
+
+
+def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(bench: Bench, copy: Run) -> None:
+    """Held against numpy's decomposition of the tokens that the policy has there."""
+    items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))[:6]
+    (place,) = places("backbone.02", bench.policy)
+    heard: list[tuple[int, int]] = []
+    bench.learning = lambda done, total, _: heard.append((done, total))
+    (axes,) = bases_of(bench, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
+    bench.learning = None
+    assert heard == [(done, len(items)) for done in range(1, len(items) + 1)]
+    assert isinstance(axes, TokenAxes)
+    questions = [question for item in items for question in bench.questions(item)]
+    rows = []
+    for question in questions:
+        with capture(bench.policy, [SITE]) as tape:
+            bench.act(question.seen, question.seed)
+        mask = bench.policy.token_roles([question.seen])["backbone"][0].mask("image")
+        rows.append(tape[SITE][0].double().cpu().numpy()[mask])
+    values, left = np.array(rows), np.array([question.side_correct == "left" for question in questions])
+    chosen = {name: axes.basis("mean-difference:2", name, "color") for name in (q.episode_id for q in questions)}
+    episode = questions[0].episode_id
+    fold = np.array([np.array_equal(chosen[q.episode_id], chosen[episode]) for q in questions])
+    assert 0 < fold.sum() < fold.size
+    differences = values[~fold & left].mean(axis=0) - values[~fold & ~left].mean(axis=0)
+    _, _, expected = np.linalg.svd(differences, full_matrices=False)
+    basis = chosen[episode].astype(float)
+    np.testing.assert_allclose(basis.T @ basis, expected[:2].T @ expected[:2], atol=1e-5)
+    control = axes.basis("control-1", episode, "color")
+    assert control.shape == basis.shape
+    np.testing.assert_allclose(control @ basis.T, 0, atol=1e-5)
+
+
+def test_tokens_are_taken_over_along_them_and_along_controls(copy: Run, source: Source, twin: "Policy") -> None:
+    asked = Interchange(
+        categories=("color",), items=2, sites=("backbone.02",), roles=("image",), direction="mean-difference:2",
+        controls=1,
+    )  # fmt: skip
+    effects = intervene_on(copy, asked, source, load=lambda *_: twin)
+    assert [row.direction for row in effects.changes] == ["mean-difference:2", "control-1"]
+    own, control = effects.changes
+    assert own.fires == control.fires == 4
+    assert min(own.norm_ratio, control.norm_ratio) > 0
+    assert own.control_shift is not None
+
+
+@pytest.mark.parametrize("direction", ["mean-difference:0", "mean-difference:x", "leace", "inlp:2", "zap"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda direction: Interchange(direction=direction),
+        lambda direction: ClosedLoop(cells=("backbone.02|image",), direction=direction),
+        lambda direction: Steer(sites=("backbone.02",), role="image", direction=direction),
+    ],
+)
+def test_what_is_no_direction_is_refused_before_anything_is_loaded(asked: object, direction: str) -> None:
+    with pytest.raises(UsageError, match="direction"):
+        asked(direction)  # type: ignore[operator]
+
+
+def test_no_dose_is_added_along_directions_of_tokens() -> None:
+    with pytest.raises(UsageError, match="adds one vector to every token"):
+        Steer(sites=("backbone.02",), role="image", direction="mean-difference:1")

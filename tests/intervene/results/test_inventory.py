@@ -1,0 +1,64 @@
+"""`probe-kit run show`: every stored intervention, by its key."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.extract import Run, open_run
+from probe_kit.intervene import Erase, Follow
+from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.intervene.results.results import effects_csv
+from probe_kit.intervene.store.answers import save
+from probe_kit.intervene.store.settings import key_of, settings_of
+from tests.intervene.answers import answers_of, follower
+
+
+@pytest.fixture
+def run(little_runs: Path, tmp_path: Path) -> Run:
+    return open_run(shutil.copytree(little_runs / "run", tmp_path / "run"))
+
+
+def store(run: Run, asked: Follow | Erase) -> str:
+    answers, settings = answers_of({"color": follower(24)}), settings_of(asked, run)
+    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {})
+    return key_of(settings)
+
+
+def shown(run: Run, *options: str) -> str:
+    told = CliRunner().invoke(app, ["run", "show", str(run.path), *options])
+    assert told.exit_code == 0, told.stderr
+    return told.stdout if "--json" in options else " ".join(told.stdout.split())
+
+
+def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> None:
+    (first,) = listed_interventions(run)
+    assert (first.kind, first.state, first.categories) == ("follow", "used", ("color",))
+    more, erased = store(run, Follow(items=12)), store(run, Erase(sites=("backbone.01",), controls=2))
+    assert [(one.key, one.state) for one in listed_interventions(run)] == [
+        (first.key, "other"), (more, "used"), (erased, "used"),
+    ]  # fmt: skip
+    text = shown(run)
+    assert f"intervention {more}" in text
+    assert "follow of color; 12 items each; another one stands in its place in tables; made" not in text
+    assert "erase of color; controls 2; method leace; roles image; seed 0; sites backbone.01; made" in text
+    assert "another one stands in its place" in text
+    listed = json.loads(shown(run, "--json"))["interventions"]
+    assert [one["key"] for one in listed] == [first.key, more, erased]
+    assert listed[2]["asked"]["method"] == "leace"
+
+
+def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:
+    (first,) = listed_interventions(run)
+    partial = run.path / "interventions" / ".0123456789ab.partial"
+    partial.mkdir()
+    (partial / "000000.npz").write_bytes(b"")
+    sorted((run.path / "commits").iterdir())[-1].unlink()
+    text = shown(run)
+    assert f"intervention {first.key}" in text
+    assert "other episodes" in text
+    assert "unfinished 0123456789ab" in text
+    assert "1 items so far" in text

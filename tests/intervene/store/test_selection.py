@@ -1,0 +1,267 @@
+"""One of every kind is stored, in many orders: whatever came last, nothing takes another's place."""
+
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.extract.run_layout import INTERVENTIONS
+from probe_kit.extract.store.format.bundles import read_bundles, write_bundle
+from probe_kit.hooks import Site
+from probe_kit.intervene import Answers, Weighed, best_cells, judgements, stored_attention, stored_following
+from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.intervene.results.results import effects_csv, effects_of
+from probe_kit.intervene.results.site_maps import (
+    stored_along,
+    stored_carriers,
+    stored_passing,
+    stored_places,
+    stored_steering,
+)
+from probe_kit.intervene.store.answers import WEIGHED, Stored, save
+from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.train import ArrayRun
+from tests.intervene.answers import answers_of, follower, habit
+
+MANY, FEW = 24, 4
+Moves = Mapping[str, float]
+"""By condition, the share of episodes that go where the exchange brings them."""
+
+
+def color(episodes: int = MANY) -> Answers:
+    return answers_of({"color": follower(episodes)})
+
+
+def unmoved(answers: Answers) -> Answers:
+    """Where the pictures change nothing."""
+    return replace(answers, lateral=np.stack([answers.of("plain")] * 2))
+
+
+def moved(answers: Answers, moves: Moves) -> Answers:
+    turned = np.arange(answers.episodes.size)
+    rows = [
+        np.where(turned < share * turned.size, answers.of("exchanged"), answers.of("plain"))
+        for share in moves.values()
+    ]
+    lateral = np.vstack([answers.lateral, *rows])
+    return replace(
+        answers,
+        conditions=(*answers.conditions, *moves),
+        lateral=lateral,
+        changed=np.abs(lateral - lateral[0]),
+        ledger=np.ones((*lateral.shape, 5)),
+    )
+
+
+def noted(episodes: int, *roles: str) -> tuple[Answers, dict[str, bytes]]:
+    answers = color(episodes)
+    mass = np.full((episodes, 2, 1, 1, len(roles)), 1 / episodes, np.float32)
+    weighed = Weighed(
+        roles, answers.episodes, answers.groups, answers.categories, answers.sides, np.zeros(episodes, int), mass
+    )
+    return answers, {WEIGHED: weighed.to_bytes()}
+
+
+def ended(answers: Answers) -> Answers:
+    """Carried out, with nothing turned."""
+    changed = moved(answers, {"backbone.02|image": 0.0})
+    return replace(changed, outcomes=np.full(changed.lateral.shape, "correct"))
+
+
+CONTROL = "backbone.02|image|control-1"
+WRONG = {"toward": "wrong", "direction": "mean-difference", "seed": 0}
+STEERED = {"backbone.01|image|mean-difference|0": 0.0, "backbone.01|image|mean-difference|2": 0.5}
+MAP = {"backbone.00|all": 1.0, "backbone.00|image": 1.0, "backbone.02|all": 1.0, "backbone.02|image": 1.0,
+       "backbone.10|all": 0.0}  # fmt: skip
+POOL: dict[str, tuple[str, dict[str, Any], Callable[[], Answers]]] = {
+    "follow": ("follow", {}, lambda: answers_of({"color": follower(MANY), "shape": habit(MANY)})),
+    "follow, few": ("follow", {"items": 2}, lambda: color(FEW)),
+    "follow, shadow": ("follow", {"readout": "shadow"}, lambda: unmoved(color())),
+    "words": ("words", {}, lambda: unmoved(color())),
+    "map": ("interchange", {"direction": "none"}, lambda: moved(color(), MAP)),
+    "map, few": ("interchange", {"direction": "none", "items": 2},
+                 lambda: moved(color(FEW), dict.fromkeys(MAP, 0.0))),
+    "map, shadow": ("interchange", {"direction": "none", "readout": "shadow"},
+                    lambda: moved(unmoved(color()), {"backbone.00|all": 0.0})),
+    "end": ("interchange", {"direction": "none", "sites": "backbone.10"},
+            lambda: moved(color(), {"backbone.10|all": 0.0, "backbone.10|image": 0.0})),
+    "tiles": ("interchange", {"direction": "none", "roles": ["image.left"]},
+              lambda: moved(color(), {"backbone.02|image.left": 0.0})),
+    "memory": ("interchange", {"direction": "none", "sites": "memory.*"},
+               lambda: moved(color(), {"memory.00|all": 0.0, "memory.02|all": 1.0})),
+    "expert": ("interchange", {"direction": "none", "sites": "expert.03@0"},
+               lambda: moved(color(), {"expert.03@0|all": 0.0})),
+    "along": ("interchange", {"direction": "mean-difference", "seed": 0},
+              lambda: moved(color(), {"backbone.02|image|mean-difference": 1.0, CONTROL: 0.0})),
+    "along a probe": ("interchange", {"direction": "probe", "seed": 0},
+                      lambda: moved(color(), {"backbone.02|image|probe": 0.0, CONTROL: 0.0})),
+    "steer": ("steer", WRONG, lambda: moved(color(), STEERED)),
+    "steer, dose": ("steer", WRONG | {"doses": [4]},
+                    lambda: moved(color(), {"backbone.01|image|mean-difference|4": 1.0})),
+    "steer, place": ("steer", WRONG | {"sites": "backbone.02"},
+                     lambda: moved(color(), {"backbone.02|image|mean-difference|2": 0.0})),
+    "steer, left": ("steer", {"toward": "left", "direction": "mean-difference", "seed": 0},
+                    lambda: moved(color(), {"backbone.01|image|mean-difference|2": 0.0})),
+    "steer, few": ("steer", WRONG | {"items": 2},
+                   lambda: moved(color(FEW), dict.fromkeys(STEERED, 0.0))),
+    "erase": ("erase", {}, lambda: moved(color(), {"backbone.02|image|leace|1": 1.0})),
+    "closed loop": ("closed-loop", {}, lambda: ended(color())),
+    "attention": ("attention", {"roles": []}, lambda: color()),
+    "attention, few": ("attention", {"roles": [], "items": 2}, lambda: color(FEW)),
+    "attention, a role": ("attention", {"roles": ["image"]}, lambda: color()),
+}  # fmt: skip
+SHARES = {"attention": (MANY, "all", "image"), "attention, few": (FEW, "all", "image"),
+          "attention, a role": (MANY, "all")}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> ArrayRun:
+    answers = answers_of({"color": follower(MANY), "shape": habit(MANY)})
+    episodes = pd.DataFrame(
+        {
+            "episode_id": answers.episodes, "item_id": answers.items, "group_id": answers.groups,
+            "category": answers.categories, "side_correct": answers.sides, "layout": "original",
+            "outcome": "correct", "side_placed": answers.sides,
+        }
+    )  # fmt: skip
+    blank = np.zeros((len(episodes), 1))
+    path = tmp_path_factory.mktemp("standing")
+    made = ArrayRun(path, "pi0", "suite@1#0123456789ab", episodes, {(Site("backbone", 0), "mean"): blank})
+    for name in POOL:
+        store(made, name)
+    return made
+
+
+def settings_of(run: ArrayRun, name: str) -> dict[str, Any]:
+    kind, own, make = POOL[name]
+    categories = list(dict.fromkeys(make().categories.tolist()))
+    return {
+        "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": categories, "readout": "chunk", **own,
+    }  # fmt: skip
+
+
+def store(run: ArrayRun, name: str) -> None:
+    kind, own, make = POOL[name]
+    answers, further = noted(*SHARES[name]) if name in SHARES else (make(), {})
+    settings = settings_of(run, name)
+    toward = str(own.get("toward", "exchanged"))
+    written = effects_csv(answers, run.suite, toward, kind, further)
+    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
+    save(run.location, settings, key_of(settings), answers, written, {"replay": check}, further)
+
+
+def made_in(run: ArrayRun, names: list[str]) -> None:
+    """As if they had been stored in this order."""
+    for at, name in enumerate(names):
+        settings = settings_of(run, name)
+        head = {"settings": settings, "created": f"2026-01-01T00:00:{at:02d}"}
+        write_bundle(run.location, INTERVENTIONS, key_of(settings), head)
+
+
+def read(run: ArrayRun) -> dict[str, Any]:
+    """Every quantity that verdicts, tables and figures take from what is stored."""
+    found, encoded = stored_following(run), {"color": True, "shape": True}
+    return {
+        "follows": found,
+        "maps": stored_passing(run),
+        "along": stored_along(run),
+        "steering": stored_steering(run),
+        "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
+        "verdicts": judgements(found, encoded, stored_places(run), stored_carriers(run)),
+        "cells": best_cells(run, ["color"]),
+    }
+
+
+ORDERS = [list(POOL), list(POOL)[::-1], *(random.Random(seed).sample(list(POOL), len(POOL)) for seed in range(1))]
+"""Of any two, each comes last in one of the first two."""
+
+
+def test_what_is_read_does_not_depend_on_the_order_in_which_it_was_stored(run: ArrayRun) -> None:
+    made_in(run, ORDERS[0])
+    first = read(run)
+    for order in ORDERS[1:]:
+        made_in(run, order)
+        again = read(run)
+        for name, value in first.items():
+            # Where two have the same condition on the same episodes, only of which of them it is read differs.
+            assert unkeyed(again[name]) == unkeyed(value), (name, order[-3:])
+
+
+def unkeyed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: unkeyed(own) for name, own in value.items()}
+    if isinstance(value, list):
+        return [replace(row, key="") for row in value]
+    return value
+
+
+def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
+    seen = read(run)
+    verdict = seen["verdicts"]["color"]
+    assert verdict.verdict == "used"
+    assert verdict.reason == (
+        "passes at backbone.00, backbone.02; read at memory.02; carried by mean-difference at backbone.02 image"
+    )
+    assert seen["verdicts"]["shape"].verdict == "encoded, unused"
+    assert (seen["follows"]["color"].follows, seen["follows"]["color"].n_episodes) == (1.0, MANY)
+    cells = [(row.place, row.role, row.net) for row in seen["maps"]["color"]]
+    assert cells == [
+        ("backbone.00", "all", 1.0), ("backbone.00", "image", 1.0), ("backbone.02", "all", 1.0),
+        ("backbone.02", "image", 1.0), ("backbone.02", "image.left", 0.0), ("backbone.10", "all", 0.0),
+        ("backbone.10", "image", 0.0), ("expert.03@0", "all", 0.0), ("memory.00", "all", 0.0),
+        ("memory.02", "all", 1.0),
+    ]  # fmt: skip
+    assert {row.n_episodes for row in seen["maps"]["color"]} == {MANY}
+    assert [row.direction for row in seen["along"]["color"]] == [
+        "control-1", "mean-difference", "control-1", "probe",
+    ]  # fmt: skip
+    doses = {name: [row.dose for row in rows] for name, rows in seen["steering"]["color"].items()}
+    assert doses == {
+        "backbone.01 image, toward left": ["2"], "backbone.01 image": ["0", "2", "4"], "backbone.02 image": ["2"],
+    }  # fmt: skip
+    assert stored_attention(run)["color"].roles == ("all", "image")
+    assert seen["cells"] == ("backbone.02|image",)
+
+
+def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
+    made_in(run, [*(name for name in POOL if name != "map"), "map"])
+    names = {key_of(settings_of(run, name)): name for name in POOL}
+    states = {names[one.key]: one.state for one in listed_interventions(run)}
+    others = {"follow, few", "follow, shadow", "map, few", "map, shadow", "steer, few", "attention, few"}
+    assert {name for name, state in states.items() if state == "other"} == {*others, "attention, a role"}
+
+
+def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
+    key = key_of(settings_of(run, "follow, few"))
+    effects = effects_of(run, Stored(read_bundles(run.location, INTERVENTIONS)[key]))
+    assert effects.rows[0].n_episodes == FEW
+    assert effects.verdicts["color"].verdict == "inconclusive"
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["tiles"], None),
+        (["expert"], None),
+        (["along a probe"], None),
+        (["along"], None),
+        (["end"], ()),
+        (["end", "memory"], ("memory.02",)),
+        (["memory", "tiles", "expert"], ("memory.02",)),
+        (["map", "memory"], ("backbone.00", "backbone.02", "memory.02")),
+    ],
+)
+def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
+    tmp_path: Path, run: ArrayRun, names: list[str], said: tuple[str, ...] | None
+) -> None:
+    """That a single role, iteration, block or direction carries nothing says nothing of the others."""
+    alone = replace(run, path=tmp_path)
+    for name in names:
+        store(alone, name)
+    assert stored_places(alone).get("color") == said

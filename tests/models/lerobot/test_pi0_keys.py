@@ -1,0 +1,48 @@
+import torch
+from torch import Tensor
+
+from probe_kit.models.embedded.pi0_tiny import SIZE, _config
+from probe_kit.models.lerobot.pi0 import build_pi0
+from probe_kit.models.lerobot.pi0_keys import current_pi0_keys
+
+VLM = "model.paligemma_with_expert.paligemma"
+
+
+def todays_keys() -> dict[str, Tensor]:
+    return dict(build_pi0(_config(), SIZE).state_dict())
+
+
+def test_todays_keys_stay_as_they_are() -> None:
+    keys = todays_keys()
+    assert current_pi0_keys(keys).keys() == keys.keys()
+
+
+def test_the_layout_of_early_2025_is_brought_to_todays() -> None:
+    def aged(name: str) -> str:
+        for new, old in (
+            (f"{VLM}.model.language_model.", f"{VLM}.language_model.model."),
+            (f"{VLM}.lm_head.", f"{VLM}.language_model.lm_head."),
+            (f"{VLM}.model.vision_tower.", f"{VLM}.vision_tower."),
+            (f"{VLM}.model.multi_modal_projector.", f"{VLM}.multi_modal_projector."),
+        ):
+            name = name.replace(new, old)
+        return name
+
+    keys = todays_keys()
+    old = {aged(name): tensor for name, tensor in keys.items()}
+    old["normalize_inputs.buffer_observation_state.mean"] = torch.zeros(8)
+    assert old.keys() != keys.keys()
+    assert current_pi0_keys(old).keys() == keys.keys()
+
+
+def test_openpi_names_gain_prefix_and_time_mlp_names() -> None:
+    renamed = current_pi0_keys({"time_mlp_in.bias": torch.zeros(2), "state_proj.bias": torch.zeros(2)})
+    assert renamed.keys() == {"model.action_time_mlp_in.bias", "model.state_proj.bias"}
+
+
+def test_a_lone_lm_head_becomes_the_embedding_but_never_replaces_one() -> None:
+    head, embedding = torch.ones(4, 2), torch.zeros(4, 2)
+    name = f"{VLM}.model.language_model.embed_tokens.weight"
+    assert torch.equal(current_pi0_keys({f"{VLM}.lm_head.weight": head})[name], head)
+    both = current_pi0_keys({f"{VLM}.lm_head.weight": head, name: embedding})
+    assert torch.equal(both[name], embedding)

@@ -1,0 +1,218 @@
+"""The join of known, encoded and used, recomputed from first principles, and what it refuses."""
+
+import math
+from collections import Counter
+from dataclasses import replace
+from io import StringIO
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.columns.known_used_table import rich_join
+from probe_kit.retention.compare.known_used import Joined, encoded_decisions, join
+from tests.retention.asked_runs import SaidRun, acted, asked, probes
+
+SIZES = {"color": 14, "shape": 12}
+
+
+def by_chance(seed: int, share: float) -> dict[str, np.ndarray]:
+    draw = np.random.default_rng(seed)
+    return {category: draw.random((count, 2)) < share for category, count in SIZES.items()}
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> tuple[SaidRun, SaidRun]:
+    return asked(tmp_path, by_chance(1, 0.9)), acted(tmp_path, by_chance(2, 0.6))
+
+
+# -- the same, by loops ----------------------------------------------------------------------------------
+
+
+def recount(reader: SaidRun, policy: SaidRun, encoded: dict[str, bool], category: str) -> dict:
+    """Every number of a row of the join by counting, without any of the package's functions."""
+    said = dict(zip(reader.episodes["episode_id"], reader.episodes["outcome"], strict=True))
+    items: dict[str, list[tuple[bool, bool, bool]]] = {}
+    group: dict[str, str] = {}
+    for row in policy.episodes.to_dict("records"):
+        if category in (row["category"], "all"):
+            marks = (said[row["episode_id"]] == "correct", encoded[row["episode_id"]], row["outcome"] == "correct")
+            items.setdefault(row["item_id"], []).append(marks)
+            group[row["item_id"]] = row["group_id"]
+    both = {item: tuple(all(one[k] for one in marks) for k in range(3)) for item, marks in items.items()}
+    tests = {}
+    for first, second in ((0, 2), (1, 2), (0, 1)):
+        gain = {item: int(marks[first]) - int(marks[second]) for item, marks in both.items()}
+        tests[first, second] = (gain, {item: group[item] for item in gain})
+    return {
+        "counts": Counter("".join(str(int(mark)) for mark in marks) for marks in both.values()),
+        "episodes": Counter("".join(str(int(m)) for m in marks) for own in items.values() for marks in own),
+        "tests": {pair: (binomial(gain), flips(gain, groups)) for pair, (gain, groups) in tests.items()},
+        "kept": [marks[2] for marks in both.values() if marks[0] and marks[1]],
+        "linked": hypergeometric([(marks[0], marks[2]) for marks in both.values() if marks[1]]),
+    }
+
+
+def binomial(gain: dict[str, int]) -> float:
+    more, fewer = sum(g > 0 for g in gain.values()), sum(g < 0 for g in gain.values())
+    n = more + fewer
+    tail = sum(math.comb(n, k) for k in range(min(more, fewer) + 1)) / 2**n
+    return min(1.0, 2 * tail) if n else 1.0
+
+
+def flips(gain: dict[str, int], groups: dict[str, str]) -> float:
+    sums = Counter()
+    for item, value in gain.items():
+        sums[groups[item]] += value
+    values = [value for value in sums.values() if value]
+    total = abs(sum(values))
+    found = [
+        abs(sum(s * v for s, v in zip(signs, values, strict=True)))
+        for signs in product((1, -1), repeat=len(values))
+    ]
+    return sum(one >= total for one in found) / len(found)
+
+
+def hypergeometric(marks: list[tuple[bool, bool]]) -> float:
+    """Fisher's two-sided p: all tables of these margins that are no likelier."""
+    n, known, used = len(marks), sum(k for k, _ in marks), sum(u for _, u in marks)
+    chance = {
+        x: math.comb(known, x) * math.comb(n - known, used - x) / math.comb(n, used)
+        for x in range(max(0, used - (n - known)), min(known, used) + 1)
+    }
+    seen = chance[sum(k and u for k, u in marks)]
+    return sum(p for p in chance.values() if p <= seen * (1 + 1e-7))
+
+
+def interval(hits: int, n: int) -> tuple[float, float]:
+    """Clopper and Pearson's, by halving."""
+
+    def below(k: int, share: float) -> float:
+        return sum(math.comb(n, x) * share**x * (1 - share) ** (n - x) for x in range(k + 1))
+
+    def solve(right: float, k: int) -> float:
+        low, high = 0.0, 1.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if below(k, middle) > right else (low, middle)
+        return low
+
+    return (0.0 if hits == 0 else solve(0.975, hits - 1)), (1.0 if hits == n else solve(0.025, hits))
+
+
+def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    results = probes(policy, {"color": [0.5, 0.8, 0.85], "shape": [0.7, 0.9]})
+    encoded: dict[str, bool] = {}
+    for curve in results.curves.values():
+        encoded |= dict(zip(curve.episodes, encoded_decisions(curve), strict=True))
+    found = join(reader, policy, results)
+    assert [row.category for row in found.rows] == ["color", "shape", "all"]
+    for row in found.rows:
+        expected = recount(reader, policy, encoded, row.category)
+        assert {code: n for code, n in row.counts.items() if n} == dict(expected["counts"])
+        assert {code: n for code, n in row.episodes.items() if n} == dict(expected["episodes"])
+        for one, (pair, (binomial_p, flip)) in zip(row.comparisons, expected["tests"].items(), strict=True):
+            assert (one.first, one.second) == tuple(("known", "encoded", "used")[k] for k in pair)
+            assert one.p_mcnemar == pytest.approx(binomial_p)
+            assert one.p_groups == pytest.approx(flip)
+            assert one.p == max(one.p_mcnemar, one.p_groups)
+        lost = expected["kept"].count(False)
+        assert (row.known_and_encoded, row.not_used) == (len(expected["kept"]), lost)
+        assert row.not_used_ci == pytest.approx(interval(lost, len(expected["kept"])), abs=1e-6)
+        if row.category != "all":
+            assert row.p_linked == pytest.approx(expected["linked"])
+    singles = [one.p for row in found.rows[:2] for one in row.comparisons]
+    order = np.argsort(singles)
+    stepped = np.maximum.accumulate([(6 - rank) * singles[at] for rank, at in enumerate(order)]).clip(max=1)
+    holm = [one.p_holm for row in found.rows[:2] for one in row.comparisons]
+    np.testing.assert_allclose(np.array(holm)[order], stepped)
+
+
+def test_encoded_decisions_are_chosen_on_other_groups(tmp_path: Path) -> None:
+    """Among a hundred sites that guess the best one looks good, and its held-out decisions still guess."""
+    policy = acted(tmp_path, {"color": np.ones((60, 2), bool)})
+    curve = probes(policy, {"color": [0.5] * 100}).curves["color", "mean"]
+    luck = curve.correct.mean(axis=1).max()
+    held_out = np.mean([encoded_decisions(curve, seed).mean() for seed in range(20)])
+    assert luck > 0.58
+    assert abs(held_out - 0.5) < 0.06
+
+
+def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(tmp_path: Path) -> None:
+    one_side = {"color": np.array([[True, False], [False, True]] * 10)}
+    found = join(asked(tmp_path, one_side), acted(tmp_path, one_side))
+    (row,) = found.rows
+    assert (row.known, row.used, row.encoded) == (0, 0, None)
+    assert row.counts == {"1-1": 0, "1-0": 0, "0-1": 0, "0-0": 20}
+    assert row.guessed == pytest.approx({"1-1": 1.25, "1-0": 3.75, "0-1": 3.75, "0-0": 11.25})
+    assert row.episodes == {"1-1": 20, "1-0": 0, "0-1": 0, "0-0": 20}
+
+
+def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    assert join(scored(reader, "logits"), policy).rows[-1].known == 0, "it always says left"
+    debiased = join(scored(reader, "debiased"), policy)
+    assert debiased.rows[-1].known == 26
+    assert debiased.score == "debiased"
+
+
+def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    found = join(reader, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
+    assert [row.signal for row in found.rows] == [True, False, None]
+    assert any(note.startswith("In shape probes beat neither") for note in found.notes)
+
+
+def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    other = policy.episodes.assign(
+        first_frame_sha256=policy.episodes["first_frame_sha256"].where(policy.episodes.index > 1, "another")
+    )
+    with pytest.raises(OtherFramesError, match="2 of 52 episodes begin with another frame"):
+        join(reader, replace(policy, episodes=other))
+    for bare in (policy.episodes.drop(columns="first_frame_sha256"), other.assign(first_frame_sha256=None)):
+        with pytest.raises(OtherFramesError, match="does not say what its first frames were"):
+            join(reader, replace(policy, episodes=bare))
+
+
+def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    with pytest.raises(UsageError, match="not an asked and an acting run, in this order"):
+        join(policy, reader)
+    strange = policy.episodes.assign(item_id="other-" + policy.episodes["item_id"])
+    with pytest.raises(UsageError, match="no question in common"):
+        join(reader, replace(policy, episodes=strange))
+    half = policy.episodes[policy.episodes["layout"] == "original"]
+    with pytest.raises(UsageError, match="no item in both layouts"):
+        join(reader, replace(policy, episodes=half))
+    with pytest.raises(UsageError, match="view 'last' was not probed"):
+        join(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
+
+
+def test_what_is_left_out_is_said(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    fewer = replace(reader, episodes=reader.episodes[reader.episodes["category"] == "color"])
+    found = join(fewer, policy, probes(policy, {"color": [0.9]}))
+    assert [row.category for row in found.rows] == ["color"]
+    assert any(note.startswith("24 episodes of") for note in found.notes)
+
+
+def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRun, SaidRun]) -> None:
+    reader, policy = runs
+    found = join(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
+    console = Console(width=150, record=True, file=StringIO())
+    console.print(rich_join(found))
+    text = console.export_text()
+    for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "known − used"):
+        assert words in text
+    frame = found.to_frame()
+    assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}
+    assert found.to_json()["rows"][0]["counts"] == found.rows[0].counts
+    assert isinstance(found.rows[0], Joined)
+    assert isinstance(frame, pd.DataFrame)

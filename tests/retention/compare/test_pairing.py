@@ -1,0 +1,261 @@
+"""Several runs as one comparison: which are paired, what their differences are, and what they are called."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from io import StringIO
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.train import ArrayRun, load_results
+from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
+
+ProbedRun = Callable[..., ArrayRun]
+Hits = dict[str, np.ndarray[Any, np.dtype[np.bool_]]]
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
+WEAK = ([0.5, 0.8, 0.6], [[0.5, 0.8]])
+
+
+def hits(share: float, seed: int, items: Mapping[str, int] | None = None) -> Hits:
+    """Per category (N, 2), whether each item is right in each layout."""
+    draw = np.random.default_rng(seed)
+    return {name: draw.random((count, 2)) < share for name, count in (items or {"color": 20, "shape": 24}).items()}
+
+
+def run(folder: Path, right: Hits, suite: str = SUITE, called: str = "", **settings: object) -> SaidRun:
+    """An acting run in a folder of its own."""
+    return SaidRun(folder, folder.name, suite, episodes(right), {}, settings=settings, called=called)
+
+
+def difference(table: RetentionTable, minus: str, category: str) -> Difference:
+    (found,) = [row for row in table.differences if (row.minus, row.category) == (minus, category)]
+    return found
+
+
+# -- against an oracle of its own ----------------------------------------------------------------------------
+
+
+def oracle(gains: pd.Series, groups: pd.Series) -> tuple[float, float, float, float]:
+    """Mean gain, its interval by a plain loop over draws of groups, and p by trying every flip of their signs."""
+    names = sorted(set(groups))
+    of_group = {name: gains[groups == name].to_numpy(float) for name in names}
+    draw = np.random.default_rng(99)
+    means = []
+    for _ in range(4000):
+        drawn = [of_group[names[at]] for at in draw.integers(len(names), size=len(names))]
+        means.append(np.concatenate(drawn).mean())
+    low, high = np.quantile(means, [0.025, 0.975])
+    sums = [values.sum() for values in of_group.values() if values.sum()]
+    observed = abs(sum(sums))
+    flips = [
+        abs(sum(sign * one for sign, one in zip(signs, sums, strict=True)))
+        for signs in product((1, -1), repeat=len(sums))
+    ]
+    return float(gains.mean()), float(low), float(high), float(np.mean([one >= observed - 1e-9 for one in flips]))
+
+
+def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "one", hits(0.8, 0)), run(tmp_path / "other", hits(0.5, 1))
+    table = retention([one, other])
+    for category in ("color", "shape"):
+        mine, theirs = (r.episodes[r.episodes["category"] == category].reset_index() for r in (one, other))
+        gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
+        value, low, high, p = oracle(gains, mine["group_id"])
+        found = difference(table, "other", category)
+        assert (found.group, found.paired) == ("one", True)
+        assert found.sr == pytest.approx(value)
+        assert found.sr_ci == (pytest.approx(low, abs=0.03), pytest.approx(high, abs=0.03))
+        assert found.p == pytest.approx(p)
+
+
+def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_run: ProbedRun) -> None:
+    one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
+    found = difference(retention([one, other]), "other", "color")
+    best = []
+    for probed in (one, other):
+        curve = load_results(probed).curves["color", "mean"]
+        backbone = [at for at, site in enumerate(curve.sites) if site.stream == "backbone"]
+        right = (curve.decisions[backbone] > 0) == curve.labels
+        best.append(right[right.mean(axis=1).argmax()].astype(float))
+    value, low, high, _ = oracle(pd.Series(best[0] - best[1]), pd.Series(curve.groups))
+    assert found.prefix_accuracy == pytest.approx(value)
+    assert found.prefix_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
+
+
+def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> None:
+    items = {"color": 400, "shape": 24}
+    right, other = hits(0.5, 0, items), hits(0.5, 1, items)
+    nearly = {name: array.copy() for name, array in right.items()}
+    nearly["color"][0, 0] ^= True
+    table = retention(
+        [run(tmp_path / name, own) for name, own in (("one", right), ("nearly", nearly), ("other", other))]
+    )
+    widths = []
+    for name in ("nearly", "other"):
+        low, high = difference(table, name, "color").sr_ci or (0, 0)
+        widths.append((high or 0) - (low or 0))
+    assert widths[0] < 0.6 * widths[1]
+
+
+def test_holm_holds_over_all_categories_of_all_pairs(tmp_path: Path) -> None:
+    runs = [run(tmp_path / f"run-{seed}", hits(0.9 - 0.2 * seed, seed)) for seed in range(3)]
+    rows = retention(runs).differences
+    for means in (False, True):
+        family = sorted((row for row in rows if (row.category == "mean") == means), key=lambda row: row.p or 0)
+        assert len(family) == (2 if means else 4)
+        highest = 0.0
+        for rank, row in enumerate(family):
+            assert row.p is not None
+            highest = max(highest, min(1.0, (len(family) - rank) * row.p))
+            assert row.p_holm == pytest.approx(highest)
+
+
+def test_a_group_of_runs_is_tested_by_its_mean_on_the_same_items(tmp_path: Path) -> None:
+    first, second, third = (run(tmp_path / name, hits(0.7, at)) for at, name in enumerate("abc"))
+    table = retention({"two": [first, second], "one": [third]})
+    right = [(r.episodes["outcome"] == "correct").astype(float) for r in (first, second, third)]
+    of_color = first.episodes["category"] == "color"
+    gains = ((right[0] + right[1]) / 2 - right[2])[of_color]
+    value, _, _, p = oracle(gains, first.episodes["group_id"][of_color])
+    found = difference(table, "one", "color")
+    assert (found.sr, found.p) == (pytest.approx(value), pytest.approx(p))
+    assert found.run is None
+
+
+# -- which are compared --------------------------------------------------------------------------------------
+
+
+def pairs(table: RetentionTable) -> list[tuple[str, str]]:
+    return list(dict.fromkeys((row.group, row.minus) for row in table.differences))
+
+
+def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_named(tmp_path: Path) -> None:
+    runs = [run(tmp_path / name, hits(0.5, at)) for at, name in enumerate("abc")]
+    assert pairs(retention(runs)) == [("a", "b"), ("a", "c")]
+    assert pairs(retention(runs, against="b")) == [("a", "b"), ("c", "b")]
+    assert pairs(retention(runs, against=str(tmp_path / "c"))) == [("a", "c"), ("b", "c")]
+    groups = {"x": runs[:1], "y": runs[1:2], "z": runs[2:]}
+    assert pairs(retention(groups)) == [("x", "y"), ("x", "z"), ("y", "z")]
+    assert pairs(retention(groups, against="y")) == [("x", "y"), ("z", "y")]
+
+
+def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
+    runs = [run(tmp_path / name, hits(0.5, at), called="twin") for at, name in enumerate("ab")]
+    with pytest.raises(UsageError, match=r"--against 'c' is none of the runs a \(twin · .*\), b"):
+        retention(runs, against="c")
+    with pytest.raises(UsageError, match="--against 'twin' is several of the runs"):
+        retention(runs, against="twin")
+    with pytest.raises(UsageError, match="there is no group 'z' to compare with; there are x, y"):
+        retention({"x": runs[:1], "y": runs[1:]}, against="z")
+    with pytest.raises(UsageError, match="needs a second run"):
+        retention(runs[:1], against="a")
+
+
+def test_one_run_twice_is_refused(tmp_path: Path) -> None:
+    one = run(tmp_path / "one", hits(0.5, 0))
+    with pytest.raises(UsageError, match="given twice"):
+        retention([one, one])
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [
+        ({"suite": "other@1#ba9876543210"}, "other suites (suite@1#0123456789ab and other@1#ba9876543210)"),
+        ({"seed": 4}, "other seeds (0 and 4)"),
+        ({"right": hits(0.5, 1, {"color": 18, "shape": 22})}, "other episodes in every category"),
+        ({"right": hits(0.5, 1, {"counting": 4})}, "no category in common"),
+    ],
+)
+def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
+    tmp_path: Path, other: dict[str, Any], why: str
+) -> None:
+    from rich.console import Console
+
+    there = {"right": hits(0.5, 1), "seed": 0} | other
+    table = retention([run(tmp_path / "one", hits(0.5, 0), seed=0), run(tmp_path / "other", **there)])
+    assert table.differences == []
+    assert table.unpaired == (f"one and other are not compared: {why}.",)
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(table.to_rich())
+    for text in (table.to_markdown(), table.to_latex().replace("\\#", "#"), console.export_text()):
+        assert table.unpaired[0] in text
+
+
+def test_other_words_are_other_questions(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
+    side = replace(other, episodes=other.episodes.assign(wording="side"))
+    assert "other wordings (knowledge and side)" in retention([one, side]).unpaired[0]
+    own = replace(other, episodes=other.episodes.assign(wording="knowledge"))
+    assert retention([one, own]).differences
+
+
+def test_a_category_with_other_items_alone_is_left_out(tmp_path: Path) -> None:
+    one = run(tmp_path / "one", hits(0.5, 0))
+    other = run(tmp_path / "other", hits(0.5, 1, {"color": 20, "shape": 10}))
+    table = retention([one, other])
+    assert [row.category for row in table.differences] == ["color", "mean"]
+    assert table.differences[1].categories == ("color",)
+    assert table.unpaired == ("one and other are not compared in shape: other episodes.",)
+
+
+def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path: Path) -> None:
+    readers = [asked(tmp_path / str(at), hits(0.7, at), f"reader-{at}") for at in range(2)]
+    policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
+    mixed = [policies[0], readers[0], policies[1], readers[1]]
+    table = retention(mixed)
+    assert pairs(table) == [("reader-0", "reader-1"), ("policy-0", "policy-1")]
+    assert table.unpaired == ("Asked and acting runs are not compared with each other here; --gap does that.",)
+    assert retention(mixed, gap=True).unpaired == ()
+    accuracy = [(r.episodes["outcome"] == "correct").mean() for r in readers]
+    gain = next(row.sr for row in table.differences if row.category == "mean")
+    right = [row.sr for row in table.means if row.kind == "asks"]
+    assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]
+    assert accuracy[0] != accuracy[1]
+
+
+def test_a_run_without_probes_is_compared_in_what_it_did(probed_run: ProbedRun, tmp_path: Path) -> None:
+    probed = probed_run({"color": SIGNAL})
+    bare = ArrayRun(tmp_path / "bare", "bare", probed.suite, probed.episodes, {})
+    table = retention([probed, bare])
+    assert [(row.category, row.view) for row in table.differences] == [("color", None), ("mean", None)]
+    assert all(row.sr == 0 and row.prefix_accuracy is None for row in table.differences)
+
+
+# -- names ---------------------------------------------------------------------------------------------------
+
+
+def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
+    right = hits(0.5, 0)
+    same = [run(tmp_path / part / "run", right, called="pi0") for part in "abc"]
+    random = replace(run(tmp_path / "d", right, called="pi0"), random_weights=True)
+    disguised = run(tmp_path / "e", right, called="pi0 (random weights)")
+    names = full_names([*same, random, disguised])
+    assert len(set(names)) == 5
+    models = {row.label for row in retention(same).rows}
+    assert len(models) == 3
+
+
+# -- JSON ----------------------------------------------------------------------------------------------------
+
+
+def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path: Path) -> None:
+    one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
+    alone = json.loads(retention([one]).to_json())
+    assert all("differences" not in row for row in alone)
+    both = json.loads(retention([one, other]).to_json())
+    assert [row["run"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
+    assert [{name: row[name] for name in alone[0]} for row in both[:3]] == alone
+    (found,) = both[0]["differences"]
+    assert found["minus_run"] == str(tmp_path / "other")
+    assert found["category"] == both[0]["category"] == "color"
+    assert found["sr"] == pytest.approx(both[0]["sr"] - both[3]["sr"])
+    assert [row["differences"] for row in both[3:]] == [[], [], []]

@@ -1,0 +1,205 @@
+"""What a terminal shows, read back number by number."""
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from probe_kit.retention import RetentionTable, retention
+from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results, save_results
+
+ProbedRun = Callable[..., ArrayRun]
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
+NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
+PERFECT = ([1.0, 1.0, 1.0], [[1.0, 1.0]])
+WIDTHS = (24, 40, 60, 80, 100, 120, 160, 240)
+"""Columns; 120 in a pipe."""
+
+
+def printed(table: RetentionTable, width: int = 80) -> str:
+    console = Console(width=width, file=io.StringIO())
+    console.print(table.to_rich())
+    return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
+
+
+@pytest.fixture
+def table(probed_run: ProbedRun) -> RetentionTable:
+    """Wide numbers: long names, 100 %, negative limits, controls, a twin, two groups."""
+    accuracies = {"facial_emotion": SIGNAL, "traffic_sign": PERFECT, "counting": NONE}
+    runs = [probed_run(accuracies, name) for name in ("one", "other")]
+    for run in runs:
+        results = load_results(run)
+        controls = Controls(
+            tuple(
+                BaselineScore(name, category, 0.4625, (0.4, 0.5), 0.4, 0.5, 200)
+                for name in ("position", "instruction", "pixels")
+                for category in accuracies
+            ),
+            tuple(
+                TwinScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "a twin")
+                for site in ("backbone.01.residual", "expert.01.residual@0")
+                for category in accuracies
+            ),
+        )
+        save_results(replace(results, controls=controls), run.path)
+    return retention({"first": [runs[0]], "second": [runs[1]]})
+
+
+def numbers(text: str) -> list[float]:
+    return [float(found) for found in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text.replace("−", "-"))]
+
+
+LINE = re.compile(r"(facial_emotion|traffic_sign|counting|mean) (A|B|A − B)")
+
+
+def blocks(text: str) -> Iterator[tuple[str, dict[tuple[str, str], list[float]]]]:
+    """Title and, by category and run, all numbers of the block in order, from however many tables it has."""
+    for block in re.split(r"\n(?=Success rate: )|\n(?=(?:Retention|Controls),)", text):
+        found: dict[tuple[str, str], list[float]] = {}
+        for line in block.splitlines():
+            name, *cells = re.split(r" {2,}", line.strip())
+            if cells and (whose := LINE.fullmatch(name)):
+                found.setdefault((whose[1], whose[2]), []).extend(one for cell in cells for one in numbers(cell))
+        yield block.splitlines()[0], found
+
+
+def rounded(values: list[object], scales: list[tuple[float, int]]) -> list[float]:
+    """What a table shows of json values: None and undefined ones are left out, intervals are flat."""
+    shown = []
+    for value, (scale, digits) in zip(values, scales, strict=True):
+        parts = value if isinstance(value, list) else [value]
+        shown += [round(scale * one, digits) for one in parts if one is not None]
+    return shown
+
+
+SHARE, RATIO, WHOLE, PLACE, P = (100, 1), (1, 2), (100, 0), (1, 0), (1, 3)
+
+
+RETENTIONS = ("bounded", "bounded_ci", "area", "area_ci", "debiased", "ci")
+
+
+def expected(row: dict[str, object]) -> dict[str, list[float]]:
+    defined = bool(row["retention_defined"])
+    score = row["normalised_score"]
+    return {
+        "Success": rounded(
+            [
+                row["sr"],
+                row["sr_ci"],
+                row["delta_regime"],
+                row["delta"],
+                score,
+                row["sr_left"],
+                row["sr_right"],
+                row["p_wrong"],
+                row["p_oob"],
+            ],
+            [SHARE, SHARE, SHARE, SHARE, (1, 1), WHOLE, WHOLE, SHARE, SHARE],
+        ),
+        "Retention": rounded(
+            [
+                *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer")),
+                row["prefix_ties"] or None,
+                row["prefix_p_fwe"],
+                *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration")),
+                row["action_ties"] or None,
+                *(row[f"action_{name}"] for name in ("p_fwe", "first_accuracy")),
+                *(row[f"retention_{name}"] if defined else None for name in RETENTIONS),
+                row["retention"] if defined else None,
+                row["gap"],
+            ],
+            [SHARE, SHARE, PLACE, PLACE, P, SHARE, SHARE, PLACE, PLACE, PLACE, P, SHARE, *[RATIO] * 7, SHARE],
+        ),
+        "Controls": rounded(
+            [
+                *(row["baselines"][name] for name in ("position", "instruction", "pixels")),  # type: ignore[index]
+                *(row[f"{stream}_selectivity"] for stream in ("prefix", "action")),
+                *(row[f"{stream}_{name}"] for stream in ("prefix", "action") for name in ("twin", "twin_ci")),
+            ],
+            [SHARE] * 9,
+        ),
+    }
+
+
+@pytest.mark.parametrize("width", [width for width in WIDTHS if width >= 60])
+def test_every_number_can_be_read_back_at_every_width(table: RetentionTable, width: int) -> None:
+    text = printed(table, width)
+    rows = json.loads(table.to_json())["rows"]
+    found = [block for block in blocks(text) if block[1]]
+    assert len(found) == 3
+    for letter, of_run in (("A", rows[:4]), ("B", rows[4:])):
+        for title, block in found:
+            for row in of_run:
+                wanted = next(values for name, values in expected(row).items() if title.startswith(name))
+                place = row["category"], letter
+                assert block[place] == pytest.approx(wanted, abs=1e-9), (title, place)
+    (difference,) = [row for row in table.differences if row.category == "mean"]
+    told = found[0][1]["mean", "A − B"]
+    assert told == pytest.approx([0.0, *(round(100 * x, 1) for x in difference.sr_ci), 1.0, 1.0])
+    told = found[1][1]["mean", "A − B"]
+    assert told[:3] == pytest.approx([0.0, *(round(100 * x, 1) for x in difference.prefix_ci)])
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_width_crops_anything_or_runs_over(table: RetentionTable, width: int) -> None:
+    text = printed(table, width)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    row = table.rows[1]
+    low, high = (f"{100 * limit:.1f}" for limit in row.prefix_ci)  # type: ignore[union-attr,operator]
+    assert f"100.0 [{low}, {high}]" in text
+
+
+def test_a_wide_terminal_has_one_table_per_subject(table: RetentionTable) -> None:
+    headings = [line for line in printed(table, 240).splitlines() if line.startswith("category ")]
+    assert len(headings) == 3
+
+
+def test_text_says_backbone_and_action_and_latex_the_papers_columns(table: RetentionTable) -> None:
+    from probe_kit.retention.formats.html import control_table, retention_table
+
+    headings = [column.name for column in retention_table(table.all_rows).columns]  # type: ignore[union-attr]
+    headings += [column.name for column in control_table(table.all_rows).columns]  # type: ignore[union-attr]
+    lines = [
+        line for line in table.to_markdown().splitlines() if line.startswith("| model") or "| category" in line
+    ]
+    lines += [line for line in printed(table, 240).splitlines() if line.startswith("category")]
+    for text in (*headings, *lines):
+        assert not re.search("prefix|expert", text), text
+    assert sum("backbone" in text for text in (*headings, *lines)) >= 6
+    assert sum("action" in text for text in (*headings, *lines)) >= 6
+    assert "& Prefix & Layer & Action & Layer & First it. &" in table.to_latex()
+
+
+def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:
+    text = printed(retention([probed_run({"color": SIGNAL}, "pi0-tiny", random_weights=True)]))
+    assert text.count("pi0-tiny (random weights) on") == 2
+
+
+def test_the_caption_says_why_retention_is_missing(probed_run: ProbedRun) -> None:
+    text = printed(retention([probed_run({"color": SIGNAL, "counting": NONE})]))
+    assert "n/a (no backbone signal)" in " ".join(text.split())
+    assert "without counting" in " ".join(text.split())
+
+
+def test_several_runs_stand_in_one_table_under_a_title_that_names_all(probed_run: ProbedRun) -> None:
+    text = printed(
+        retention([probed_run({"color": SIGNAL}, "pi0"), probed_run({"color": SIGNAL}, "smolvla")]), 160
+    )
+    for what in ("Success rate", "Retention, view mean"):
+        assert text.count(f"{what}: A pi0, B smolvla on suite@1#0123456789ab") == 1
+    lines = [line.split("  ")[0] for line in text.splitlines() if line.startswith(("color ", "mean "))]
+    assert lines[:6] == ["color A", "color B", "color A − B", "mean A", "mean B", "mean A − B"]
+
+
+def test_a_policy_without_an_expert_has_the_same_columns(probed_run: ProbedRun) -> None:
+    runs = [probed_run({"color": SIGNAL}, "openvla", action_stream="action"), probed_run({"color": SIGNAL}, "pi0")]
+    table = retention(runs)
+    assert [row.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
+    assert [row.retention for row in table.rows] == [table.rows[0].retention] * 2 != [None, None]
+    headings = [line for line in printed(table, 160).splitlines() if "backbone %" in line]
+    assert len(headings) == 1

@@ -1,0 +1,90 @@
+import numpy as np
+
+from probe_kit.statistics.label_permutations import (
+    exchange_groups,
+    family_p,
+    flip_groups,
+    flip_items,
+    site_p,
+    smallest_p,
+)
+
+ITEMS = np.repeat(np.arange(200), 2)
+LAYOUTS = np.tile(["original", "swapped"], 200)
+LABELS = np.tile([True, False], 200)
+
+
+def test_flipping_keeps_the_two_layouts_of_an_item_opposite() -> None:
+    flipped = flip_items(LABELS, ITEMS, 50, seed=0)
+    assert (flipped[0::2] != flipped[1::2]).all()
+    assert 0.45 < (flipped != LABELS[:, None]).mean() < 0.55
+
+
+def test_exchanging_keeps_the_class_share_of_each_layout() -> None:
+    labels = np.random.default_rng(0).random(400) < np.where(LAYOUTS == "original", 0.9, 0.2)
+    exchanged = exchange_groups(labels, ITEMS // 2, ITEMS, LAYOUTS, 50, seed=0)
+    for layout in ("original", "swapped"):
+        assert (exchanged[layout == LAYOUTS].mean(axis=0) == labels[layout == LAYOUTS].mean()).all()
+    assert (exchanged != labels[:, None]).any(axis=0).all()
+
+
+def test_a_flip_takes_the_whole_group_and_the_twins_of_an_item_with_it() -> None:
+    flipped = flip_groups(LABELS, ITEMS // 2, 50, seed=0) != LABELS[:, None]
+    assert (np.ptp(flipped.reshape(100, 4, 50).astype(int), axis=1) == 0).all()
+    assert 0.4 < flipped.mean() < 0.6
+
+
+def test_missing_episodes_leave_the_classes_as_large_as_they_are() -> None:
+    """A null that restores balance would call a probe significant that only names the larger class."""
+    kept = np.random.default_rng(0).random(400) < np.where(LABELS, 1.0, 0.6)
+    for count in (400, 40):  # groups of four: drawn, and with 10 groups enumerated
+        labels, groups = LABELS[:count][kept[:count]], (ITEMS // 2)[:count][kept[:count]]
+        relabelled = flip_groups(labels, groups, 50, seed=0)
+        assert relabelled.shape[1] >= 7
+        assert (relabelled.sum(axis=0) == labels.sum()).all()
+        assert (relabelled != labels[:, None]).any()
+
+
+def test_few_groups_are_enumerated_without_the_real_labels_and_without_mirror_images() -> None:
+    labels, groups = LABELS[:24], np.repeat(np.arange(6), 4)
+    relabelled = flip_groups(labels, groups, 7, seed=0)
+    assert relabelled.shape == (24, 2**5 - 1)
+    seen = {tuple(column) for column in relabelled.T}
+    assert len(seen) == 31
+    assert tuple(labels) not in seen
+    assert not seen & {tuple(~column) for column in relabelled.T}
+    assert smallest_p(31) == 1 / 32
+    assert flip_groups(labels, groups, 0, seed=0).shape == (24, 0)
+
+
+def test_groups_of_another_shape_exchange_nothing() -> None:
+    groups = np.array([0, 0, 0, 0, 1, 1])
+    items, layouts = np.array([0, 0, 1, 1, 2, 2]), np.array(["original", "swapped"] * 3)
+    labels = np.array([True, True, True, True, False, False])
+    assert (exchange_groups(labels, groups, items, layouts, 20, seed=0) == labels[:, None]).all()
+
+
+def test_items_with_one_episode_exchange_only_among_themselves() -> None:
+    items, layouts = np.array([0, 0, 1, 1, 2, 3]), np.array(["original", "swapped"] * 2 + ["original"] * 2)
+    labels = np.array([True, True, True, True, False, False])
+    exchanged = exchange_groups(labels, items, items, layouts, 20, seed=0)
+    assert (exchanged == labels[:, None]).all()
+
+
+def test_the_same_seed_gives_the_same_relabellings() -> None:
+    assert (flip_items(LABELS, ITEMS, 5, seed=3) == flip_items(LABELS, ITEMS, 5, seed=3)).all()
+
+
+def test_p_counts_the_real_labels_among_the_draws() -> None:
+    null = np.array([[0.5, 0.6, 0.7], [0.4, 0.5, 0.5]])
+    assert site_p(np.array([0.65, 0.9]), null).tolist() == [2 / 4, 1 / 4]
+
+
+def test_family_wise_p_compares_with_the_best_site() -> None:
+    null = np.array([[0.5, 0.6, 0.5], [0.4, 0.5, 0.7]])
+    assert family_p(np.array([0.65, 0.55]), null).tolist() == [2 / 4, 3 / 4]
+
+
+def test_p_is_missing_without_relabellings() -> None:
+    assert np.isnan(site_p(np.array([0.9]), np.empty((1, 0)))).all()
+    assert np.isnan(family_p(np.array([0.9]), np.empty((1, 0)))).all()

@@ -1,0 +1,193 @@
+"""A set in Act2Answer's own format becomes a suite: words, sides and pictures as they are."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
+from probe_kit.suite import load_suite, validate_suite
+from probe_kit.suite.converters import convert
+from probe_kit.suite.converters.benchmarks.act2answer import BoundingBoxWarning
+from probe_kit.suite.converters.benchmarks.act2answer_pairs import object_of
+from tests.conftest import SHARED
+from tests.support.act2answer_tiles import art, write_tile
+
+pytest.importorskip("trimesh", reason="the extra act2answer (trimesh) is not installed")
+REAL = SHARED / "data" / "act2answer" / "test_colors"
+PAIRS = [
+    {"index": 1, "left": "fox", "right": "cat", "question": "Put cube on the fox.", "answer": "Left"},
+    {"index": 0, "left": "cat", "right": "dog", "question": "Put cube on dog", "answer": "right"},
+    {"index": 2, "left": "twin", "right": "owl", "question": "Put cube on the left of two owls, as they sit "
+     "there today in the old tree behind the house", "answer": "Left", "left_label": "owls", "right_label": "owl"},
+]  # fmt: skip
+NAMES = ("cat", "dog", "fox", "owl", "twin")
+
+
+def write_set(folder: Path, box: float = 0.1452) -> Path:
+    """Three questions about five tiles; `twin` shows the same picture as `fox` under another name."""
+    folder.mkdir(parents=True)
+    (folder / "pairs.json").write_text(json.dumps(PAIRS))
+    half = [box / 2, box / 2, 0.003]
+    record = {"bbox": {"min": [-value for value in half], "max": half}, "scales": [1], "density": 6368}
+    (folder / "model_db.json").write_text(json.dumps({name: {"name": name, **record} for name in NAMES}))
+    for seed, name in enumerate(NAMES):
+        write_tile(folder / "shapes" / name / "textured.glb", art(2 if name == "twin" else seed))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_set(tmp_path_factory.mktemp("sets") / "living_world_v1")
+
+
+@pytest.fixture
+def folder(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / original.name))
+
+
+def test_questions_are_taken_over_as_they_are(folder: Path, tmp_path: Path) -> None:
+    suite = convert("act2answer", folder, tmp_path / "suite")
+    first, second, third = suite.items
+    assert [item.source["source_id"] for item in suite.items] == [f"living_world_v1#{index}" for index in range(3)]
+    assert first.instruction == "Put cube on dog"
+    assert (first.correct_side, first.target_concept, first.distractor_concept) == ("right", "dog", "cat")
+    assert (second.instruction, second.object_phrase, second.object_article) == (
+        "Put cube on the fox.",
+        "fox",
+        "the",
+    )
+    assert (second.correct_side, second.target_concept) == ("left", "fox")
+    assert (third.target_concept, third.distractor_concept, third.side_word) == ("owls", "owl", True)
+    assert suite.categories == ("living-world",)
+    assert not any(item.redistributable for item in suite.items)
+    assert validate_suite(tmp_path / "suite").ok
+    assert load_suite(tmp_path / "suite").identity == suite.identity
+
+
+def test_questions_that_share_a_picture_share_a_group_whatever_its_name(folder: Path, tmp_path: Path) -> None:
+    """`twin` is the picture of `fox`, and the cat lies in two questions: all three belong together."""
+    suite = convert("act2answer", folder, tmp_path / "suite")
+    assert len({item.group_id for item in suite.items}) == 1
+    other = json.loads((folder / "pairs.json").read_text())[:2]
+    other[0]["right"] = "owl"
+    (folder / "pairs.json").write_text(json.dumps(other))
+    apart = convert("act2answer", folder, tmp_path / "apart")
+    assert len({item.group_id for item in apart.items}) == 2
+
+
+def test_the_same_set_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    one, other = (convert("act2answer", folder, tmp_path / name, seed=seed) for seed, name in ((0, "a"), (1, "b")))
+    assert one.identity == other.identity
+    files = [path.relative_to(one.folder) for path in sorted(one.folder.rglob("*")) if path.is_file()]
+    assert files
+    for file in files:
+        assert (one.folder / file).read_bytes() == (other.folder / file).read_bytes(), file
+
+
+def _change(place: int, **values: Any) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        pairs = json.loads((folder / "pairs.json").read_text())
+        pairs[place].update(values)
+        (folder / "pairs.json").write_text(json.dumps(pairs))
+
+    return apply
+
+
+def _forget(name: str) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        records = json.loads((folder / "model_db.json").read_text())
+        del records[name]
+        (folder / "model_db.json").write_text(json.dumps(records))
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (_change(0, answer="Center"), "expected Left or Right"),
+        (_change(0, answer=""), "expected Left or Right"),
+        (_change(0, answer=None), "expected a str"),
+        (_change(0, left="cat"), "lies on both sides"),
+        (_change(2, index=3), "index 3 where 2 was expected"),
+        (_change(2, index=1), "index 1 where 2 was expected"),
+        (_change(2, index="2"), "expected a whole number"),
+        (_change(0, question="Put\nit"), "expected one line"),
+        (_change(2, right="fox"), "show the same picture"),
+        (_forget("dog"), "names the tile 'dog', which .* does not describe"),
+        (lambda folder: (folder / "shapes/dog/textured.glb").unlink(), "dog/textured.glb not found"),
+        (lambda folder: (folder / "pairs.json").unlink(), "pairs.json not found"),
+        (lambda folder: (folder / "pairs.json").write_text("[]"), "expected a list of questions"),
+        (lambda folder: (folder / "model_db.json").write_text("[]"), "expected an object by tile name"),
+    ],
+)
+def test_what_the_release_would_misread_is_refused(
+    folder: Path, tmp_path: Path, change: Callable[[Path], None], complaint: str
+) -> None:
+    change(folder)
+    with pytest.raises(SuiteError, match=complaint):
+        convert("act2answer", folder, tmp_path / "suite")
+    assert not (tmp_path / "suite").exists()
+
+
+def test_a_scored_box_unlike_the_mesh_is_said(tmp_path: Path) -> None:
+    folder = write_set(tmp_path / "living_world", box=0.11)
+    with pytest.warns(BoundingBoxWarning, match=r"cat is 0\.1452 m wide and scored as 0\.1100 m"):
+        suite = convert("act2answer", folder, tmp_path / "suite")
+    notes = json.loads((suite.folder / "stats.json").read_text())["notes"]
+    assert "5 of 5 tiles" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "slug"), [("test_colors", "color"), ("time_clock_v1", "time"), ("public_info", "public-info")]
+)
+def test_the_folders_name_tells_the_category(original: Path, tmp_path: Path, name: str, slug: str) -> None:
+    folder = Path(shutil.copytree(original, tmp_path / name))
+    assert convert("act2answer", folder, tmp_path / "suite", n=1).categories == (slug,)
+
+
+def test_a_name_that_tells_no_category_needs_one(original: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(original, tmp_path / "symmetry_color_v2"))
+    with pytest.raises(UsageError, match="tells color and symmetry; say which one"):
+        convert("act2answer", folder, tmp_path / "suite")
+    with pytest.raises(UnknownCategoryError):
+        convert("act2answer", folder, tmp_path / "suite", categories=["shapes"])
+    assert convert("act2answer", folder, tmp_path / "suite", categories=["shape"]).categories == ("shape",)
+
+
+def test_options_that_cannot_be_meant_are_refused(original: Path, tmp_path: Path) -> None:
+    for options, complaint in (({"tile_yaw": 45}, "expected one of 0, 90"), ({"min_side": 3}, "unknown option"),
+                               ({"curation": "x.json"}, "takes no curation")):  # fmt: skip
+        with pytest.raises(UsageError, match=complaint):
+            convert("act2answer", original, tmp_path / "suite", **options)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no real set at {REAL}")
+def test_the_authors_own_set_with_generated_tiles(tmp_path: Path) -> None:
+    """Their `pairs.json` and `model_db.json` byte for byte; their pictures could not be had."""
+    folder = Path(shutil.copytree(REAL, tmp_path / "test_colors"))
+    for seed, name in enumerate(sorted(json.loads((folder / "model_db.json").read_text()))):
+        write_tile(folder / "shapes" / name / "textured.glb", art(seed))
+    with pytest.warns(BoundingBoxWarning, match="12 of 12 tiles"):
+        suite = convert("act2answer", folder, tmp_path / "suite")
+    assert [item.object_phrase for item in suite.items][:3] == ["blue", "red", "green"]
+    assert len(suite.items) == 6
+    assert sum(item.correct_side == "left" for item in suite.items) == 3
+    assert len({item.group_id for item in suite.items}) == 6
+
+
+@pytest.mark.parametrize(
+    ("question", "expected"),
+    [
+        ("Put cube on blue", ("blue", "none")),
+        ("Put cube on the safe image", ("safe image", "the")),
+        ("Which is safe?", ("Which is safe?", "none")),
+        ("Put cube on the", ("the", "none")),
+    ],
+)
+def test_the_object_is_what_stands_behind_on(question: str, expected: tuple[str, str]) -> None:
+    assert object_of(question) == expected

@@ -1,0 +1,76 @@
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.suite.converters import convert
+
+REAL = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[5] / "shared")) / "data" / "mmbench"
+
+
+def test_real_faces_are_made_only_on_request(mmbench_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"real people, and was not asked for. Pass include_real_faces"):
+        convert("mmbench", mmbench_root, tmp_path / "suite")
+
+
+def test_names_are_asked_for_with_other_names_beside_them(mmbench_root: Path, tmp_path: Path) -> None:
+    suite = convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
+    assert len(suite.items) == 6
+    assert all(item.instruction == f"Put the cube on {item.object_phrase}" for item in suite.items)
+    assert all(item.object_article == "none" and item.contains_real_face for item in suite.items)
+    targets = Counter(
+        item.left_image_id if item.correct_side == "left" else item.right_image_id for item in suite.items
+    )
+    assert max(targets.values()) == 1
+    assert suite.card["contains_real_faces"] is True
+
+
+def test_circular_copies_and_other_questions_are_counted_and_left_out(mmbench_root: Path, tmp_path: Path) -> None:
+    suite = convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
+    stats = json.loads((suite.folder / "stats.json").read_text())
+    assert stats["celebrity"]["pool"] == 9
+    assert stats["reasons"]["circular copy"] == stats["reasons"]["not an identity question"] == 1
+    assert stats["celebrity"]["rule_selected"] == 7
+
+
+def test_two_names_for_one_picture_never_meet_and_share_a_group(mmbench_root: Path, tmp_path: Path) -> None:
+    suite = convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
+    assert all(item.left_image_id != item.right_image_id for item in suite.items)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("\tcategory\t", "\tkind\t", "lacks category"),
+        ("\tA\tcelebrity", "\t\tcelebrity", "row with index 0 .*: no answer"),
+        ("\tA\tcelebrity", "\tC\tcelebrity", "answer is 'C', which is no option"),
+        ("B\tcelebrity_recognition\t0\t", "B\tcelebrity_recognition\t77\t", "its picture is in row '77'"),
+        ("\n0\t", "\nzero\t", "row 2 of .*: index is 'zero'"),
+    ],
+)
+def test_a_broken_file_is_refused_naming_the_row(
+    mmbench_root: Path, tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    path = mmbench_root / "MMBench_DEV_EN.tsv"
+    text = path.read_bytes().decode().replace("\r\n", "\n")
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(SuiteError, match=message):
+        convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
+    assert not (tmp_path / "suite").exists()
+
+
+def test_a_test_file_is_refused_because_its_answers_are_secret(tmp_path: Path) -> None:
+    (tmp_path / "MMBench_TEST_EN.tsv").write_text("index\n")
+    with pytest.raises(SuiteError, match=r"only a TEST file"):
+        convert("mmbench", tmp_path, tmp_path / "suite", include_real_faces=True)
+
+
+def test_the_published_sample_has_no_celebrities(tmp_path: Path) -> None:
+    if not REAL.is_dir():
+        pytest.skip(f"no MMBench sample at {REAL} (set PROBE_KIT_SHARED); it is not part of the repository")
+    with pytest.raises(SuiteError, match=r"0 rows of category celebrity_recognition among 10"):
+        convert("mmbench", REAL, tmp_path / "suite", include_real_faces=True)

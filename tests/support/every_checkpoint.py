@@ -1,0 +1,33 @@
+"""Which writer and which options of loading make each family's tiny checkpoint."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tests.support import (
+    internvla_checkpoints,
+    magma_checkpoints,
+    pi0_checkpoints,
+    prismatic_checkpoints,
+    smolvla_checkpoints,
+    spatialvla_checkpoints,
+    vlm_checkpoints,
+    xiaomi_checkpoints,
+)
+
+_BYTES = {"tokenizer": "bytes"}
+WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
+    "pi0": (pi0_checkpoints.write_intact, {}),
+    "smolvla": (smolvla_checkpoints.write_smolvla, {}),
+    "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
+    "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),
+    "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
+    "magma": (magma_checkpoints.write_checkpoint, {}),
+    "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {}),
+    "internvla-m1": (internvla_checkpoints.write_checkpoint, {}),
+    "paligemma": (vlm_checkpoints.write_paligemma, {}),
+    "qwen2.5-vl": (vlm_checkpoints.write_qwen2_5_vl, {}),
+    "qwen3-vl": (vlm_checkpoints.write_qwen3_vl, {}),
+    "internvl": (vlm_checkpoints.write_internvl, {}),
+    "ovis2.5": (vlm_checkpoints.write_ovis2_5, {}),
+}

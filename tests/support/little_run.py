@@ -1,0 +1,138 @@
+"""A small run through the real writer, with everything a run can hold, made in a second without a model."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.scoring.trajectory import CHANNELS
+from probe_kit.extract import Run, open_run, seal
+from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.hashing import derive_seed
+from probe_kit.intervene import Answers, Follow
+from probe_kit.intervene.results.results import effects_csv
+from probe_kit.intervene.store.answers import save
+from probe_kit.intervene.store.settings import key_of, settings_of
+from probe_kit.suite import Suite
+from probe_kit.train import train_probes
+
+STREAMS = (
+    StoredStream("backbone", 2, 6, None, 130, ("mean", "last"), quantities=("residual",)),
+    StoredStream("expert", 1, 4, 2, 3, ("mean", "mean:action"), quantities=("residual",)),
+)
+STEPS = 2
+PICTURED = 2
+"""Episodes that keep frames."""
+PLACED = ("left", "right", "none")
+
+
+def little_plan(suite: Suite, seed: int = 0, episodes: int | None = None) -> Plan:
+    plan = make_plan(suite, list(STREAMS), seed, 1, True)
+    return replace(plan, episodes=plan.episodes[:episodes])
+
+
+def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
+    return {
+        "model": "little",
+        "weights_sha256": "0" * 64,
+        "random_weights": True,
+        "captured_calls": 1,
+        "tokens": "all",
+        "codec": codec,
+        "seed": seed,
+        "suite": {"identity": "little@1#0123456789ab"},
+        "scene": {"max_steps": STEPS},
+    }
+
+
+def little_writer(where: Location, plan: Plan, seed: int = 0, codec: str = "zstd") -> RunWriter:
+    writer = RunWriter(where, plan, little_settings(seed, codec))
+    certify(writer)
+    return writer
+
+
+def certify(writer: RunWriter) -> None:
+    """What the process says of itself, which is part of the work on a run."""
+    check = {f"actions_{how}_hooks_sha256": "a" * 64 for how in ("with", "without")}
+    writer.write_certificate({"policy": {"family": "little"}, "capture_check": check})
+
+
+def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:
+    """The same numbers for the same episode and seed, always."""
+    draw = np.random.default_rng(derive_seed("little", seed, number))
+    planned = plan.episodes[number]
+    arrays: dict[str, dict[str, Any]] = {"pooled": {}, "tokens": {}}
+    for stream in STREAMS:
+        arrays["pooled"][stream.name] = draw.normal(
+            size=(1, *stream.lead, len(stream.views), stream.width)
+        ).astype(np.float32)
+        tokens = draw.integers(0, 0x7F00, (1, *stream.lead, stream.stored_tokens, stream.width), np.uint16)
+        tokens[..., stream.tokens :, :] = 0
+        arrays["tokens"][stream.name] = tokens
+    placed = PLACED[int(draw.integers(3))]
+    outcome = {
+        "outcome": "oob" if placed == "none" else "correct" if placed == planned.episode.side_correct else "wrong",
+        "side_placed": placed,
+        "cube_x": float(draw.uniform()),
+        "cube_y": float(draw.uniform(-0.3, 0.3)),
+        "steps": STEPS,
+    }
+    roles = [{"backbone": [("language", 0, 130)], "expert": [("action", 0, 3)]}]
+    trajectory = draw.normal(size=(STEPS + 1, len(CHANNELS))).astype(np.float32)
+    pictures = {thumbnail_key(number): as_thumbnail(still(seed, number))} if number < PICTURED else {}
+    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number), pictures)
+
+
+def still(seed: int, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two frames that differ by seed and episode."""
+    return np.full((60, 80, 3), 100 * seed + number, np.uint8), np.full((60, 80, 3), 50, np.uint8)
+
+
+def write_little_run(
+    where: Path | str, suite: Suite, seed: int = 0, codec: str = "zstd", episodes: int | None = None
+) -> Run:
+    """Written and sealed."""
+    plan = little_plan(suite, seed, episodes)
+    writer = little_writer(locate(where), plan, seed, codec)
+    for number in writer.remaining():
+        writer.write(episode(plan, number, seed))
+    seal(where)
+    return open_run(where)
+
+
+def intervene_on_little_run(run: Run) -> None:
+    """A stored intervention on its episodes, with answers drawn instead of inferred."""
+    settings, episodes = settings_of(Follow(), run), run.episodes
+    draw = np.random.default_rng(derive_seed("little", run.settings_sha256))
+    names = {"episodes": "episode_id", "items": "item_id", "groups": "group_id", "categories": "category"}
+    lateral = draw.normal(size=(2, len(episodes)))
+    answers = Answers(
+        conditions=("plain", "exchanged"),
+        **{own: episodes[name].to_numpy(dtype=str) for own, name in names.items()},
+        sides=episodes["side_correct"].to_numpy(dtype=str),
+        lateral=lateral,
+        changed=np.abs(lateral - lateral[0]),
+        ledger=np.zeros((*lateral.shape, 5)),
+        apart=np.zeros(len(episodes)),
+    )
+    check = {
+        "episodes": len(episodes),
+        "compared": len(episodes),
+        "equal": len(episodes),
+        "largest_difference": 0.0,
+    }
+    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
+
+
+def probe_little_run(run: Run) -> None:
+    """Two sets of probes; to the second a control is added later."""
+    train_probes(run, permutations=1, seed=1)
+    train_probes(run, permutations=2)
+    train_probes(run, permutations=2, controls=("position",))

@@ -1,0 +1,74 @@
+"""The control that a random network must not beat, and that a network which knows must."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks import Stream
+from probe_kit.suite import Suite, build_suite
+from probe_kit.train import ArrayRun, ProbeResults, train_probes
+from probe_kit.train.controls.random_features import BindingInputs
+
+ITEMS, WIDTH = 100, 24
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suites") / "suite", ("color",), ITEMS)
+
+
+def run_of(suite: Suite, path: Path, knowledge: float = 0.0) -> ArrayRun:
+    """A network of three random layers on pictures and words; the last one may know the answer."""
+    episodes = pd.DataFrame(
+        {
+            "episode_id": e.episode_id, "item_id": e.item.item_id, "layout": e.layout, "category": "color",
+            "group_id": e.item.group_id, "side_correct": e.side_correct, "side_placed": "none", "outcome": "oob",
+            "instruction": e.item.instruction,
+        }
+        for e in suite.episodes()
+    )  # fmt: skip
+    sites = list(Stream("backbone", 3, WIDTH).sites())
+    run = ArrayRun(path, "random", suite.identity, episodes, {})
+    inputs = BindingInputs.of(run, suite.folder)
+    rows = np.arange(len(episodes))
+    features = {(site, "mean"): inputs.layer(rows, WIDTH, 100 + site.layer) for site in sites}
+    sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
+    features[sites[-1], "mean"][:, 0] += knowledge * sign.astype(np.float32)
+    return ArrayRun(path, "random", suite.identity, episodes, features)
+
+
+def probed(suite: Suite, path: Path, knowledge: float = 0.0) -> ProbeResults:
+    run = run_of(suite, path, knowledge)
+    return train_probes(run, permutations=39, controls=("binding",), suite=suite.folder)
+
+
+def test_a_random_network_is_no_better_than_binding(suite: Suite, tmp_path: Path) -> None:
+    scores = probed(suite, tmp_path / "random").scores
+    assert not scores["beats_binding"].any()
+    assert not scores["signal"].any()
+    assert scores["beats_twin"].isna().all()
+
+
+def test_a_network_that_knows_the_answer_is_better_than_binding(suite: Suite, tmp_path: Path) -> None:
+    results = probed(suite, tmp_path / "knowing", knowledge=1.5)
+    best = results.scores.loc[results.scores["accuracy"].idxmax()]
+    assert best["beats_binding"]
+    assert best["signal"]
+    control = results.controls.of_category("color")["binding"]
+    assert control.ci[0] < control.accuracy < control.ci[1]
+    assert not control.above_chance  # what it has for free is no leak
+
+
+def test_random_layers_repeat_and_differ_by_seed(suite: Suite, tmp_path: Path) -> None:
+    inputs, rows = BindingInputs.of(run_of(suite, tmp_path), suite.folder), np.arange(20)
+    np.testing.assert_array_equal(inputs.layer(rows, 8, 0), inputs.layer(rows, 8, 0))
+    assert (inputs.layer(rows, 8, 0) != inputs.layer(rows, 8, 1)).all()
+    assert inputs.layer(rows, 8, 0).std() > 0.3  # neither dead nor saturated
+
+
+def test_binding_needs_the_pictures(suite: Suite, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="'binding' needs the pictures"):
+        train_probes(run_of(suite, tmp_path), permutations=0, controls=("binding",))

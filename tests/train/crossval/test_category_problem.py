@@ -1,0 +1,110 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
+from probe_kit.train import ArrayRun, ProbeSettings, Target
+from probe_kit.train.crossval.category_problem import category_problem
+
+PlantedRun = Callable[..., ArrayRun]
+
+
+def settings(target: Target = "correct") -> ProbeSettings:
+    return ProbeSettings(
+        "m", False, None, "s@1#0", "0", "0", ("color",), ("mean",), target, permutations=30, seed=0
+    )
+
+
+def test_relabelling_the_correct_side_flips_whole_groups(planted_run: PlantedRun) -> None:
+    problem = category_problem(planted_run().episodes, "color", settings())
+    flipped = (problem.relabellings != problem.labels[:, None]).reshape(20, 4, 30)
+    assert (flipped == flipped[:, :1]).all()
+
+
+def with_concepts(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Groups 0 and 10, 1 and 11, … are about the same two concepts, once the other way round."""
+    group = episodes["group_id"].str.rpartition("-")[2].astype(int)
+    pair = (group % 10).astype(str)
+    swapped = group >= 10
+    return episodes.assign(
+        target_concept=np.where(swapped, "b" + pair, "a" + pair),
+        distractor_concept=np.where(swapped, "a" + pair, "b" + pair),
+    )
+
+
+def test_concept_folds_train_on_no_pair_of_concepts_that_they_test(planted_run: PlantedRun) -> None:
+    episodes = with_concepts(planted_run().episodes)
+    problem = category_problem(episodes, "color", replace(settings(), folds="concepts"))
+    pairs = episodes["target_concept"].str[1:].to_numpy()
+    assert np.unique(problem.groups).size == 10
+    for fold in problem.folds:
+        for split in (fold.outer, *fold.inner):
+            assert not set(pairs[split.train]) & set(pairs[split.test])
+            assert not set(episodes["group_id"].iloc[split.train]) & set(episodes["group_id"].iloc[split.test])
+    by_groups = category_problem(episodes, "color", settings())
+    assert any(set(pairs[fold.outer.train]) & set(pairs[fold.outer.test]) for fold in by_groups.folds)
+
+
+def test_concept_folds_without_concepts_are_refused(planted_run: PlantedRun) -> None:
+    with pytest.raises(UsageError, match="target_concept and distractor_concept"):
+        category_problem(planted_run().episodes, "color", replace(settings(), folds="concepts"))
+
+
+def test_dropping_incomplete_items_restores_balance(planted_run: PlantedRun) -> None:
+    episodes = planted_run().episodes
+    some = episodes[(episodes["side_correct"] == "left") | (episodes.index % 5 > 1)]
+    problem = category_problem(some, "color", replace(settings(), incomplete="drop"))
+    assert problem.labels.mean() == 0.5
+    assert 0 < problem.labels.size < len(some)
+    assert (pd.Series(problem.items).value_counts() == 2).all()
+
+
+def test_a_category_that_is_nearly_all_of_one_side_is_refused(planted_run: PlantedRun) -> None:
+    episodes = planted_run().episodes
+    left = episodes[(episodes["side_correct"] == "left") | (episodes.index < 20)]
+    with pytest.raises(UnbalancedEpisodesError, match=r"chance is 0\.8.*drop"):
+        category_problem(left, "color", settings())
+
+
+def test_so_few_groups_that_nothing_can_be_significant_are_said(planted_run: PlantedRun) -> None:
+    with pytest.warns(UserWarning, match=r"15 relabellings, the smallest possible p is 0\.062"):
+        category_problem(planted_run(n_items=10).episodes, "color", settings())
+
+
+def test_relabelling_the_chosen_side_keeps_its_share(planted_run: PlantedRun) -> None:
+    problem = category_problem(planted_run().episodes, "color", settings("chosen"))
+    assert problem.labels.size < 80
+    np.testing.assert_array_equal(problem.relabellings.mean(axis=0), problem.labels.mean())
+
+
+def test_no_group_is_split_between_outer_or_inner_folds(planted_run: PlantedRun) -> None:
+    problem = category_problem(planted_run().episodes, "color", settings())
+    for fold in problem.folds:
+        for split in (fold.outer, *fold.inner):
+            assert not set(problem.groups[split.train]) & set(problem.groups[split.test])
+
+
+def test_a_category_takes_part_only_with_its_own_episodes(planted_run: PlantedRun) -> None:
+    episodes = planted_run(categories=("shape", "color")).episodes
+    problem = category_problem(episodes, "color", settings())
+    assert (episodes["category"].iloc[problem.rows] == "color").all()
+
+
+def test_the_pooled_category_has_every_episode(planted_run: PlantedRun) -> None:
+    episodes = planted_run(categories=("shape", "color")).episodes
+    assert category_problem(episodes, "all", settings()).rows.tolist() == list(range(160))
+
+
+def test_missing_episodes_move_chance_and_say_so(planted_run: PlantedRun) -> None:
+    episodes = planted_run().episodes
+    left = episodes[(episodes["side_correct"] == "left") | (episodes.index < 60)]
+    with pytest.warns(UserWarning, match=r"chance is 0\.5.*Episodes are missing"):
+        category_problem(left, "color", settings())
+
+
+def test_too_few_groups_name_category_and_target(planted_run: PlantedRun) -> None:
+    with pytest.raises(TooFewGroupsError, match=r"category 'color', target 'chosen': \d independent groups"):
+        category_problem(planted_run(n_items=6).episodes, "color", settings("chosen"))

@@ -1,0 +1,141 @@
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
+from probe_kit.hooks import Site
+from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.crossval.category_problem import CategoryProblem
+from probe_kit.train.crossval.site_probe import nested_folds
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.execution.dispatch import probe_columns
+from probe_kit.train.execution.executor import CrewSettings, Key, Probed
+from probe_kit.train.execution.processes import ProcessCrew
+from probe_kit.train.execution.ray import RayCrew
+
+ITEMS = np.repeat(np.arange(10), 2)
+LABELS = np.tile([True, False], 10)
+PROBLEM = CategoryProblem(
+    rows=np.arange(20),
+    labels=LABELS,
+    items=ITEMS.astype(str),
+    groups=ITEMS.astype(str),
+    episodes=np.arange(20).astype(str),
+    folds=nested_folds(LABELS, ITEMS, 0),
+    relabellings=flip_items(LABELS, ITEMS, 3, 0),
+    token_permutations=0,
+)
+
+
+def columns(read: list[Key]) -> Iterator[tuple[Key, Samples]]:
+    for layer in range(6):
+        key = ("mean", Site("backbone", layer))
+        read.append(key)
+        yield key, Samples.pooled(np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32))
+
+
+def columns_of(settings: CrewSettings) -> dict[Key, Probed]:
+    return dict(probe_columns(columns([]), {"color": PROBLEM}, settings))
+
+
+def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -> None:
+    assert alone.keys() == together.keys()
+    for key, probes in alone.items():
+        np.testing.assert_array_equal(probes["color"].decisions, together[key]["color"].decisions)
+        np.testing.assert_array_equal(probes["color"].null, together[key]["color"].null)
+
+
+def test_processes_give_the_same_numbers_as_this_one() -> None:
+    assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(jobs=2)))
+
+
+def test_what_a_process_raises_keeps_its_class() -> None:
+    of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
+    with pytest.raises(TooFewGroupsError, match="same label"):
+        list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(jobs=2)))
+
+
+def test_a_process_that_dies_is_named_with_a_way_out() -> None:
+    crew = ProcessCrew({"color": PROBLEM}, 1)
+    samples = next(columns([]))[1]
+
+    def probe() -> None:
+        crew.first_of([crew.submit(samples)])
+
+    with crew:
+        os.kill(crew._children[0].pid, signal.SIGKILL)
+        with pytest.raises(WorkerDiedError, match=r"code -9.*fewer --jobs"):
+            probe()
+
+
+def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
+    pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
+    with pytest.raises(UsageError, match=r"no Ray cluster answers at '127\.0\.0\.1:9'"):
+        columns_of(CrewSettings(ray="127.0.0.1:9"))
+
+
+def test_columns_are_read_only_when_they_are_needed() -> None:
+    read: list[Key] = []
+    probing = probe_columns(columns(read), {"color": PROBLEM}, CrewSettings())
+    next(probing)
+    assert len(read) == 1
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"probe-kit\[ray\]"):
+        columns_of(CrewSettings(ray="auto"))
+
+
+LOST = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError")
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_a_task_that_ray_repeated_in_vain_says_how_to_go_on(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class LostError(Exception):
+        """As Ray raises it."""
+
+    class OtherError(Exception):
+        """Another one."""
+
+    def get(_task: str) -> None:
+        raise LostError("its node is gone")
+
+    kinds = dict.fromkeys(
+        ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError"), OtherError
+    )
+    crew = RayCrew({}, "auto")
+    there = SimpleNamespace(get=get, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
+    monkeypatch.setattr(crew, "_ray", there, raising=False)
+    with pytest.raises(WorkerDiedError, match=r"its node is gone\. The same command continues"):
+        crew.result("a task")
+
+
+def test_ray_is_imported_for_ray_only() -> None:
+    code = "import sys, probe_kit.train.execution.dispatch; print([m for m in ('ray', 'torch', 'pybullet') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_numbers_and_raises_what_a_task_raises() -> None:
+    """Slow: a cluster takes its time to start, and on starved machines it may not start at all."""
+    ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
+    try:
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    except (RuntimeError, ConnectionError, TimeoutError, ray.exceptions.RayError) as error:
+        pytest.skip(f"Ray does not start here: {error}")
+    of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
+    try:
+        assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(ray="auto")))
+        with pytest.raises(TooFewGroupsError, match="same label"):
+            list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(ray="auto", jobs=1)))
+        assert ray.is_initialized()  # a cluster somebody else started stays
+    finally:
+        ray.shutdown()

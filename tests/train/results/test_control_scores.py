@@ -1,0 +1,60 @@
+import json
+
+from probe_kit.train import BaselineScore, Controls, Excess, TwinScore
+from probe_kit.train.results.control_scores import signal
+
+
+def baseline(name: str, p: float | None = 0.5, accuracy: float = 0.5) -> BaselineScore:
+    return BaselineScore(name, "color", accuracy, (0.4, 0.6), p, 0.5, 80)
+
+
+def twin(site: str, peak: bool) -> TwinScore:
+    return TwinScore("color", "mean", site, site, peak, 0.9, 0.5, 0.4, (0.3, 0.5), "tiny (random weights)")
+
+
+def test_above_chance_means_a_small_p() -> None:
+    assert baseline("pixels", 0.01).above_chance
+    assert not baseline("pixels", 0.05).above_chance
+    assert not baseline("pixels", None).above_chance
+
+
+def test_a_newer_baseline_replaces_an_older_one_and_keeps_the_twin() -> None:
+    controls = Controls((baseline("pixels"), baseline("position")), (twin("backbone.01.residual", True),))
+    merged = controls.with_baselines([baseline("pixels", accuracy=0.9)])
+    assert {name: score.accuracy for name, score in merged.of_category("color").items()} == {
+        "pixels": 0.9,
+        "position": 0.5,
+    }
+    assert merged.twin == controls.twin
+    assert merged.of_category("shape") == {}
+
+
+def test_the_twin_of_a_stream_is_its_peak() -> None:
+    scores = [
+        twin("backbone.01.residual", False),
+        twin("expert.00.residual@1", True),
+        twin("backbone.03.residual", True),
+    ]
+    controls = Controls().with_twin(scores)
+    assert controls.twin_peak("color", "mean", "backbone") == scores[2]
+    assert controls.twin_peak("color", "last", "backbone") is None
+
+
+def test_signal_must_beat_every_control_that_was_run() -> None:
+    site = "backbone.01.residual"
+    controls = Controls().with_excess([Excess("binding", "color", "mean", site, 0.6, 0.2)])
+    assert controls.beats("color", "mean", site, 0.001) == {"chance": True, "binding": False, "twin": None}
+    assert not signal(controls.beats("color", "mean", site, 0.001))
+    better = controls.with_excess([Excess("binding", "color", "mean", site, 0.6, 0.01)])
+    assert signal(better.beats("color", "mean", site, 0.001))
+    assert not signal(better.beats("color", "mean", site, 0.2))
+    assert better.beats("shape", "mean", site, 0.001) == {"chance": True, "binding": None, "twin": None}
+    assert signal({"chance": True, "binding": None, "twin": None})
+    assert better.beats("color", "mean", site, float("nan"))["chance"] is None
+    assert not signal(better.beats("color", "mean", site, float("nan")))
+
+
+def test_json_gives_the_same_controls_back() -> None:
+    excess = Excess("twin", "color", "mean", "backbone.01.residual", 0.6, 0.2)
+    controls = Controls((baseline("pixels", None),), (twin("backbone.01.residual", True),), (excess,))
+    assert Controls.from_json(json.loads(json.dumps(controls.to_json()))) == controls

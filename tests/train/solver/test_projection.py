@@ -1,0 +1,83 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit.train.solver import principal_axes as axes
+from probe_kit.train.solver.principal_axes import principal_axes
+from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.standardiser import Standardiser
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal(shape)
+
+
+def test_training_features_get_mean_zero_and_deviation_one() -> None:
+    features = 5 + 3 * noise(50, 4)
+    scaled = Standardiser.fit(features)(features)
+    np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(scaled.std(axis=0), 1)
+
+
+def test_features_constant_up_to_rounding_are_dropped() -> None:
+    features = noise(50, 4).astype(np.float32)
+    features[:, 1] = 7
+    features[:, 2] = 1e4 + 1e-3 * features[:, 2]  # below the resolution of float32 at 1e4
+    assert Standardiser.fit(features).kept.tolist() == [True, False, False, True]
+
+
+def test_test_samples_are_scaled_with_training_statistics() -> None:
+    scaled = Standardiser.fit(np.array([[0.0], [2.0]]))(np.array([[5.0]]))
+    assert scaled.item() == 4.0
+
+
+@pytest.mark.parametrize("shape", [(20, 50), (50, 20)])
+def test_axes_are_orthonormal_and_lose_nothing_of_the_training_samples(shape: tuple[int, int]) -> None:
+    samples = noise(*shape)
+    found = principal_axes(samples)
+    assert found.shape == (shape[1], 20)
+    np.testing.assert_allclose(found.T @ found, np.eye(20), atol=1e-12)
+    np.testing.assert_allclose(samples @ found @ found.T, samples, atol=1e-12)
+
+
+@pytest.mark.parametrize("steepness", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("make", [np.asarray, torch.from_numpy])
+def test_many_axes_are_found_in_float32_and_orthogonal_in_float64(
+    steepness: float, make: Callable[[np.ndarray], np.ndarray | torch.Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(axes, "WORTH_NARROWING", 100)
+    monkeypatch.setattr(axes, "LEADING", 8)
+    samples = noise(150, 100) * 100 * np.arange(1.0, 101) ** -steepness
+    found = np.asarray(principal_axes(make(samples)))
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found.T @ found, np.eye(100), atol=1e-10)
+    moments = (samples @ found).T @ (samples @ found)
+    assert (np.diff(np.diag(moments)) > -1.0).all(), "ascending"
+    curved = np.eye(100) + moments  # as of an objective with its penalty
+    scale = np.sqrt(np.diag(curved))
+    spread = np.linalg.eigvalsh(curved / np.outer(scale, scale))
+    assert spread[0] > 0.9
+    assert spread[-1] < 1.1
+
+
+def test_coordinates_of_training_samples_are_uncorrelated() -> None:
+    (moments,) = Coordinates.fit(noise(30, 80)).train.moments(np.ones((30, 1)))
+    np.testing.assert_allclose(moments, np.diag(np.diag(moments)), atol=1e-10)
+
+
+@pytest.mark.parametrize("shape", [(30, 80), (80, 30)])
+def test_raw_weights_decide_like_the_weights_in_coordinates(shape: tuple[int, int]) -> None:
+    features = 4 + 2 * noise(*shape)
+    features[:, 5] = 3.0
+    coordinates = Coordinates.fit(features)
+    weights = np.random.default_rng(1).standard_normal(coordinates.train.shape[1])
+    raw, intercept = coordinates.raw_weights(weights)
+    np.testing.assert_allclose(features @ raw + intercept, coordinates.train @ weights, atol=1e-9)
+    assert raw[5] == 0
+
+
+def test_a_site_without_any_varying_feature_has_only_an_intercept() -> None:
+    coordinates = Coordinates.fit(np.ones((10, 6)))
+    assert (coordinates.train @ np.eye(1)).tolist() == [[1.0]] * 10
