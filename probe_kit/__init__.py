@@ -79,7 +79,7 @@ __all__ = [
 ]
 
 # `import probe_kit` must not load torch.
-__getattr__ = lazy_names(
+__getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Steer": "intervene",

@@ -1,13 +1,15 @@
 """Names of a package that are imported on first use, because their modules load torch or a simulator."""
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
 
-def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """A module-level `__getattr__` (PEP 562) for `package`.
+def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """The module-level `__getattr__` and `__dir__` (PEP 562) of `package`.
 
+    `dir`, `help` and the completion of names find `homes` among the names of the package; `dir` imports nothing.
     homes: name → module inside the package, or `module:other_name` where it is called otherwise there; a module of
     another package begins with `probe_kit.`.
     """
@@ -19,4 +21,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
         home = module if module.startswith("probe_kit.") else f"{package}.{module}"
         return getattr(import_module(home), original or name)
 
-    return load
+    def names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return load, names

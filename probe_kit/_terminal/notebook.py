@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from probe_kit.places import without_places
+
 PROGRESS_MARK = "probe-kit-progress"
 """Class of a progress bar's element, so that whoever keeps a notebook can leave the bars out."""
 _REDRAW_S = 0.2
@@ -14,24 +16,29 @@ _REDRAW_S = 0.2
 def facts_html(title: str, facts: Mapping[str, str], note: str = "") -> str:
     """A bold title, a line per fact, and a note below; legible on light and dark pages."""
     lines = "".join(
-        f'<tr><td style="text-align:left;opacity:.65">{escape(name)}</td>'
-        f'<td style="text-align:left">{escape(value)}</td></tr>'
+        f'<tr><td style="text-align:left;opacity:.65">{_safe(name)}</td>'
+        f'<td style="text-align:left">{_safe(value)}</td></tr>'
         for name, value in facts.items()
         if value
     )
-    below = f'<div style="opacity:.65">{escape(note)}</div>' if note else ""
-    return f"<div><b>{escape(title)}</b><table>{lines}</table>{below}</div>"
+    below = f'<div style="opacity:.65">{_safe(note)}</div>' if note else ""
+    return f"<div><b>{_safe(title)}</b><table>{lines}</table>{below}</div>"
 
 
 def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], note: str = "") -> str:
     """A bold title over a table with a heading per column, and a note below."""
-    head = "".join(f'<th style="text-align:left">{escape(name)}</th>' for name in columns)
+    head = "".join(f'<th style="text-align:left">{_safe(name)}</th>' for name in columns)
     body = "".join(
-        "<tr>" + "".join(f'<td style="text-align:left">{escape(str(value))}</td>' for value in row) + "</tr>"
+        "<tr>" + "".join(f'<td style="text-align:left">{_safe(str(value))}</td>' for value in row) + "</tr>"
         for row in rows
     )
-    below = f'<div style="opacity:.65">{escape(note)}</div>' if note else ""
-    return f"<div><b>{escape(title)}</b><table><tr>{head}</tr>{body}</table>{below}</div>"
+    below = f'<div style="opacity:.65">{_safe(note)}</div>' if note else ""
+    return f"<div><b>{_safe(title)}</b><table><tr>{head}</tr>{body}</table>{below}</div>"
+
+
+def _safe(text: str) -> str:
+    """For HTML, and without the places of this machine: notebooks are sent to others."""
+    return escape(without_places(text))
 
 
 def notebook_progress(label: str) -> Callable[..., None] | None:

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 # These import torch, which takes seconds; reading a run needs only sites.
-__getattr__ = lazy_names(
+__getattr__, __dir__ = lazy_names(
     __name__,
     {
         "AttentionMass": "capturing.attention",

@@ -62,7 +62,7 @@ __all__ = [
 ]
 
 # `probe-kit --help` and tables that only read must load neither torch nor a simulator.
-__getattr__ = lazy_names(
+__getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Sensitivity": "kinds.instruction_swap.effects",

@@ -7,7 +7,7 @@ from itertools import product
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.known_used import KnownUsed, join
+from probe_kit.retention.compare.known_used import KnownUsed, correct_joins, join
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
@@ -24,7 +24,8 @@ class Joins:
 def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     """Known, encoded, used of every pair of an asked and an acting run.
 
-    runs: those that the table is made of, as it reads them; probes and outcome rule are the table's.
+    runs: those that the table is made of, as it reads them; probes and outcome rule are the table's. Tests are
+    corrected over all pairs.
     """
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
@@ -35,7 +36,7 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
             found.append(join(reader, own, table.results.get(str(policy.location))))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
-    return Joins(tuple(found), tuple(refused))
+    return Joins(tuple(correct_joins(found)), tuple(refused))
 
 
 def _judged(run: RunReader, table: RetentionTable) -> bool:

@@ -11,7 +11,7 @@ from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_
 from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
-from probe_kit.retention.behaviour.wordings import WordingPair, wording_pairs
+from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings, wording_pairs
 from probe_kit.retention.columns.text_table import ANSWERS, PlainTable, answer_table, gap_tables, size_table
 from probe_kit.retention.compare.differences import Difference, group_differences
 from probe_kit.retention.compare.pairing import Compared, compare_runs
@@ -211,7 +211,7 @@ def retention(
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
     judged = [by_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
-    pairs = [pair for run in judged for pair in _wordings(run, names[str(run.location)])]
+    pairs = correct_wordings([pair for run in judged for pair in _wordings(run, names[str(run.location)])])
     gaps = vlm_gaps([run for _, run in listed], names) if gap else []
     if gap and not gaps:
         raise UsageError(
@@ -270,7 +270,8 @@ def _read_probes(
         try:
             found = load_results(run, key)
         except NoProbesError as error:
-            missing.append(f"Success rates only: {error}")
+            shares = "Success rates" if ask_of(run) is None else "Answers"
+            missing.append(f"{shares} only: {error}")
             continue
         results[str(run.location)] = found
         if not is_current(found.settings, run):

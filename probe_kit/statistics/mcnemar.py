@@ -1,6 +1,5 @@
 """Exact tests of two conditions on the same episodes."""
 
-from collections.abc import Sequence
 from math import comb
 
 import numpy as np
@@ -25,12 +24,3 @@ def grouped_sign_p(difference: NDArray[np.int_], groups: NDArray[np.str_]) -> fl
     _, group_of = np.unique(groups, return_inverse=True)
     lead = np.bincount(group_of, weights=difference)
     return sign_p(int((lead > 0).sum()), int((lead < 0).sum()))
-
-
-def holm(values: Sequence[float]) -> list[float]:
-    """p-values of tests made together, by Holm: each is the chance that any of them falls so low by luck."""
-    order = np.argsort(values, kind="stable")
-    raised = np.maximum.accumulate([(len(values) - rank) * values[at] for rank, at in enumerate(order)])
-    adjusted = np.empty(len(values))
-    adjusted[order] = np.minimum(raised, 1.0)
-    return [float(value) for value in adjusted]

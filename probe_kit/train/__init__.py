@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 # `probe-kit --help` must load neither pandas nor matplotlib.
-__getattr__ = lazy_names(
+__getattr__, __dir__ = lazy_names(
     __name__,
     {
         "ArrayRun": "data.array_run",

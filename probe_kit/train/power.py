@@ -1,7 +1,8 @@
 """How much can be seen with so many items? Power of probes and controls, for planning and beside their results."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, sqrt
 from statistics import NormalDist
 
@@ -15,6 +16,14 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
 ITEMS_PER_GROUP, LAYOUTS = 2, 2
+FEWEST_ITEMS, MOST_ITEMS = 5 * ITEMS_PER_GROUP, 1000
+"""Between these the number of items is searched."""
+SEEDS = 5
+"""Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
+NULL_DRAWS, POOL = 4000, 40_000
+"""Experiments without signal per seed, and the groups that they are made of."""
+_NUMBERS = 200_000
+"""Numbers in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +31,7 @@ class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
     chance: against relabellings. binding, twin: against a control that is right half of the time; it takes more if
-    the control is better than that.
+    the control is better than that. spread: standard error of the three, the largest, measured over `SEEDS` seeds.
     """
 
     items: int
@@ -30,23 +39,120 @@ class Power:
     chance: float
     binding: float
     twin: float
+    spread: float
 
 
-def simulate(items: int, above: float, sites: int = 19, draws: int = 200, seed: int = 0) -> Power:
+@dataclass(frozen=True)
+class Needed:
+    """The fewest items at which all three tests see a signal of `above` in a share `power` of experiments.
+
+    items: None if `MOST_ITEMS` are too few. resolution: the next smaller number that was tried is so many items
+    below, and sees it less often. reached: the least share of the three with so many items; spread: its error.
+    """
+
+    above: float
+    power: float
+    items: int | None
+    resolution: int | None = None
+    reached: float | None = None
+    spread: float | None = None
+
+
+def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Power:
     """Power by simulated correctness of `draws` experiments.
 
-    A third of the sites carry the signal. Raises UsageError for fewer than 10 items or an impossible signal.
+    A third of the sites carry the signal, at least one. Raises UsageError for fewer than 10 items, no site, fewer
+    than `SEEDS` draws, or an impossible signal.
     """
-    if items < 5 * ITEMS_PER_GROUP:
+    if items < FEWEST_ITEMS:
         raise UsageError(f"{items} items make fewer than 5 groups; no probe is fitted. Expected 10 or more.")
     if not 0 <= above <= 0.5:
         raise UsageError(f"a signal of {above} above chance; expected a share from 0 to 0.5")
-    generator = np.random.default_rng(seed)
+    if sites < 1 or draws < SEEDS:
+        raise UsageError(f"{sites} sites and {draws} experiments; expected at least 1 and {SEEDS}")
+    signal = np.zeros(sites)
+    signal[_carriers(sites)] = above
+    parts = np.array([_part(items, signal, -(-draws // SEEDS), SEEDS * seed + part) for part in range(SEEDS)])
+    chance, binding, twin = parts.mean(axis=0).tolist()
+    spread = float((parts.std(axis=0, ddof=1) / sqrt(SEEDS)).max())
+    return Power(items, above, chance, binding, twin, spread)
+
+
+def items_needed(above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Needed:
+    """The fewest items at which all three tests reach `power`; see `fewest` for how they are looked for.
+
+    Raises UsageError as `simulate` does.
+    """
+    found: dict[int, Power] = {}
+
+    def reaches(items: int) -> bool:
+        found[items] = simulate(items, above, sites, draws, seed)
+        return _least(found[items]) >= power
+
+    place = fewest(reaches, FEWEST_ITEMS, MOST_ITEMS)
+    if place is None:
+        return Needed(above, power, None)
+    items, step = place
+    return Needed(above, power, items, step, _least(found[items]), found[items].spread)
+
+
+def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, int] | None:
+    """The smallest even number from `low` to `high` that reaches a goal, and the resolution; None if none does.
+
+    The range is halved until it is as wide as the resolution: a group of items, and above 200 of them 2 %. A
+    simulated power is noisy and goes in steps: where one of the next two larger numbers fails, the search goes on
+    above it, so that the goal is reached at three numbers in a row.
+    """
+    known: dict[int, bool] = {}
+
+    def does(items: int) -> bool:
+        if items not in known:
+            known[items] = reaches(items)
+        return known[items]
+
+    below, above = low - ITEMS_PER_GROUP, low
+    while not does(above):
+        if above >= high:
+            return None
+        below, above = above, min(2 * above, high)
+    while True:
+        step = _resolution(above)
+        while above - below > step:
+            middle = below + max(step, (above - below) // 2 // step * step)
+            below, above = (below, middle) if does(middle) else (middle, above)
+            step = _resolution(above)
+        failing = [items for items in (above + step, above + 2 * step) if items <= high and not does(items)]
+        if not failing:
+            return above, above - below
+        below, above = failing[-1], failing[-1] + step
+        while not does(above):
+            if above >= high:
+                return None
+            below, above = above, min(above + step, high)
+
+
+def _resolution(items: int) -> int:
+    """A group of items, and above 200 of them about 2 %."""
+    return max(1, items // 50 // ITEMS_PER_GROUP) * ITEMS_PER_GROUP
+
+
+def _least(found: Power) -> float:
+    return min(found.chance, found.binding, found.twin)
+
+
+def _carriers(sites: int) -> slice:
+    """A third of the sites, at least one, around 0.6 of the depth."""
+    count = max(1, round(sites / 3))
+    first = min(max(0, round(0.6 * (sites - 1) - (count - 1) / 2)), sites - count)
+    return slice(first, first + count)
+
+
+def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tuple[float, float, float]:
+    """Shares of `draws` experiments in which each test sees the signal, with a limit of chance of their own."""
+    generator = np.random.default_rng([seed, items, signal.size])
     groups = np.repeat(np.arange(items // ITEMS_PER_GROUP), ITEMS_PER_GROUP * LAYOUTS)
-    signal = np.where(np.abs(np.arange(sites) - 0.6 * sites) <= sites / 6, above, 0.0)
-    nothing = np.zeros(sites)
-    null = [_right(generator, nothing, groups).mean(axis=1).max() for _ in range(max(draws, 400))]
-    limit = float(np.quantile(null, 1 - SIGNIFICANCE))
+    nothing = np.zeros(signal.size)
+    limit = _limit(items // ITEMS_PER_GROUP, signal.size, seed)
     seen = []
     for draw in range(draws):
         here, twin = _right(generator, signal, groups), _right(generator, nothing, groups)
@@ -59,8 +165,40 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 200, seed: 
                 better_than_best(here, twin, groups, draw).min() < SIGNIFICANCE,
             )
         )
-    chance, binding, beaten = np.mean(seen, axis=0)
-    return Power(items, above, float(chance), float(binding), float(beaten))
+    chance, binding, beaten = np.mean(seen, axis=0).tolist()
+    return chance, binding, beaten
+
+
+@lru_cache(maxsize=256)
+def _limit(groups: int, sites: int, seed: int) -> float:
+    """What the best of `sites` without signal exceeds in less than `SIGNIFICANCE` of experiments.
+
+    Groups are drawn from a pool and its complement, so that every site is right in one half of the pool exactly.
+    """
+    generator = np.random.default_rng([seed, groups, sites, 1])
+    pool = _pool(sites, seed)
+    at_once = max(1, _NUMBERS // (groups * sites))
+    best = [
+        pool[generator.integers(len(pool), size=(min(at_once, NULL_DRAWS - start), groups))]
+        .sum(axis=1, dtype=np.int64)
+        .max(axis=1)
+        for start in range(0, NULL_DRAWS, at_once)
+    ]
+    exceeded = np.sort(np.concatenate(best))[::-1][ceil(SIGNIFICANCE * NULL_DRAWS) - 1]
+    return float(exceeded) / (groups * ITEMS_PER_GROUP * LAYOUTS)
+
+
+@lru_cache(maxsize=SEEDS)
+def _pool(sites: int, seed: int) -> NDArray[np.int8]:
+    """(2 POOL, S) episodes that each site gets right in groups without signal."""
+    size = ITEMS_PER_GROUP * LAYOUTS
+    generator = np.random.default_rng([seed, sites, 2])
+    drawn = []
+    for _ in range(POOL // 2000):
+        right = _right(generator, np.zeros(sites), np.repeat(np.arange(2000), size))
+        drawn.append(right.reshape(sites, -1, size).sum(axis=2, dtype=np.int8).T)
+    own = np.concatenate(drawn)
+    return np.concatenate([own, np.int8(size) - own])
 
 
 def items_for_width(width: float) -> int:
@@ -71,15 +209,6 @@ def items_for_width(width: float) -> int:
     if not 0 < width < 1:
         raise UsageError(f"an interval {width} wide; expected a share between 0 and 1")
     return ceil((NormalDist().inv_cdf(0.975) / width) ** 2)
-
-
-def items_needed(above: float, power: float, grid: Sequence[int], sites: int = 19, draws: int = 200) -> int | None:
-    """The first number of items of an ascending `grid` at which all three tests reach `power`, None if none."""
-    for items in grid:
-        found = simulate(items, above, sites, draws)
-        if min(found.chance, found.binding, found.twin) >= power:
-            return items
-    return None
 
 
 def _right(

@@ -10,13 +10,16 @@ from probe_kit._terminal.console import err, out, print_json, split, whole_numbe
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
-    from probe_kit.train.power import Power
+    from probe_kit.train.power import Needed, Power
 
 MOST_ITEMS = 100_000
+ITEMS = "24,60,150,300"
 
 
 def power(
-    items: Annotated[str, typer.Option(help="Comma-separated numbers of items per category.")] = "24,60,150,300",
+    items: Annotated[
+        str | None, typer.Option(help="Comma-separated numbers of items per category [default: 24,60,150,300].")
+    ] = None,
     signal: Annotated[
         str, typer.Option(help="Comma-separated signals: points of accuracy above chance, in %.")
     ] = "10,15,25",
@@ -28,7 +31,7 @@ def power(
     width: Annotated[
         float | None, typer.Option(help="Instead: items for an SR interval so wide, in points.", min=0.1, max=100)
     ] = None,
-    draws: Annotated[int, typer.Option(help="Simulated experiments per number.", min=20, max=100_000)] = 200,
+    draws: Annotated[int, typer.Option(help="Simulated experiments per number.", min=20, max=100_000)] = 400,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """How many items do I need? Power of probes against chance, binding and a twin, by simulation.
@@ -42,7 +45,9 @@ def power(
             raise UsageError(f"{name} is {value}; expected a number")
     if width is not None and wanted is not None:
         raise UsageError("--power and --width are two questions; ask them one after the other")
-    counts = [_whole(part) for part in split(items) or ()]
+    if items is not None and (width is not None or wanted is not None):
+        raise UsageError("--power and --width look for the number of items themselves; leave --items out")
+    counts = [_whole(part) for part in split(items or ITEMS) or ()]
     signals = [_points(part) for part in split(signal) or ()]
     if width is not None:
         needed = items_for_width(width / 100)
@@ -50,19 +55,29 @@ def power(
         return
     with err.status("simulating"):
         if wanted is not None:
-            fewest = {above: items_needed(above, wanted / 100, counts, sites, draws) for above in signals}
+            fewest = [items_needed(above, wanted / 100, sites, draws) for above in signals]
         else:
             found = [simulate(count, above, sites, draws) for count in counts for above in signals]
     if wanted is not None:
         if as_json:
-            print_json([{"above": above, "items": count} for above, count in fewest.items()])
-        for above, count in fewest.items() if not as_json else ():
-            answer = f"more than {max(counts)}" if count is None else count
-            out.print(f"{100 * above:g} points above chance, seen in {wanted:g} %: {answer} items per category")
+            print_json([asdict(one) for one in fewest])
+        for one in fewest if not as_json else ():
+            out.print(f"{100 * one.above:g} points above chance, seen in {wanted:g} %: {_answer(one)}")
     elif as_json:
         print_json([asdict(one) for one in found])
     else:
         _print(found)
+
+
+def _answer(one: "Needed") -> str:
+    from probe_kit.train.power import MOST_ITEMS as MOST_SEARCHED
+
+    if one.items is None or one.reached is None or one.spread is None:
+        return f"more than {MOST_SEARCHED} items per category"
+    return (
+        f"{one.items} items per category (to {one.resolution}; simulated there {100 * one.reached:.0f} % "
+        f"± {100 * one.spread:.1f}; more --draws narrow it)"
+    )
 
 
 def _print(found: "list[Power]") -> None:
@@ -74,17 +89,26 @@ def _print(found: "list[Power]") -> None:
         "against chance %",
         "against binding %",
         "against a twin %",
+        "± (standard error)",
         "red control from %",
     )
-    rows = [(one.above, one.chance, one.binding, one.twin, detectable(one.items)) for one in found]
+    rows = [
+        (
+            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.binding, one.twin)),
+            f"{100 * one.spread:.1f}",
+            f"{100 * detectable(one.items):.0f}",
+        )
+        for one in found
+    ]
     out.print(
         FittingTable(
             title="Power: how often a signal is seen",
-            caption="binding and twin at chance; a leaking control of that accuracy is red in 80 % of suites",
+            caption="binding and twin at chance; ±: of the three, the largest, measured over seeds; a leaking "
+            "control of that accuracy is red in 80 % of suites",
             name="items",
             names=tuple(str(one.items) for one in found),
             styles=("",) * len(found),
-            parts=(Part("Power", headings, tuple(tuple(Cell(f"{100 * x:.0f}") for x in row) for row in rows)),),
+            parts=(Part("Power", headings, tuple(tuple(map(Cell, row)) for row in rows)),),
         )
     )
 

@@ -172,7 +172,7 @@ def _settings(
     call: int,
 ) -> ProbeSettings:
     if not run.streams:
-        raise NoProbesError(f"{run.location} has no activations to probe: policy {run.model!r} has no streams.")
+        raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
     known = list(dict.fromkeys(run.episodes["category"]))
     for category in categories or ():
         if category not in (*known, POOLED):

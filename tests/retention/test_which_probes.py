@@ -61,7 +61,7 @@ def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: Pro
     table = retention([probed, bare, scripted])
     assert len(table.notes) == 2
     assert f"Run `probe-kit train {bare.path}`." in table.notes[0]
-    assert "the policy 'expert' has no streams" in table.notes[1]
+    assert "of 'expert' no stream was stored" in table.notes[1]
     assert table.rows[1].sr == 0.6
     assert retention([probed]).notes == ()
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from probe_kit.statistics.mcnemar import grouped_sign_p, holm, sign_p
+from probe_kit.statistics.mcnemar import grouped_sign_p, sign_p
 
 
 @pytest.mark.parametrize(("more", "less"), [(0, 0), (5, 5), (1, 0), (9, 1), (2, 11), (40, 20)])
@@ -18,12 +18,6 @@ def test_items_that_share_pictures_count_once():
     assert grouped_sign_p(difference, alone) == sign_p(6, 0) == 0.03125
     assert grouped_sign_p(difference, together) == sign_p(2, 0) == 0.5
     assert grouped_sign_p(np.array([1, -1, 0]), np.array(list("aab"))) == 1.0
-
-
-def test_holm_multiplies_the_smallest_by_all_and_never_falls():
-    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
-    assert holm([0.9, 0.8]) == [1.0, 1.0]
-    assert holm([]) == []
 
 
 def test_the_grouped_test_raises_no_false_alarm_where_groups_answer_alike():

@@ -1,12 +1,16 @@
 import json
+from math import ceil
+from statistics import NormalDist
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.statistics.significance import detectable
-from probe_kit.train.power import items_for_width, items_needed, simulate
+from probe_kit.train.power import _carriers, _limit, fewest, items_for_width, items_needed, simulate
 
 
 def test_power_grows_with_items_and_with_the_signal() -> None:
@@ -29,9 +33,105 @@ def test_what_a_control_could_have_seen_at_this_size() -> None:
         detectable(0)
 
 
-def test_the_items_needed_are_the_first_that_reach_the_power() -> None:
-    assert items_needed(0.25, 0.8, (24, 150), draws=60) == 150
-    assert items_needed(0.05, 0.99, (24,), draws=60) is None
+def test_one_site_carries_the_signal_too() -> None:
+    """An independent simulation of one probe sees 25 points in nearly all experiments with 60 items."""
+    found = simulate(60, 0.25, sites=1, draws=100)
+    assert found.chance > 0.98
+    assert found.binding > 0.7
+    assert simulate(60, 0.0, sites=1, draws=100).chance < 0.12
+
+
+@pytest.mark.parametrize("sites", range(1, 40))
+def test_a_third_of_the_sites_carry_the_signal_whatever_their_number(sites: int) -> None:
+    carriers = range(sites)[_carriers(sites)]
+    assert len(carriers) == max(1, round(sites / 3))
+
+
+def independent(items: int, above: float, sites: int, draws: int) -> float:
+    """Power against chance of `draws` experiments, from the whole covariance instead of its recursion."""
+    generator = np.random.default_rng(12345)
+    place = np.arange(sites)
+    of_sites = 0.9 ** np.abs(place[:, None] - place)
+    of_group = 0.3 + 0.7 * np.eye(4)
+    root = np.linalg.cholesky(np.kron(of_sites, of_group))
+    groups = items // 2
+
+    def best(signal: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+        limits = np.array([NormalDist().inv_cdf(0.5 + share) for share in signal])
+        found = []
+        for _ in range(count):
+            values = (generator.standard_normal((groups, 4 * sites)) @ root.T).reshape(groups, sites, 4)
+            found.append((values < limits[:, None]).mean(axis=(0, 2)).max())
+        return np.array(found)
+
+    signal = np.zeros(sites)
+    signal[_carriers(sites)] = above
+    null = np.sort(best(np.zeros(sites), 10 * draws))
+    return float((best(signal, draws) > null[-ceil(0.05 * len(null))]).mean())
+
+
+@pytest.mark.parametrize(("items", "above", "sites"), [(60, 0.25, 1), (60, 0.1, 1), (24, 0.15, 5)])
+def test_power_against_chance_is_that_of_an_independent_simulation(items: int, above: float, sites: int) -> None:
+    expected = independent(items, above, sites, 1000)
+    found = [simulate(items, above, sites, draws=100, seed=seed).chance for seed in range(4)]
+    error = (expected * (1 - expected) * (1 / 1000 + 1 / 400)) ** 0.5
+    assert np.mean(found) == pytest.approx(expected, abs=3.5 * error + 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("items", "above"), [(60, 0.1), (24, 0.15), (150, 0.1)])
+def test_power_over_all_sites_is_that_of_an_independent_simulation(items: int, above: float) -> None:
+    expected = independent(items, above, 19, 1500)
+    found = simulate(items, above, draws=1500).chance
+    error = (2 * expected * (1 - expected) / 1500) ** 0.5
+    assert found == pytest.approx(expected, abs=3.5 * error + 0.01)
+
+
+def test_the_limit_of_chance_hardly_depends_on_the_seed() -> None:
+    """A step of one episode is what is left of it."""
+    for groups in (12, 30, 75):
+        limits = [_limit(groups, 19, seed) for seed in range(6)]
+        assert max(limits) - min(limits) <= 1 / (4 * groups) + 1e-9
+
+
+@pytest.mark.slow
+def test_the_spread_is_the_error_over_seeds() -> None:
+    """Over repetitions, shares vary as much as the spread says: more draws, less of both."""
+    few = [simulate(24, 0.15, 5, draws=50, seed=seed) for seed in range(8)]
+    many = [simulate(24, 0.15, 5, draws=400, seed=seed) for seed in range(4)]
+    measured = max(np.std([getattr(one, name) for one in few], ddof=1) for name in ("chance", "binding", "twin"))
+    said = float(np.mean([one.spread for one in few]))
+    assert 0.4 * measured < said < 2.5 * measured
+    assert np.mean([one.spread for one in many]) < 0.7 * said
+
+
+@pytest.mark.parametrize("goal", [10, 12, 58, 68, 150, 152, 999, 1000])
+def test_the_fewest_items_are_found_to_the_resolution_that_is_said(goal: int) -> None:
+    found = fewest(lambda items: items >= goal, 10, 1000)
+    assert found is not None
+    items, resolution = found
+    assert goal <= items < goal + resolution
+    assert resolution <= max(2, items // 50)
+
+
+def test_a_number_that_reaches_the_goal_by_luck_is_not_the_fewest() -> None:
+    """Shares go in steps: 40 reach it and 42 do not."""
+    found = fewest(lambda items: items == 40 or items >= 68, 10, 1000)
+    assert found == (68, 2)
+    assert fewest(lambda _: False, 10, 1000) is None
+    assert fewest(lambda items: items == 1000, 10, 1000) is not None
+
+
+def test_the_items_needed_reach_the_power_and_a_step_less_does_not() -> None:
+    needed = items_needed(0.25, 0.8, sites=3, draws=60)
+    assert needed.items is not None
+    assert needed.resolution is not None
+    here, less = (simulate(count, 0.25, 3, 60) for count in (needed.items, needed.items - needed.resolution))
+    assert min(here.chance, here.binding, here.twin) == needed.reached >= 0.8
+    assert min(less.chance, less.binding, less.twin) < 0.8
+
+
+def test_the_width_of_an_interval_asks_for_items_too() -> None:
     assert items_for_width(0.16) == 151  # 0.08 either side: the margin of 150 items
     for width in (0.0, 1.5):
         with pytest.raises(UsageError, match="expected a share"):
@@ -53,6 +153,17 @@ def test_the_command_prints_every_number_of_items() -> None:
     assert "against a twin" in text
     assert CliRunner().invoke(app, ["power", "--width", "16"]).stdout.startswith("151 items")
     assert CliRunner().invoke(app, ["power", "--items", "many"]).exit_code == 2
+
+
+def test_the_command_looks_for_the_number_and_says_how_well_it_is_known() -> None:
+    asked = ["power", "--power", "70", "--signal", "50", "--sites", "1", "--draws", "20"]
+    (found,) = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
+    assert found.keys() == {"above", "power", "items", "resolution", "reached", "spread"}
+    text = CliRunner().invoke(app, asked).stdout
+    assert f"{found['items']} items per category (to {found['resolution']};" in text
+    refused = CliRunner().invoke(app, [*asked, "--items", "24,60"])
+    assert refused.exit_code == 2
+    assert "leave --items out" in refused.output
 
 
 def test_two_questions_are_not_answered_by_one_of_them() -> None:

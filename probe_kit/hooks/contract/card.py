@@ -1,8 +1,20 @@
 """The card of a loaded model: enough to say whose numbers these are. Imports no torch."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
+
+
+@dataclass(frozen=True)
+class SourceWeights:
+    """What identifies the weights that a policy's network grew from; None for what is not known.
+
+    checkpoint: their hub id. sha256: as `Card.weights_sha256`. parameters: how many numbers they are in memory.
+    """
+
+    checkpoint: str | None = None
+    sha256: str | None = None
+    parameters: int | None = None
 
 
 @dataclass(frozen=True)
@@ -17,7 +29,8 @@ class Card:
     chunk, execute: actions per inference and how many of them are carried out; 0 for a model that does not act.
     ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
     newest weighing most; None carries out the head of the newest chunk.
-    source: the family of the reader whose network this policy grew from, if it is one of ours.
+    source: the family of the reader whose network this policy grew from, if it is one of ours. source_weights: of
+    that family, the weights; None where nobody can know them, as of a checkpoint that is not the family's own.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """
 
@@ -41,6 +54,7 @@ class Card:
     needs: frozenset[str] = frozenset()
     ensemble: float | None = None
     source: str | None = None
+    source_weights: SourceWeights | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As stored in a run's certificate: plain values only."""
@@ -52,4 +66,5 @@ class Card:
             "audit": dict(self.audit),
             "settings": dict(self.settings),
             "needs": sorted(self.needs),
+            "source_weights": None if self.source_weights is None else asdict(self.source_weights),
         }

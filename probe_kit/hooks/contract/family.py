@@ -13,6 +13,7 @@ from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.checkpoints.third_party import loading, of_checkpoint
+from probe_kit.hooks.contract.card import Card, SourceWeights
 from probe_kit.hooks.contract.default_scene import BRIDGE, Home
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options
@@ -42,7 +43,8 @@ class Family:
     config.json. packages: modules of an extra that it needs, with the name of that extra.
     unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
     `verify --keys` prints them.
-    source: name of the reader whose network this policy grew from, if it is one of ours. sizes: hub ids of the
+    source: name of the reader whose network this policy grew from, if it is one of ours. source_weights: the
+    weights from which the default checkpoint, and those of protocols, grew. sizes: hub ids of the
     released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
@@ -73,6 +75,7 @@ class Family:
     needs_checkpoint: bool = False
     protocols: Mapping[str, ProtocolRow] = MappingProxyType({})
     source: str | None = None
+    source_weights: SourceWeights | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
     home: Home = BRIDGE
@@ -118,8 +121,17 @@ class Family:
             _check_streams(model, str(place))
         # What an adapter does not say of its options itself is part of the identity all the same.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
-        model.card = replace(model.card, settings={**said, **model.card.settings}, source=self.source)
+        model.card = replace(
+            model.card, settings={**said, **model.card.settings}, **self._source_of(model.card, place)
+        )
         return model
+
+    def _source_of(self, card: Card, place: str | None) -> dict[str, Any]:
+        """What the card says of the source: a random twin has none, a foreign checkpoint an unknown one."""
+        if card.random_weights:
+            return {"source": None, "source_weights": None}
+        own = place in (self.default_checkpoint, *(row.checkpoint for row in self.protocols.values()))
+        return {"source": self.source, "source_weights": self.source_weights if own else None}
 
     def check(
         self,

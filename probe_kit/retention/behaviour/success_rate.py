@@ -81,18 +81,19 @@ class SuccessRate:
 
 
 def regime(sr: float, delta: float, p_wrong: float, p_oob: float, asked: bool = False) -> tuple[Regime, str]:
-    """The regime of a success rate, and why in a few words. asked: `oob` is an answer not read."""
+    """The regime of a success rate, and why in a few words. asked: it is one of answers, `oob` one not read."""
+    share = "accuracy" if asked else "SR"
     if sr > 0.5 + delta:
-        return Regime.KNOWLEDGE, f"SR {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
+        return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
     if sr >= 0.5 - delta:
-        return Regime.NO_RELIABLE_KNOWLEDGE, f"SR {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
+        return Regime.NO_RELIABLE_KNOWLEDGE, f"{share} {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
     nowhere = "no answer could be read in" if asked else "the cube ends outside both zones in"
     cause = (
         f"{nowhere} {p_oob:.0%} of episodes"
         if p_oob >= p_wrong
         else f"the wrong picture is chosen in {p_wrong:.0%} of episodes"
     )
-    return Regime.FAILURE, f"SR {sr:.3f} is below 0.5 − Δ = {0.5 - delta:.3f}: {cause}"
+    return Regime.FAILURE, f"{share} {sr:.3f} is below 0.5 − Δ = {0.5 - delta:.3f}: {cause}"
 
 
 def normalised_score(success_rates: Sequence[float]) -> float:

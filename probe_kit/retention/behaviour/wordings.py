@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probe_kit.retention.behaviour.success_rate import units_of
-from probe_kit.statistics.mcnemar import grouped_sign_p, holm, sign_p
+from probe_kit.retention.correction import corrected
+from probe_kit.statistics.mcnemar import grouped_sign_p, sign_p
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,8 +29,8 @@ class WordingPair:
 
     n_episodes: so many. sr, other_sr: shares that were right. only, only_other: how many were right in one alone.
     p: McNemar's exact two-sided p over episodes. p_groups: the same with groups of items that share pictures as
-    the unit, which is the one to trust where there are twins. p_holm: that, corrected for all pairs of wordings of
-    the category.
+    the unit, which is the one to trust where there are twins. p_holm: that, corrected over the categories and
+    pairs of wordings of all runs of the table, or over the rows `all`.
     """
 
     run: str
@@ -56,16 +57,20 @@ def wording_pairs(episodes: "pd.DataFrame", wordings: Sequence[str], run: str, l
     by_category = [(str(name), table) for name, table in episodes.groupby("category", sort=False)]
     if len(by_category) > 1:
         by_category.append((EVERY, episodes))
-    found = []
-    for category, table in by_category:
-        pairs = [
+    return correct_wordings(
+        [
             _pair(table, wording, other, run, label, category)
+            for category, table in by_category
             for wording, other in combinations(wordings, 2)
             if _in_both(table, wording, other).any()
         ]
-        corrected = holm([pair.p_groups for pair in pairs])
-        found += [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
-    return found
+    )
+
+
+def correct_wordings(pairs: Sequence[WordingPair]) -> list[WordingPair]:
+    """The same pairs, which stand in one table, with `p_holm` over the lot."""
+    found = corrected(pairs, lambda pair: pair.p_groups, lambda pair: pair.category == EVERY)
+    return [replace(pair, p_holm=p) for pair, p in zip(pairs, found, strict=True) if p is not None]
 
 
 def _in_both(table: "pd.DataFrame", wording: str, other: str) -> "NDArray[np.bool_]":

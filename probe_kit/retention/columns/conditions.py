@@ -35,7 +35,8 @@ def condition_tables(rows: Sequence[RetentionRow], wordings: Sequence[WordingPai
 
 _LADDER = (
     "same items, same seeds; only one: episodes right in the first wording alone, and in the second alone; p: "
-    "McNemar, exact; by group: items that share pictures count once; Holm: that, for all pairs of the category"
+    "McNemar, exact; by group: items that share pictures count once; Holm: that, over all categories, pairs and "
+    "runs shown"
 )
 
 

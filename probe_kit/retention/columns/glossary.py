@@ -1,6 +1,9 @@
 """What every number of the report means, in words that need no paper beside them."""
 
+from collections.abc import Mapping
 from types import MappingProxyType
+
+from probe_kit.retention.kinds import Kind
 
 GLOSSARY = MappingProxyType(
     {
@@ -126,3 +129,60 @@ GLOSSARY = MappingProxyType(
     }
 )
 """Term to meaning; the headings of the tables show these too."""
+
+_ASKED = MappingProxyType(
+    {
+        "SR": (
+            "Accuracy: share of episodes in which the right picture was named. In brackets the 95 % interval, "
+            "whole groups of questions resampled. Two pictures: guessing gives 50 %."
+        ),
+        "call": "Which inference of an episode was probed, counted from 0; a model that is asked has this one.",
+        "wrong": "Share of episodes in which the other picture was named.",
+        "outside": "Share of episodes in which no answer could be read, or several.",
+        "original": "Accuracy in the layout as drawn.",
+        "swapped": "Accuracy with the two pictures exchanged.",
+        "left": "Accuracy where the correct picture lay on the left.",
+        "right": "Accuracy where it lay on the right. Left and right far apart: one side is preferred.",
+        "goes left": "Among the answers that could be read, the share that named the left one. 50 %: no habit.",
+        "right twice": (
+            "Questions answered correctly in both layouts, of those that were asked in both. A habit of naming "
+            "one side cannot produce these."
+        ),
+        "reading": (
+            "Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so "
+            "far. Failure: as far below; the answers cannot be read, or the wrong one is preferred."
+        ),
+        "normalised score": "Mean accuracy on a scale where guessing is 0 and perfection 100.",
+        "action": (
+            "Best held-out accuracy of a probe where the answer is made (the position that chooses its first "
+            "token), over layers."
+        ),
+        "layer": (
+            "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first "
+            "of several that are equally good; after +: how many others are. After @: the iteration."
+        ),
+        "retention": (
+            "(answer − chance) / (backbone − chance): the share of what can be read in the backbone that can "
+            "still be read where the answer is made. Biased upwards when signals are weak: both are maxima."
+        ),
+        "first iteration": "Best layer at the first iteration.",
+        "gap": "Backbone accuracy minus that of the answers, in points: what can be read but is not said.",
+    }
+)
+"""What the same terms mean of a model that was asked."""
+_ACTING_ONLY = ("never moved", "flagged", "follows / against", "used")
+"""Terms that mean nothing where no policy acted."""
+
+
+def glossary_of(kind: Kind) -> Mapping[str, str]:
+    """Term to meaning for a page of policies, of models that were asked, or of both."""
+    if kind == "acts":
+        return GLOSSARY
+    if kind == "asks":
+        return {word: _ASKED.get(word, said) for word, said in GLOSSARY.items() if word not in _ACTING_ONLY}
+    return {
+        word: f"{said} Of a model that was asked: {_ASKED[word][:1].lower()}{_ASKED[word][1:]}"
+        if word in _ASKED
+        else said
+        for word, said in GLOSSARY.items()
+    }

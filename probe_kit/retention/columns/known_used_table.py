@@ -17,7 +17,7 @@ _LEGEND = (
     "of an item, which a coin manages in 25 %"
 )
 _CODES = "a capital letter for what is right, a small one for what is not"
-_TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over categories and pairs"
+_TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
 
 
 def rich_join(joined: KnownUsed) -> "Group":

@@ -83,7 +83,10 @@ def difference_legend(differences: Sequence[Difference], behaviour: bool = True)
         "whole groups of items drawn, the same for both sides" if any(row.paired for row in differences) else ""
     )
     own = "" if all(row.paired for row in differences) else "of other items: each side's own groups drawn"
-    tests = "p of SR: exact, signs of groups flipped, in means over all items (Holm: all categories and pairs)"
+    tests = (
+        "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories and "
+        "pairs)"
+    )
     shown = tests if behaviour and any(row.p is not None for row in differences) else ""
     probes = "best sites held fixed" if any(row.prefix_accuracy is not None for row in differences) else ""
     return "differences: 95 %, " + "; ".join(filter(None, [drawn, own, probes, shown]))

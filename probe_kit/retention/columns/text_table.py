@@ -1,6 +1,6 @@
 """Tables of text that look the same in every format: answers, sizes of the picture by prompt, VLM − VLA."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -18,6 +18,7 @@ from probe_kit.retention.columns.text import (
     with_limits,
 )
 from probe_kit.retention.compare.vlm_vla import VlmGap
+from probe_kit.retention.grown_from import Relation
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 ANSWERS = "Answers"
@@ -95,6 +96,13 @@ _GAPS: Sequence[tuple[str, Callable[[VlmGap], str]]] = [
 ]
 
 
+_SOURCES: Mapping[Relation, str] = {
+    "yes": "the policy grew from these weights",
+    "no": "the policy did NOT grow from these weights",
+    "unknown": "unknown whether the policy grew from these weights",
+}
+
+
 def gap_tables(gaps: Sequence[VlmGap]) -> list[PlainTable]:
     """One table per pair of an asked and an acting run."""
     return [
@@ -111,7 +119,8 @@ def _gap_table(asked: str, acted: str, rows: Sequence[VlmGap]) -> PlainTable:
     items = "the same items" if all(row.paired for row in rows) else "OTHER items: not paired, no p"
     return PlainTable(
         f"VLM − VLA: {asked} − {acted}",
-        f"{items}; {seen}; p: exact, whole groups of items flipped",
+        f"{items}; {seen}; {_SOURCES[rows[0].source]}; p: exact, whole groups of items flipped; (Holm): over the "
+        "categories of all pairs shown, means by themselves",
         tuple(name for name, _ in _GAPS),
         tuple(tuple(cell(row) for _, cell in _GAPS) for row in rows),
     )

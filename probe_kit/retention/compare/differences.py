@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
+from probe_kit.retention.correction import corrected
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Estimates, Limits, average
 from probe_kit.retention.rows.build import Drawn
 from probe_kit.retention.rows.category_mean import average_estimates
 from probe_kit.retention.rows.row import MEAN
-from probe_kit.statistics.paired_tests import holm
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -192,11 +192,8 @@ def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:
 
 def _with_holm(rows: Sequence[Difference]) -> list[Difference]:
     """Categories of all pairs are one family, means of all pairs another; views do not multiply tests of SR."""
-    corrected: dict[tuple[str, str, str], float | None] = {}
-    for means in (False, True):
-        tests = {_test(row): row.p for row in rows if (row.category == MEAN) == means}
-        corrected |= zip(tests, holm(list(tests.values())), strict=True)
-    return [replace(row, p_holm=corrected[_test(row)]) for row in rows]
+    found = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, _test)
+    return [replace(row, p_holm=p) for row, p in zip(rows, found, strict=True)]
 
 
 def _test(row: Difference) -> tuple[str, str, str]:

@@ -17,13 +17,13 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.correction import corrected
 from probe_kit.retention.estimators.cross_fit import random_halves
 from probe_kit.retention.estimators.retention import best_site
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
     fisher_p,
     flip_p,
-    holm,
     mcnemar_p,
     overlap_p,
 )
@@ -49,7 +49,8 @@ class Comparison:
     """Whether two of the three are right of equally many items.
 
     only_first, only_second: items on which they differ. p_mcnemar: exact over items; p_groups: the same, whole
-    groups of items turned together; p: the larger of the two. p_holm: over all categories and pairs.
+    groups of items turned together; p: the larger of the two. p_holm: over all categories and pairs, of all joins
+    that are shown together.
     """
 
     first: str
@@ -157,7 +158,24 @@ def join(
         rows.append(_over_all(whole, rows, seed))
     notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *_without_signal(rows)]
     score = str(getattr(asked, "score", "text"))
-    return KnownUsed(asked.label, acted.label, score, chosen, tuple(_with_holm(rows)), tuple(notes))
+    joined = KnownUsed(asked.label, acted.label, score, chosen, tuple(rows), tuple(notes))
+    return correct_joins([joined])[0]
+
+
+def correct_joins(joins: Sequence[KnownUsed]) -> list[KnownUsed]:
+    """The same joins, which are shown together, with `p_holm` over the lot.
+
+    The tests of all categories are one family; those over all categories are a summary and no part of it.
+    """
+    tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
+    p_holm = iter(corrected(tests, lambda one: one.p))
+
+    def of_row(row: Joined) -> Joined:
+        if row.category == OVERALL:
+            return row
+        return replace(row, comparisons=tuple(replace(one, p_holm=next(p_holm)) for one in row.comparisons))
+
+    return [replace(join, rows=tuple(of_row(row) for row in join.rows)) for join in joins]
 
 
 # -- the same questions ----------------------------------------------------------------------------------
@@ -364,17 +382,6 @@ def _over_all(items: "pd.DataFrame", rows: Sequence[Joined], seed: int) -> Joine
     known, used = own["known"].to_numpy(bool), own["used"].to_numpy(bool)
     p = overlap_p(known, used, own["category"].to_numpy(str), derive_seed("overlap", seed)) if len(own) else None
     return replace(whole, p_linked=p)
-
-
-def _with_holm(rows: Sequence[Joined]) -> list[Joined]:
-    """The tests of all categories are one family; those over all categories are a summary and no part of it."""
-    single = [row for row in rows if row.category != OVERALL]
-    corrected = iter(holm([one.p for row in single for one in row.comparisons]))
-    found = [
-        replace(row, comparisons=tuple(replace(one, p_holm=next(corrected)) for one in row.comparisons))
-        for row in single
-    ]
-    return [*found, *(row for row in rows if row.category == OVERALL)]
 
 
 # -- what a reader must know -----------------------------------------------------------------------------

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.correction import corrected
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits, average, sr_estimate
+from probe_kit.retention.grown_from import Relation, grew_from
 from probe_kit.retention.rows.row import MEAN
-from probe_kit.statistics.paired_tests import flip_p, holm
+from probe_kit.statistics.paired_tests import flip_p
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -22,7 +24,9 @@ class VlmGap:
 
     paired: whether both are of the same episodes, whose groups are then drawn together. same_frames: whether every
     one of these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
-    flipped, of all items at once in the row `mean`; None unless paired. p_holm: over the categories of the pair.
+    flipped, of all items at once in the row `mean`; None unless paired. p_holm: over the categories of all pairs
+    of the table, or over the pairs in rows `mean`. source: whether the policy's network grew from the weights that
+    were asked; `unknown` where cards do not say.
     """
 
     asked: str
@@ -37,30 +41,30 @@ class VlmGap:
     vlm_gap_ci: Limits
     p: float | None = None
     p_holm: float | None = None
+    source: Relation = "unknown"
 
 
 def vlm_gaps(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> list[VlmGap]:
     """Every asked run minus every acting one that it can be compared with, per category and over all of them.
 
-    A policy whose network grew from one of the readers that were asked is compared with that one only.
+    A policy whose network grew from weights that were asked is not compared with readers of other weights.
     names: what runs are called, by their location; by default their labels. Runs as `retention` reads them.
     """
     called = names or {str(run.location): run.label for run in runs}
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None]
-    readers = {run.model for run in asked}
     found: list[VlmGap] = []
-    for reader, policy in product(asked, acted):
-        source = _source(policy)
-        if source not in readers or source == reader.model:
-            found += _pair(reader, policy, called)
-    return found
+    for reader, policy, source in _chosen(asked, acted):
+        found += [replace(row, source=source) for row in _pair(reader, policy, called)]
+    p_holm = corrected(found, lambda row: row.p, lambda row: row.category == MEAN)
+    return [replace(row, p_holm=p) for row, p in zip(found, p_holm, strict=True)]
 
 
-def _source(run: RunReader) -> str | None:
-    """The reader that a policy's network grew from, as its card says."""
-    certificate: Mapping[str, Mapping[str, str | None]] = getattr(run, "certificate", {})
-    return certificate.get("policy", {}).get("source")
+def _chosen(asked: Sequence[RunReader], acted: Sequence[RunReader]) -> list[tuple[RunReader, RunReader, Relation]]:
+    """The pairs that are compared, reader by reader."""
+    related = [(reader, policy, grew_from(policy, reader)) for reader, policy in product(asked, acted)]
+    grown = {id(policy) for _, policy, source in related if source == "yes"}
+    return [pair for pair in related if pair[2] != "no" or id(pair[1]) not in grown]
 
 
 def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmGap]:
@@ -74,7 +78,6 @@ def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> li
         gaps.append(gap)
     if not rows:
         return []
-    rows = [replace(row, p_holm=p) for row, p in zip(rows, holm([row.p for row in rows]), strict=True)]
     return [*rows, _mean(rows, average(gaps), reader, policy)]
 
 
@@ -134,5 +137,4 @@ def _mean(rows: Sequence[VlmGap], gap: Estimate, reader: RunReader, policy: RunR
         vlm_gap=gap.value,
         vlm_gap_ci=gap.ci,
         p=_p(*kept) if paired else None,
-        p_holm=None,
     )

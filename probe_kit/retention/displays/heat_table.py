@@ -1,6 +1,6 @@
 """Tables of numbers on heat colours, as the paper prints them: a model per row, a category per column."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -12,6 +12,7 @@ from probe_kit.retention.displays.base.display import Shown
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.retention.displays.base.style import axes_for, caption
 from probe_kit.retention.formats.heat import HEAT, heat_colour
+from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
@@ -46,8 +47,9 @@ class HeatTableDisplay(Shown):
     cells: tuple[tuple[Cell, ...], ...]
     certificates: tuple[Certificate, ...]
     parts: ClassVar[tuple[str, ...]] = ("",)
-    title: ClassVar[str] = ""
-    note: ClassVar[str] = ""
+    title = ""
+    note = ""
+    notes: ClassVar[Mapping[Kind, str]] = {}
     scale: ClassVar[float] = 100.0
     digits: ClassVar[int] = 1
     ruled: str = ""
@@ -58,7 +60,10 @@ class HeatTableDisplay(Shown):
         """Of success rates, which belong to an outcome rule."""
         rows = once_per_category(table.all_rows)
         found = cls._of(rows, cell)
-        found.ruled = f", {rule_name(rows)}"
+        kind, acted = kind_of(rows), [row for row in rows if row.kind == "acts"]
+        found.title = cls.title.replace(RATE["acts"], RATE[kind])
+        found.note = cls.notes.get(kind, cls.note)
+        found.ruled = f", {rule_name(acted)}" if acted else ""
         return found
 
     @classmethod
@@ -155,6 +160,10 @@ class SideTableDisplay(HeatTableDisplay):
     title = "Success rate (%) where the correct picture is left | right"
     digits = 0
     note = "equal halves: no side is favoured; one blue, one pale: the policy goes to a side, not to an answer"
+    notes: ClassVar[Mapping[Kind, str]] = {
+        "asks": "equal halves: no side is favoured; one blue, one pale: one side is named, whatever the question",
+        "both": "equal halves: no side is favoured; one blue, one pale: one side is chosen, whatever the question",
+    }
     parts = ("left", "right")
 
     @classmethod

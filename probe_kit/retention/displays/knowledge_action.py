@@ -18,6 +18,7 @@ from probe_kit.retention.displays.base.style import (
     series,
     significance_handles,
 )
+from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
@@ -46,12 +47,13 @@ class KnowledgeActionDisplay(Shown):
     """Success rate against the best probe of a stream, a point per category and model.
 
     On the diagonal the policy acts on what can be read; below it, it knows more than it does. Both axes run from 0
-    to 100 %, whatever is shown.
+    to 100 %, whatever is shown. kind: whether the shares are of policies, of answers or of both.
     """
 
     stream: str
     points: tuple[GapPoint, ...]
     certificates: tuple[Certificate, ...]
+    kind: Kind = "acts"
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -74,7 +76,9 @@ class KnowledgeActionDisplay(Shown):
                 f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
             )
         means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
-        return cls(stream, tuple(points), tuple(Certificate.of_row(mean) for mean in means))
+        certificates = tuple(Certificate.of_row(mean) for mean in means)
+        drawn = [row for row in table.rows if (row.group, row.run) in shown]
+        return cls(stream, tuple(points), certificates, kind_of(drawn))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and captions."""
@@ -84,9 +88,10 @@ class KnowledgeActionDisplay(Shown):
         for position, model in enumerate(models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
         plain(axes)
-        place = "in the backbone" if self.stream == "backbone" else "where the action is made"
+        made = "answer" if self.kind == "asks" else "action"
+        place = "in the backbone" if self.stream == "backbone" else f"where the {made} is made"
         axes.set_xlabel(f"best held-out probe {place} (%)", fontsize=9)
-        axes.set_ylabel("success rate (%)", fontsize=9)
+        axes.set_ylabel(f"{RATE[self.kind].lower()} (%)", fontsize=9)
         if figure is not None:
             legend_above(figure, [*axes.get_legend_handles_labels()[0], *significance_handles()])
         caption(figure, *self.certificates)

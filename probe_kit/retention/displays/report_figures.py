@@ -38,6 +38,7 @@ from probe_kit.retention.displays.side_by_side import curves_side_by_side, has_m
 from probe_kit.retention.estimators.by_call import CallCurves, event_calls
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.joins import joins_of
+from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
@@ -144,23 +145,25 @@ def run_names(runs: Sequence[RunReader]) -> list[str]:
 def _of_table(
     table: RetentionTable, results: Sequence[ProbeResults | None], names: Sequence[str]
 ) -> list[Exhibit]:
-    def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
-        return Exhibit(name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True)
-
     acted = [row for row in table.rows if row.sr is not None]
-    exhibits: list[Exhibit] = []
+    kind, exhibits = kind_of(acted), list[Exhibit]()
+
+    def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
+        note = display.notes.get(kind, display.note)
+        return Exhibit(name, title, subject, note, None, lambda: _figure(display.from_table(table)), True)
+
     if acted:
         exhibits += [
-            show(SuccessTableDisplay, "success", "Success rate", "behaviour"),
-            show(SideTableDisplay, "sides", "Success rate by side", "behaviour"),
+            show(SuccessTableDisplay, "success", RATE[kind], "behaviour"),
+            show(SideTableDisplay, "sides", f"{RATE[kind]} by side", "behaviour"),
         ]
     if any(row.prefix_accuracy is not None for row in acted):
         exhibits.append(
             Exhibit(
-                "knowledge-action", "Knowledge and action", "retention",
+                "knowledge-action", f"Knowledge and {'answers' if kind == 'asks' else 'action'}", "retention",
                 "Each point is one category: how well the answer can be read inside the model (across) and how "
-                "often the model acts on it (up). Points far below the line are knowledge that does not reach the "
-                "hand.",
+                f"often the model {_DOES[kind]} (up). Points far below the line are knowledge that does not reach "
+                f"the {'answer' if kind == 'asks' else 'hand'}.",
                 None, lambda: _figure(KnowledgeActionDisplay.from_table(table)),
             )
         )  # fmt: skip
@@ -178,6 +181,9 @@ def _of_table(
             )
         )  # fmt: skip
     return exhibits
+
+
+_DOES: dict[Kind, str] = {"acts": "acts on it", "asks": "says it", "both": "acts on it or says it"}
 
 
 def _side_by_side(
@@ -253,7 +259,7 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
         Exhibit(
             f"{name}-paired-layouts", "The same question, pictures swapped", "behaviour",
             "Every question is asked twice, with the two pictures exchanged. Knowing the answer means right both "
-            "times; always going to one side means right once. Bold p: more items are right twice than wrong "
+            "times; always choosing one side means right once. Bold p: more items are right twice than wrong "
             "twice, beyond luck.",
             position, lambda: _figure(PairedLayoutsDisplay.from_run(run)),
         )

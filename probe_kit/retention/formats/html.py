@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.lines import (
     Line,
     behaviour_lines,
@@ -42,6 +42,7 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import PlainTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import heat_colour
+from probe_kit.retention.kinds import RATE, heading, kind_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -253,14 +254,15 @@ def behaviour_table(
 ) -> HtmlTable:
     """Success rates and what they are made of, once per category. unpaired: why runs have no differences."""
     lines = behaviour_lines(once_per_category(rows), differences)
-    return replace(_table("Success rate", lines, _BEHAVIOUR), captions=(*_captions(lines), *unpaired))
+    return replace(_table(RATE[kind_of(rows)], lines, _BEHAVIOUR), captions=(*_captions(lines), *unpaired))
 
 
 def more_behaviour_table(rows: Sequence[RetentionRow]) -> HtmlTable:
     """Success rates by layout and at other zone radii, and the habit of going to one side."""
     radii = dict.fromkeys(radius for row in rows for radius in row.sr_by_epsilon)
     columns = [*_MORE_BEHAVIOUR, *(_radius(radius) for radius in radii)]
-    return _table("Success rate by layout and zone radius", compared(once_per_category(rows)), columns)
+    by = "layout" if kind_of(rows) == "asks" else "layout and zone radius"
+    return _table(f"{RATE[kind_of(rows)]} by {by}", compared(once_per_category(rows)), columns)
 
 
 def retention_table(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> HtmlTable | None:
@@ -333,7 +335,8 @@ def _table(title: str, lines: Sequence[Line], columns: Sequence[_Column]) -> Htm
 def _heading(column: _Column, rows: Sequence[RetentionRow]) -> HtmlColumn:
     meaning = column.meaning or ""
     numeric = column.text is difference_test or any(column.text(row)[:1].isdigit() for row in rows)
-    return HtmlColumn(_unbroken(column.name), GLOSSARY.get(meaning, meaning), numeric)
+    kind = kind_of(rows)
+    return HtmlColumn(_unbroken(heading(column.name, kind)), glossary_of(kind).get(meaning, meaning), numeric)
 
 
 def _unbroken(name: str) -> str:

@@ -33,6 +33,7 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import PlainTable, is_asked
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import HEAT
+from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
@@ -96,9 +97,10 @@ def _retention_table(
     rows: Sequence[RetentionRow], differences: Sequence[Difference], unpaired: Sequence[str]
 ) -> str:
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
-    asked = any(is_asked(row) for row in rows)
-    what = "SR / accuracy and retention" if asked else "Success rate and retention"
-    caption = title(f"{what} ({rule_name(rows)})", rows)
+    kind = kind_of(rows)
+    acted = [row for row in rows if not is_asked(row)]
+    judged = f" ({rule_name(acted)})" if acted else ""
+    caption = title(f"{RATE[kind]} and retention{judged}", rows)
     said = [sentence for sentence in (difference_legend(differences), *unpaired) if sentence]
     columns = _columns(rows, differences)
     return "\n".join(
@@ -109,8 +111,7 @@ def _retention_table(
             rf"\caption{{{escape('. '.join([caption, *said]))}}}",
             rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in columns)}}}",
             r"\toprule",
-            " & ".join("SR / acc." if asked and heading == "SR" else heading for heading, _, _ in columns)
-            + r" \\",
+            " & ".join(_RATE[kind] if name == "SR" else name for name, _, _ in columns) + r" \\",
             r"\midrule",
             *_body(rows, differences, columns),
             r"\bottomrule",
@@ -139,6 +140,9 @@ def _body(
 def escape(text: str) -> str:
     """`text` with LaTeX's special characters made harmless."""
     return "".join(_SPECIAL.get(character, character) for character in text)
+
+
+_RATE: dict[Kind, str] = {"acts": "SR", "asks": "Accuracy", "both": "SR / acc."}
 
 
 def _heading(text: str) -> str:

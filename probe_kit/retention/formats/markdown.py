@@ -42,8 +42,9 @@ from probe_kit.retention.columns.text import (
     title,
     view_name,
 )
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.text_table import PlainTable
 from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.kinds import RATE, heading, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 
 
@@ -100,12 +101,12 @@ def markdown(
 
     Differences stand below the runs of their category; unpaired: why others have none.
     """
-    asked, behaviour = any(is_asked(row) for row in rows), once_per_category(rows)
+    kind, behaviour = kind_of(rows), once_per_category(rows)
     more = [DIFFERENCE_TEST] if any(row.p is not None for row in differences) else []
     more += FOLLOWED_COLUMNS if followed(rows) else []
     shown = [*SUCCESS_COLUMNS[:3], *more, *SUCCESS_COLUMNS[3:]]
-    columns = [(_of_both(name) if asked else name, cell) for name, cell in shown]
-    what = "SR / accuracy" if asked else f"Success rate by {rule_name(rows)}"
+    columns = [(heading(name, kind), cell) for name, cell in shown if kind != "asks" or name not in _ACTING_ONLY]
+    what = RATE[kind] if kind != "acts" else f"{RATE[kind]} by {rule_name(rows)}"
     parts = [_lines_table(title(what, behaviour), behaviour_lines(behaviour, differences), columns)]
     captions = [f"{sentence}." for sentence in [difference_legend(differences)] if sentence]
     parts += [f"> {sentence}\n" for sentence in (*captions, *unpaired)]
@@ -124,9 +125,8 @@ def markdown(
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 
-def _of_both(heading: str) -> str:
-    """A heading over policies that acted and readers that were asked."""
-    return {"SR % [95 %]": "SR / accuracy % [95 %]", "outside %": "outside / unread %"}.get(heading, heading)
+_ACTING_ONLY = ("never moved %", "flagged steps %")
+"""Headings of what a model that is asked cannot do."""
 
 
 def _regime(row: RetentionRow) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
+from probe_kit.places import without_places
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.html import (
@@ -23,10 +24,15 @@ def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) 
     return _heading(rows) + "".join(_table(one) for one in found if one is not None)
 
 
+def _safe(text: str) -> str:
+    """For HTML, and without the places of this machine: notebooks are sent to others."""
+    return escape(without_places(text))
+
+
 def _heading(rows: Sequence[RetentionRow]) -> str:
     """Whose numbers these are, since a table of one model does not repeat its name."""
     suites = ", ".join(dict.fromkeys(row.suite for row in rows))
-    return f"<div>{escape(_models(rows))} on {escape(suites)}</div>" if rows else ""
+    return f"<div>{_safe(_models(rows))} on {_safe(suites)}</div>" if rows else ""
 
 
 def _models(rows: Sequence[RetentionRow]) -> str:
@@ -62,8 +68,8 @@ def _cell(cell: HtmlCell, numeric: bool, bold: bool) -> str:
     style += ";font-weight:bold" if bold or cell.strong else ""
     style += ";color:#b00020" if cell.alarm else ""
     style += ";font-style:italic" if cell.difference else ""
-    below = f"<br><small>{escape(cell.below)}</small>" if cell.below else ""
-    return f'<td style="{style}" title="{escape(cell.note)}">{escape(cell.text)}{below}</td>'
+    below = f"<br><small>{_safe(cell.below)}</small>" if cell.below else ""
+    return f'<td style="{style}" title="{_safe(cell.note)}">{_safe(cell.text)}{below}</td>'
 
 
 def _style(numeric: bool) -> str:

@@ -83,6 +83,7 @@ def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
             "answer": row.get("target_concept") or "",
             "other": row.get("distractor_concept") or "",
             "unmoved": bool(row.get("never_moved", False)),
+            "asked": "parse" in row,
         }
         yield _Listed(card, rank, picture)
 

@@ -51,8 +51,11 @@
   // -- episodes: a page of cards at a time, made when they are wanted --------------------------------------------
   const PAGE = 48;
   const OUTCOMES = { correct: "✓ correct", wrong: "✗ wrong picture", oob: "○ on neither" };
+  const ANSWERS = { correct: "✓ right answer", wrong: "✗ wrong answer", oob: "○ no answer read" };
+  const EITHER = { correct: "✓ correct", wrong: "✗ wrong", oob: "○ neither" };
   const source = document.getElementById("cards");
   const cards = JSON.parse(source.textContent);
+  const outcomes = cards.every((card) => card.asked) ? ANSWERS : cards.some((card) => card.asked) ? EITHER : OUTCOMES;
   const block = Number(source.dataset.block);
   const blocks = document.querySelectorAll("script.pictures");
   const parsed = new Map();
@@ -82,7 +85,7 @@
         element("img", { alt, src: `data:image/webp;base64,${picture(card.picture)}`, loading: "lazy", decoding: "async" }),
         element("i", { textContent: "first" }), element("i", { textContent: "last" }));
     }
-    const outcome = OUTCOMES[card.outcome] + (card.unmoved ? ", cube never moved" : "");
+    const outcome = (card.asked ? ANSWERS : OUTCOMES)[card.outcome] + (card.unmoved ? ", cube never moved" : "");
     const answer = card.answer ? `answer: ${card.answer}, ${card.side}` : `answer: ${card.side}`;
     const where = [card.category.replaceAll("_", " "), card.layout].join(" · ");
     const text = element("div", { className: "text" },
@@ -115,7 +118,7 @@
 
   for (const select of form.querySelectorAll("select")) {
     for (const value of new Set(cards.map((card) => card[select.name]))) {
-      const label = select.name === "outcome" ? OUTCOMES[value] : value.replaceAll("_", " ");
+      const label = select.name === "outcome" ? outcomes[value] : value.replaceAll("_", " ");
       select.append(element("option", { value, textContent: label }));
     }
   }

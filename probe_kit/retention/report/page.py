@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
+from probe_kit.places import without_places
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
-from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.known_used_table import join_tables
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.report_figures import Exhibit, gallery
@@ -21,6 +22,7 @@ from probe_kit.retention.formats.html import (
     retention_table,
 )
 from probe_kit.retention.joins import joins_of
+from probe_kit.retention.kinds import Kind, heading, kind_of
 from probe_kit.retention.report.category_summary import stories
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.pictures import data_uri
@@ -82,7 +84,12 @@ def report_html(
     joins = joins_of(runs, table)
     sentence, bibtex = citation(runs)
     rows = table.all_rows
+    kind = kind_of(rows)
+    places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
     return _render(
+        places,
+        kind=kind,
+        answered=_ANSWERED[kind],
         title=listed(names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
@@ -103,26 +110,39 @@ def report_html(
             subject: _pictures(exhibits, subject, names)
             for subject in ("behaviour", "probes", "retention", "join")
         },
-        grid=episode_grid(as_judged, names, pictures),
+        grid=episode_grid(as_judged, [without_places(name, places) for name in names], pictures),
         several=len(runs) > 1,
         provenance=[
             provenance(name, run, table.results.get(str(run.location)))
             for name, run in zip(names, runs, strict=True)
         ],
-        glossary=GLOSSARY,
+        glossary={heading(word, kind): said for word, said in glossary_of(kind).items()},
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
     )
 
 
-def _render(**content: Any) -> str:
+_ANSWERED: dict[Kind, str] = {
+    "acts": "the answer is where the cube ends",
+    "asks": "the answer is what the model says",
+    "both": "a policy answers by where the cube ends, a model that was asked by what it says",
+}
+
+
+def _render(places: tuple[str, ...], **content: Any) -> str:
+    """The page; no text in it holds `places` or another absolute path of this machine."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    def shown(value: Any) -> Any:
+        if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
+            return value
+        return without_places(value, places)
+
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
+        lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
     assets = {name: Markup((_HERE / f"page.{name}").read_text()) for name in ("css", "js")}
     return environment.get_template("page.html.jinja").render(**assets, **content)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from probe_kit.extract.store.locations.summary import NOT_PROTECTED
+from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
@@ -79,9 +80,12 @@ def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
     """A sentence for a methods section, and BibTeX."""
     lines = "; ".join(Certificate.of_run(run).line.replace(" · ", ", ") for run in runs)
+    shares = (
+        "Accuracies of answers about" if all(ask_of(run) is not None for run in runs) else "Success rates from"
+    )
     sentence = (
-        f"Evaluated with probe_kit {__version__} under the Act2Answer protocol ({PAPER}): {lines}. Success rates "
-        "from a PyBullet scene are comparable with each other, not with those of other simulators."
+        f"Evaluated with probe_kit {__version__} under the Act2Answer protocol ({PAPER}): {lines}. {shares} "
+        "a PyBullet scene are comparable with each other, not with those of other simulators."
     )
     bibtex = (
         "@software{probe_kit,\n"

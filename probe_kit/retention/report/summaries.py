@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, percent
+from probe_kit.retention.columns.text_table import is_asked
+from probe_kit.retention.kinds import RATE, kind_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -51,7 +53,7 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
-    rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
+    rate = Headline(f"{percent(mean.sr)} %", RATE[kind_of([mean])].lower(), "guessing: 50 %")
     found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
     if mean.prefix_accuracy is not None:
         found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
@@ -86,7 +88,7 @@ def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     if mean.gap is not None and any(row.prefix_signal for row in rows):
         found.append(
             f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
-            f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
+            f"{'more' if mean.gap >= 0 else 'less'} often than {_what_is_judged(mean)}."
         )
     return found
 
@@ -96,9 +98,14 @@ def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
         return "The model was listened to at the first picture of every episode and did not act: no success rate."
     knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
     fails = [row for row in rows if row.regime == Regime.FAILURE]
-    text = f"The cube ended on the correct picture in {percent(mean.sr)} % of episodes, averaged over categories. "
+    right = "It answers right in" if is_asked(mean) else "The cube ended on the correct picture in"
+    text = f"{right} {percent(mean.sr)} % of episodes, averaged over categories. "
     text += f"In {_of(knows, rows)} that is more than guessing explains"
     return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
+
+
+def _what_is_judged(mean: RetentionRow) -> str:
+    return "its answers" if is_asked(mean) else "the policy"
 
 
 def _knowledge(rows: Sequence[RetentionRow]) -> str:
@@ -138,6 +145,29 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = []
     if mean.random_weights:
         found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
+    found += _unread(mean) if is_asked(mean) else _unmoved(mean)
+    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
+    if biased:
+        habit = "The answers have a habit of naming" if is_asked(mean) else "The policy has a habit of going to"
+        found.append(f"{habit} one side in {_of(biased, rows)}.")
+    if mean.leaks:
+        found.append(
+            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
+            "believing a probe."
+        )
+    return found
+
+
+def _unread(mean: RetentionRow) -> list[str]:
+    """What would be misread of a model that was asked."""
+    if (mean.p_oob or 0) <= _MOSTLY:
+        return []
+    return [f"No answer could be read in {percent(mean.p_oob)} % of episodes: it may know more than it says."]
+
+
+def _unmoved(mean: RetentionRow) -> list[str]:
+    """What would be misread of a policy."""
+    found = []
     if (mean.p_never_moved or 0) > _MOSTLY:
         found.append(
             f"The cube never moved in {percent(mean.p_never_moved)} % of episodes: the policy does not grasp, so "
@@ -149,14 +179,6 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
         found.append(
             f"In {percent(mean.p_flagged)} % of its steps the policy put out something that is no action."
         )
-    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
-    if biased:
-        found.append(f"The policy has a habit of going to one side in {_of(biased, rows)}.")
-    if mean.leaks:
-        found.append(
-            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
-            "believing a probe."
-        )
     return found
 
 
@@ -166,7 +188,7 @@ def read_row(row: RetentionRow) -> list[str]:
         found = [
             f"Listened to in {row.n_episodes} episodes; it did not act."
             if row.listened
-            else f"Success rate {row.regime_reason}."
+            else f"{RATE[kind_of([row])]} {row.regime_reason}."
         ]
     else:
         right = round(row.sr * row.n_episodes)

@@ -136,7 +136,7 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
 
 def _why_none(run: RunReader, target: Target, stored: int) -> str:
     if not run.streams:
-        return f"{run.location} has no activations to probe: the policy {run.model!r} has no streams."
+        return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
     others = f" (of {stored} stored, none: other episodes, another target or another version)" if stored else ""
     return (
         f"{run.location} has no probes for target {target!r} on its episodes{others}. "

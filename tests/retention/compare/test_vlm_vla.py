@@ -126,7 +126,12 @@ def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
 def test_a_policy_is_compared_with_the_reader_it_grew_from(tmp_path: Path) -> None:
     qwen = asked(tmp_path / "a", by_chance(1, 0.9), "qwen3-vl")
     gemma = asked(tmp_path / "b", by_chance(3, 0.8), "paligemma")
-    pi0 = acted(tmp_path / "c", by_chance(2, 0.5), "pi0", source="paligemma")
+    weights = {"family": "paligemma", "checkpoint": "google/paligemma-3b-pt-224"}
+    gemma = replace(gemma, certificate={"policy": weights})
+    qwen = replace(qwen, certificate={"policy": {"family": "qwen3-vl", "checkpoint": "Qwen/Qwen3-VL-8B-Instruct"}})
+    pi0 = acted(tmp_path / "c", by_chance(2, 0.5), "pi0")
+    grown = {"source": "paligemma", "source_weights": {"checkpoint": "google/paligemma-3b-pt-224"}}
+    pi0 = replace(pi0, certificate={"policy": grown})
     tiny = acted(tmp_path / "d", by_chance(4, 0.5), "pi0-tiny")
     pairs = {(gap.asked, gap.acted) for gap in vlm_gaps([qwen, gemma, pi0, tiny])}
     assert pairs == {("paligemma", "pi0"), ("qwen3-vl", "pi0-tiny"), ("paligemma", "pi0-tiny")}

@@ -69,7 +69,7 @@ def run_text(run: Summarised) -> str:
 
 
 def run_html(run: Summarised) -> str:
-    """What it is a run of, how it went, and where it lies."""
+    """What it is a run of, how it went, and what its folder is called."""
     weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
     facts = {
         "suite": run.suite,
@@ -77,7 +77,7 @@ def run_html(run: Summarised) -> str:
         "episodes": _episodes(run),
         "outcomes": ", ".join(f"{name} {count}" for name, count in _outcomes(run).items()),
         "streams": streams_text(run.streams.values()),
-        "at": str(run.location),
+        "at": run.location.name if Path(str(run.location)).is_absolute() else str(run.location),
         **({} if run.protected else {"integrity": NOT_PROTECTED}),
     }
     return facts_html(f"Run of {run.label}", facts, "run.episodes is the table, run.column(site) one site of it")

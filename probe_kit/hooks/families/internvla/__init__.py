@@ -1,5 +1,6 @@
 """InternVLA-M1, native."""
 
+from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
@@ -32,6 +33,7 @@ FAMILIES = (
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
         verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
         source="qwen2.5-vl",
+        source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
         full_size="probe_kit.models.internvla:full_size_internvla",
         hub=(
             ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),

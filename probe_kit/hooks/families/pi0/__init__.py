@@ -1,5 +1,6 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
+from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.default_scene import RELEASED
 from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
@@ -10,6 +11,9 @@ from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
 _VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
+_VLM_TINY = SourceWeights(
+    sha256="77a4486bf2d356c1e11cfd2a7a0f835683dacf1a7864f714feef92cb19fa0650", parameters=658_944
+)
 
 FAMILIES = (
     Family(
@@ -22,6 +26,7 @@ FAMILIES = (
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="vlm-tiny",
+        source_weights=_VLM_TINY,
         interventions=FLOW,
         home=RELEASED,
     ),
@@ -35,6 +40,7 @@ FAMILIES = (
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="vlm-tiny",
+        source_weights=_VLM_TINY,
         interventions=FLOW,
         home=RELEASED,
     ),
@@ -48,6 +54,7 @@ FAMILIES = (
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="vlm-tiny",
+        source_weights=_VLM_TINY,
         interventions=FLOW,
         home=RELEASED,
     ),
@@ -66,6 +73,7 @@ FAMILIES = (
         verifier=_VERIFIER,
         config_types=("pi0",),
         source="paligemma",
+        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
         full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         options=(
             Option(

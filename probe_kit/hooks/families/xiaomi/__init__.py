@@ -1,5 +1,6 @@
 """Xiaomi-Robotics-R0, native."""
 
+from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
@@ -28,6 +29,7 @@ FAMILIES = (
         notes="Apache-2.0; 9.4 GB in bfloat16",
         verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
         source="qwen3-vl",
+        source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
         full_size="probe_kit.models.xiaomi:full_size_xiaomi",
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),

@@ -1,0 +1,34 @@
+"""Whether a policy's network grew from the weights that a reader was asked with."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from probe_kit.train.data.run_reader import RunReader
+
+Relation = Literal["yes", "no", "unknown"]
+
+
+def grew_from(policy: RunReader, reader: RunReader) -> Relation:
+    """Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little.
+
+    A family's name says which network it is and not which weights: another name is another source, the same name
+    is no evidence.
+    """
+    grown, asked = _card(policy), _card(reader)
+    if grown.get("random_weights") or asked.get("random_weights"):
+        return "no"
+    source = grown.get("source_weights") or {}
+    if source.get("sha256"):
+        return "yes" if source["sha256"] == asked.get("weights_sha256") else "no"
+    if source.get("checkpoint") and source["checkpoint"] == asked.get("checkpoint"):
+        return "yes"
+    sizes = source.get("parameters"), asked.get("parameters")
+    told_apart_by = sizes if None not in sizes else (grown.get("source"), asked.get("family"))
+    return "no" if None not in told_apart_by and len(set(told_apart_by)) == 2 else "unknown"
+
+
+def _card(run: RunReader) -> Mapping[str, Any]:
+    """What was really loaded; empty where a run has no certificate."""
+    certificate: Mapping[str, Any] = getattr(run, "certificate", {})
+    card: Mapping[str, Any] = certificate.get("policy") or {}
+    return card
