@@ -253,9 +253,9 @@ def _enlarge(folder: Path, larger: Mapping[str, Values]) -> None:
     for name, changes in larger.items():
         path = folder / name
         as_json = path.suffix == ".json"
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         values = _merged(json.loads(text) if as_json else yaml.safe_load(text), changes)
-        path.write_text(json.dumps(values) if as_json else yaml.safe_dump(values))
+        path.write_text(json.dumps(values) if as_json else yaml.safe_dump(values), encoding="utf-8")
     for path in (*folder.rglob("*.safetensors"), *folder.rglob("*.index.json")):
         if not path.name.startswith("policy_"):  # statistics of lerobot's processors
             path.unlink()

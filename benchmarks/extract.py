@@ -157,7 +157,7 @@ def write_mid_sized(folder: Path) -> None:
     policy = build_pi0(pi0_tiny.new_pi0_tiny(0).config, size)
     initialise(policy, 0)
     pi0_tiny.write_checkpoint(folder, policy, pi0_tiny.GUESSED, "random, for a benchmark")
-    (folder / "dims.json").write_text(json.dumps(size.to_json()))
+    (folder / "dims.json").write_text(json.dumps(size.to_json()), encoding="utf-8")
 
 
 def bench_loop(suite: Suite, folder: Path, items: int, repeats: int) -> None:

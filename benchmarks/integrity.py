@@ -191,11 +191,11 @@ def _numbered(planned: PlannedEpisode, number: int) -> PlannedEpisode:
 
 def as_former_version(run: Path) -> None:
     """The same run with the checksums of schema 2."""
-    card = json.loads((run / RUN_FILE).read_text())
+    card = json.loads((run / RUN_FILE).read_text(encoding="utf-8"))
     del card[HASH], card["objects"]
     (run / RUN_FILE).write_bytes(as_json({**card, "schema_version": 2}))
     for path in sorted((run / "commits").iterdir()):
-        commit = json.loads(path.read_text())
+        commit = json.loads(path.read_text(encoding="utf-8"))
         for part in (HASH, "run", "episode"):
             del commit[part]
         commit["objects"] = {key: [known[0], "00000000"] for key, known in commit["objects"].items()}

@@ -20,7 +20,7 @@ from probe_kit.suite import build_suite
 
 def resident_megabytes() -> float:
     """Of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * 4096 / 1e6
 
 
 def main() -> None:

@@ -102,7 +102,7 @@ def opened(page: Path) -> tuple[float, int, int, float]:
         noted.write_text(text.replace("</title>", f"</title>{_NOTE}", 1), encoding="utf-8")
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         arguments = [BROWSER, *_FLAGS, f"--user-data-dir={profile}", "--dump-dom", noted.as_uri()]
-        shown = subprocess.run(arguments, capture_output=True, text=True, check=True, timeout=300).stdout
+        shown = subprocess.run(arguments, capture_output=True, encoding="utf-8", check=True, timeout=300).stdout
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = re.search(r"<title>times (\[.*?\])</title>", shown)
     if found is None:
@@ -118,7 +118,7 @@ def bench_opening(folder: Path, repeats: int = 5) -> None:
         print(f"not opened: no {BROWSER} on this machine")
         return
     empty = folder / "empty.html"
-    empty.write_text("<!doctype html><title>empty</title><div id=grid></div>")
+    empty.write_text("<!doctype html><title>empty</title><div id=grid></div>", encoding="utf-8")
     pages = {"empty page": empty, "report": folder / REPORT}
     turns: dict[str, list[tuple[float, int, int, float]]] = {name: [] for name in pages}
     for _ in range(repeats):

@@ -1,5 +1,5 @@
 """`python -m probe_kit` is `probe-kit`."""
 
-from probe_kit.cli import main
+from probe_kit.start import main
 
 main()

@@ -4,7 +4,6 @@ Every package keeps its own commands, which parse, call the library and print; t
 stderr.
 """
 
-import signal
 import sys
 import warnings
 from io import TextIOWrapper
@@ -24,6 +23,7 @@ from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
+from probe_kit.interruption import begun
 from probe_kit.intervene.commands import intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
@@ -64,6 +64,7 @@ class Commands(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
+            begun()
             return self._run(ctx)
         except _FOR_TYPER:
             raise
@@ -157,8 +158,7 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def main() -> None:
-    """Entry point; a SIGTERM counts as Ctrl-C."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    """Run the command of this process's arguments."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # signs that the terminal's encoding lacks are no reason to fail
             stream.reconfigure(errors="backslashreplace")

@@ -91,7 +91,7 @@ def _available_memory() -> float | None:
     """Bytes, as Linux counts them; elsewhere all of the machine's, or None."""
     meminfo = Path("/proc/meminfo")
     if meminfo.is_file():
-        found = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text())
+        found = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text(encoding="utf-8"))
         if found:
             return float(found[1]) * 1024
     if "SC_PHYS_PAGES" in os.sysconf_names:
@@ -206,8 +206,9 @@ def _try(function: str) -> tuple[dict[str, Any] | None, str]:
     code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False
-        )
+            [sys.executable, "-c", code], capture_output=True, encoding="utf-8", errors="replace",
+            timeout=PATIENCE, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return None, f"no answer within {PATIENCE} s"
     if done.returncode != 0:

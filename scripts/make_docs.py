@@ -34,8 +34,11 @@ def main() -> None:
     with progress() as bar:
         measure(asked.folder, asked.trained_only, lambda stage: counter(bar, stage))
     for page in (README, *PAGES):
-        page.write_text(filled(page.read_text(), json.loads(DATA.read_text())))
-    draw_picture(asked.folder, json.loads(DATA.read_text())["probes"])
+        page.write_text(
+            filled(page.read_text(encoding="utf-8"), json.loads(DATA.read_text(encoding="utf-8"))),
+            encoding="utf-8",
+        )
+    draw_picture(asked.folder, json.loads(DATA.read_text(encoding="utf-8"))["probes"])
     for made, shown in SHOWN.items():
         shutil.copyfile(asked.folder / made, ROOT / "docs" / shown)
     sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]
@@ -47,7 +50,7 @@ def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
     made = run_demo(folder, stage)
     rows = [row for row in made.table.rows if row.category != MEAN and row.kind == "acts"]
     if trained_only:
-        stored = json.loads(DATA.read_text())["organisms"]
+        stored = json.loads(DATA.read_text(encoding="utf-8"))["organisms"]
         others = [one for one in stored if one["organism"] != TRAINED.name]
         findings = [_finding(_of_trained(row)) for row in rows] + others
     else:
@@ -62,7 +65,7 @@ def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
         "episodes": rows[0].n_episodes,
         "organisms": findings,
     }
-    DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _of_trained(row: RetentionRow) -> Finding:

@@ -26,7 +26,7 @@ KEYS = set(
 
 def probe_kit(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "probe_kit", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=300)
+    return subprocess.run(command, capture_output=True, encoding="utf-8", cwd=cwd, check=False, timeout=300)
 
 
 def in_process(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -52,7 +52,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     assert printed.returncode == 0, printed.stderr
     rows = json.loads(printed.stdout)
     assert {row["category"] for row in rows} == {"color", "mean"}
-    assert "data:image/svg+xml" in (tmp_path / "report.html").read_text()
+    assert "data:image/svg+xml" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert {"run-layer-curves.png", "run-final-positions.pdf"} <= {
         p.name for p in (tmp_path / "figures").iterdir()
     }
@@ -128,7 +128,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     # A shell's background ignores it, and a child would inherit that.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
     finally:
         signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 60
@@ -153,7 +153,7 @@ def test_help_is_there() -> None:
 def test_importing_the_command_line_loads_nothing_heavy() -> None:
     heavy = ("torch", "lerobot", "transformers", "pybullet", "sklearn", "pandas", "xarray", "zarr", "matplotlib")
     code = f"import sys, probe_kit.cli; print([m for m in {heavy} if m in sys.modules])"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
     assert loaded.stdout.strip() == "[]"
 
 

@@ -20,7 +20,7 @@ Usage = namedtuple("Usage", "total used free")
 @pytest.mark.slow
 def test_the_command_agrees_with_what_it_found() -> None:
     answer = subprocess.run(
-        [sys.executable, "-m", "probe_kit", "doctor", "--json"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "probe_kit", "doctor", "--json"], capture_output=True, encoding="utf-8", check=False
     )
     findings = {row["subject"]: row for row in json.loads(answer.stdout)}
     subjects = "python processor memory disk simulator renderer policy gpu hub tokenizer"
@@ -126,5 +126,9 @@ def test_an_extra_lacks_what_is_not_installed() -> None:
 def test_available_memory_is_that_of_the_system() -> None:
     available = doctor._available_memory()
     assert available is not None
-    total = next(line for line in Path("/proc/meminfo").read_text().splitlines() if line.startswith("MemTotal"))
+    total = next(
+        line
+        for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+        if line.startswith("MemTotal")
+    )
     assert 0 < available <= 1024 * int(total.split()[1])

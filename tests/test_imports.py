@@ -11,7 +11,7 @@ from tests.support.import_graph import children, circles, import_graph, levels, 
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
-TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command"}
+TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command", "start"}
 BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system"}
 FOLDERS = {
     **dict.fromkeys(BASE, BASE),
@@ -79,7 +79,7 @@ def test_what_reads_runs_knows_neither_models_nor_simulators(room: str) -> None:
 
 def test_what_no_test_machine_installs_is_imported_by_require_alone() -> None:
     """An `import` of it is an error of types in a fresh clone, and none where a developer happens to have it."""
-    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))
     installed = names(project["project"]["dependencies"]) | names(project["dependency-groups"]["dev"])
     extras = project["project"]["optional-dependencies"].values()
     absent = {name for extra in extras for name in names(extra)} - installed
@@ -112,4 +112,4 @@ def test_an_import_upwards_is_found(tmp_path: Path) -> None:
 def write(folder: Path, name: str, text: str) -> None:
     (folder / "house").mkdir(exist_ok=True)
     (folder / "house" / "__init__.py").touch()
-    (folder / "house" / f"{name}.py").write_text(text)
+    (folder / "house" / f"{name}.py").write_text(text, encoding="utf-8")

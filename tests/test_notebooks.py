@@ -159,7 +159,11 @@ def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
 @pytest.mark.parametrize("name", NAMES)
 def test_every_cell_that_ends_in_a_figure_shows_a_picture(name: str) -> None:
     """In the committed outputs, which are of the same kinds as fresh ones."""
-    cells = [c for c in json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"] if c["cell_type"] == "code"]
+    cells = [
+        c
+        for c in json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+        if c["cell_type"] == "code"
+    ]
     drawing = [cell for cell in cells if PICTURE.search("".join(cell["source"]).rstrip().splitlines()[-1])]
     assert drawing
     for cell in drawing:
@@ -169,7 +173,7 @@ def test_every_cell_that_ends_in_a_figure_shows_a_picture(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_committed_outputs_hold_no_path_of_a_machine_and_no_error(name: str) -> None:
-    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"]:
+    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]:
         for output in cell.get("outputs", []):
             assert output["output_type"] != "error"
             texts = {kind: content for kind, content in output.get("data", {}).items() if kind != "image/png"}

@@ -31,7 +31,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def executable(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     path.chmod(0o755)
     return path
 
@@ -47,7 +47,7 @@ def bare_machine(folder: Path) -> Path:
 
 def with_uv(checkout: Path, programs: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [checkout / "with-uv", *arguments], env={"PATH": str(programs)}, cwd=checkout.parent, text=True,
+        [checkout / "with-uv", *arguments], env={"PATH": str(programs)}, cwd=checkout.parent, encoding="utf-8",
         capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=300,
     )  # fmt: skip
 
@@ -112,21 +112,25 @@ def test_a_python_without_headers_is_passed_over_for_one_of_uvs_own(checkout: Pa
 
 
 def test_the_readmes_two_commands_and_the_script_of_ci_are_the_same() -> None:
-    (block,) = re.findall(r"## Two commands\n+```\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (block,) = re.findall(
+        r"## Two commands\n+```\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     lines = [line.partition("#")[0].strip() for line in block.splitlines() if line.strip()]
     clone, demo, tests = lines
     assert clone.startswith("git clone https://")
     assert demo == "./with-uv probe-kit demo"
-    assert tests == (ROOT / ".ci" / "run").read_text().splitlines()[-1]
+    assert tests == (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()[-1]
 
 
 @pytest.mark.slow
 def test_pip_really_fetches_a_uv_that_runs(checkout: Path, programs: Path) -> None:
     executable(programs / "python3", f'#!/bin/sh\nexec "{sys._base_executable}" "$@"\n')  # type: ignore[attr-defined]
     script = checkout / "with-uv"
-    plain = script.read_text().replace('exec "$uv" run --project "$here" "$@"', 'exec "$uv" --version')
-    script.write_text(plain)
+    plain = script.read_text(encoding="utf-8").replace(
+        'exec "$uv" run --project "$here" "$@"', 'exec "$uv" --version'
+    )
+    script.write_text(plain, encoding="utf-8")
     environment = {**{k: v for k, v in os.environ.items() if k.startswith("PIP_")}, "PATH": str(programs)}
-    done = subprocess.run([script, "pytest"], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run([script, "pytest"], env=environment, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("uv ")

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,28 @@ _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def parse_json(content: bytes | str) -> Any:
-    """The value. Raises ValueError for what is no UTF-8 or no JSON, nests too deeply, or has half characters."""
+    """The value.
+
+    Raises ValueError for what is no UTF-8 or no JSON, nests too deeply, has half characters, or names a key twice.
+    """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=_object)
         (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
     except RecursionError:
         raise ValueError("it nests too deeply") from None
     except UnicodeEncodeError:
         raise ValueError("it holds half a surrogate pair, which is no character") from None
     return value
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Of a key that is named twice, parsers keep the one or the other."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"it names the key {twice!r} twice")
+    return found
 
 
 def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:

@@ -53,7 +53,7 @@ def _of_system() -> list[str]:
     models = [
         found[1].strip()
         for card in sorted(_NVIDIA.glob("*/information"))
-        if (found := re.search(r"^Model:(.*)$", card.read_text(errors="replace"), re.MULTILINE))
+        if (found := re.search(r"^Model:(.*)$", card.read_text(errors="replace", encoding="utf-8"), re.MULTILINE))
     ]
     return [f"{len(models)} GPU{'s' * (len(models) > 1)} ({', '.join(dict.fromkeys(models))})"] if models else []
 

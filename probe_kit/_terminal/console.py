@@ -7,6 +7,7 @@ that turn the direction of text around) becomes a visible sign, and square brack
 
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from rich.text import Text
 from probe_kit._terminal.plain_text import UNSAFE, visible
 from probe_kit._terminal.progress_log import Heartbeat
 
+_NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 PAGE = 120
 """Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""
 
@@ -93,8 +95,21 @@ def print_json(value: Any) -> None:
 
 
 def print_json_text(text: str) -> None:
-    """Print JSON on stdout; what a terminal would obey is written as JSON's own escapes, so nothing is lost."""
-    typer.echo(UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+    """Print JSON on stdout.
+
+    What a terminal would obey, or stdout's encoding lacks, is written as JSON's own escapes, so nothing is lost.
+    """
+    safe = UNSAFE.sub(_escaped, text)
+    try:
+        safe.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        safe = _NOT_ASCII.sub(_escaped, safe)
+    typer.echo(safe)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    """A sign as JSON writes it in ASCII: one escape, or the two of a surrogate pair."""
+    return json.dumps(found[0])[1:-1] if ord(found[0]) != 0x7F else "\\u007f"
 
 
 def print_text(text: str) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from probe_kit._terminal.console import complain, marked, say
 from probe_kit.errors import DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
+from probe_kit.interruption import INTERRUPTED
 
-INTERRUPTED = 130
 UNFORESEEN = 1
 
 _FULL = {errno.ENOSPC: "is full", errno.EDQUOT: "has no quota left for you", errno.EROFS: "is read-only"}

@@ -25,14 +25,17 @@ class Heartbeat:
         self._started = clock()
         self._first: tuple[int, float] | None = None
         self._due = self._started + FIRST
+        self._ended: tuple[int, int] | None = None
 
     def __call__(self, done: int, total: int, *_: object) -> None:
         """`done` of `total` are finished; whatever else a caller tells is not used."""
         now = self._clock()
         if self._first is None:
             self._first = done, now
-        if now < self._due and done < total:
+        # Several events of one answer, as a worker of a Ray cluster gives them, all find the last one counted.
+        if (done, total) == self._ended or (now < self._due and done < total):
             return
+        self._ended = (done, total) if done >= total else None
         self._due = now + EVERY
         before, since = self._first
         rate = (done - before) / (now - since) if now > since else 0.0

@@ -72,7 +72,7 @@ def run_demo(folder: Path, stage: NamedProgress) -> Demo:
     run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
     table = retention([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
-    (folder / "table.md").write_text(table.to_markdown())
+    (folder / "table.md").write_text(table.to_markdown(), encoding="utf-8")
     write_report([asked, run], folder / "report.html", table)
     film = next((run.path / VIDEOS).glob("*.gif"))
     shutil.copyfile(film, folder / "episode.gif")

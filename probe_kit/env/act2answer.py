@@ -124,7 +124,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         """The observation now; draws the picture unless it was drawn since the last action."""
         picture, size = self.render(), self.scene_spec.picture_size
         if size is not None:
-            picture = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
+            picture = np.array(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
         arm = self.scene.arm
         agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}

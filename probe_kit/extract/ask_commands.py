@@ -95,6 +95,13 @@ def ask(
     ray: Annotated[
         str | None, typer.Option(help="Work on this Ray cluster; auto: find one.", rich_help_panel=MACHINE)
     ] = None,
+    inference_limit: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds after which a worker whose model hangs is ended; needs --workers.",
+            rich_help_panel=MACHINE,
+        ),
+    ] = None,
     frames: Annotated[
         str,
         typer.Option(help="ends: a thumbnail of every first frame. none: no pictures.", rich_help_panel=MACHINE),
@@ -142,6 +149,7 @@ def ask(
         "env_workers": env_workers,
         "workers": workers,
         "ray": ray,
+        "inference_limit": inference_limit,
         "allow_mixed": allow_mixed,
         "picture": picture,
         "asked": asked,

@@ -128,6 +128,10 @@ def extract(
     ray: Annotated[
         str | None, typer.Option(help="Work on this Ray cluster; auto: the one of this machine, or a new one.")
     ] = None,
+    inference_limit: Annotated[
+        float | None,
+        typer.Option(help="Seconds after which a worker whose model hangs is ended; needs --workers."),
+    ] = None,
     allow_mixed: Annotated[
         bool,
         typer.Option("--allow-mixed", help="Continue a run begun with other versions or on another device."),
@@ -187,6 +191,7 @@ def extract(
         env_workers=env_workers,
         workers=workers,
         ray=ray,
+        inference_limit=inference_limit,
         allow_mixed=allow_mixed,
     )
     with err.status("loading suite and model"):

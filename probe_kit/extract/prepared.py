@@ -189,4 +189,5 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         settings.edits,
         settings.vectors,
         settings.listen,
+        settings.inference_limit,
     )

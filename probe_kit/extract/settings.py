@@ -46,7 +46,18 @@ _MOST = {
 }
 LONGEST_LABEL = 200
 LARGEST = 1_000_000
-_MACHINE = {"allow_mixed", "device", "video", "frames", "batch", "calibrate", "env_workers", "workers", "ray"}
+_MACHINE = {
+    "allow_mixed",
+    "device",
+    "video",
+    "frames",
+    "batch",
+    "calibrate",
+    "env_workers",
+    "workers",
+    "ray",
+    "inference_limit",
+}
 
 
 _DEFAULT_SCENE = SceneSpec()
@@ -74,6 +85,8 @@ class RunSettings:
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
     ray: address of a Ray cluster, or `auto`; the workers then run there.
+    inference_limit: seconds that one call of the model may take in a worker, which is ended then; its episodes are
+    tried once more and given up by name. None for no limit.
     allow_mixed: continue a run whose episodes were made on another kind of device or with other versions; it is
     then marked as mixed wherever it is shown.
     """
@@ -99,6 +112,7 @@ class RunSettings:
     env_workers: int | None = None
     workers: int = 0
     ray: str | None = None
+    inference_limit: float | None = None
     allow_mixed: bool = False
 
     tokens_allowed: ClassVar[tuple[str, ...]] = TOKENS
@@ -111,6 +125,7 @@ class RunSettings:
         self._check_one_of("frames", FRAMES)
         for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
             self._check_at_least(name, bound)
+        self._check_limit()
         if self.label is not None and not (self.label.isprintable() and 0 < len(self.label) <= LONGEST_LABEL):
             raise UsageError(
                 f"label is {self.label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters"
@@ -124,6 +139,17 @@ class RunSettings:
         value, most = getattr(self, name), _MOST.get(name, LARGEST)
         if value is not None and not bound <= value <= most:
             raise UsageError(f"{name} is {value}; expected at least {bound} and at most {most}")
+
+    def _check_limit(self) -> None:
+        if self.inference_limit is None:
+            return
+        if not 0 < self.inference_limit <= LARGEST:
+            raise UsageError(f"inference_limit is {self.inference_limit}; expected seconds, up to {LARGEST:,}")
+        if not (self.workers or self.ray):
+            raise UsageError(
+                f"--inference-limit {self.inference_limit:g} needs a process that can be ended: add --workers 1, "
+                "or leave it out and end a model that hangs with Ctrl-C"
+            )
 
     def choices(self) -> dict[str, Any]:
         """The settings that change the stored numbers by themselves: neither paths nor the machine."""

@@ -339,7 +339,7 @@ class ModelContract:
         copied = Path(shutil.copytree(checkpoint, tmp_path / "copy"))
         before = self.load(copied).card
         configuration = copied / self.configuration
-        configuration.write_text(configuration.read_text() + " ")
+        configuration.write_text(configuration.read_text(encoding="utf-8") + " ", encoding="utf-8")
         after = self.load(copied).card
         assert before.weights_sha256 == after.weights_sha256
         assert before.settings != after.settings

@@ -22,7 +22,7 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
             "Copy it from the model's page"
         )
     try:
-        values = json.loads(file.read_text())
+        values = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
     if not isinstance(values, dict) or (missing := [name for name in needed if values.get(name) is None]):

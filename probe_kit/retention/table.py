@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from probe_kit.csv_text import csv_of_frame
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
@@ -109,8 +110,11 @@ class RetentionTable:
         return table_json(self.all_rows, self.differences, {"wordings": self.wordings, "gaps": self.gaps})
 
     def to_csv(self) -> str:
-        """All rows as comma-separated values with a header; differences have `differences_frame`."""
-        return self.to_frame().to_csv(index=False)
+        """All rows as comma-separated values with a header; differences have `differences_frame`.
+
+        A text that a spreadsheet would compute has a `'` in front.
+        """
+        return csv_of_frame(self.to_frame())
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables."""

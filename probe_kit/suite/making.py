@@ -3,7 +3,8 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NotRequired, TypedDict, Unpack
+from typing import Any, NotRequired, TypedDict, Unpack, cast
+from unicodedata import normalize
 
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import CATEGORIES
@@ -63,6 +64,7 @@ def make_item(
     content: what makes it this item and no other; its hash is the id's end.
     """
     left, right = pictures
+    composed = {name: normalize("NFC", one) if isinstance(one, str) else one for name, one in question.items()}
     return Item(
         item_id=f"{suite}-{category}-{sha256_json(content)[:10]}",
         category=category,
@@ -78,5 +80,5 @@ def make_item(
         right_image_id=right.image_id,
         group_id="",
         split="eval",
-        **question,
+        **cast("Question", composed),
     )

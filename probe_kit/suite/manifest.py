@@ -8,7 +8,6 @@
 Nothing written depends on the clock or the machine's name: the same suite is the same bytes.
 """
 
-import csv
 import errno
 import json
 from collections import Counter
@@ -18,6 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from probe_kit._system.bounded_json import MOST_BYTES
+from probe_kit.csv_text import csv_of_rows
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
@@ -131,10 +131,8 @@ def _write_attribution(path: Path, items: Iterable[Item]) -> None:
             (item.right_file_name, item.right_image_id, item.license, item.attribution),
         )
     }
-    with path.open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(("file_name", "image_id", "license", "attribution"))
-        table.writerows(sorted(rows))
+    columns = ("file_name", "image_id", "license", "attribution")
+    _write_text(path, csv_of_rows(columns, (dict(zip(columns, row, strict=True)) for row in sorted(rows))))
 
 
 # -- reading -----------------------------------------------------------------------------------------

@@ -14,11 +14,11 @@ def timed(out: Path, part: str) -> Iterator[None]:
     file = out / "time.json"
     processor, wall = _processor_seconds(), time.monotonic()
     yield
-    spent = json.loads(file.read_text()) if file.is_file() else {}
+    spent = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     before = spent.get(part, {"processor": 0.0, "wall": 0.0})
     now = {"processor": (_processor_seconds() - processor) / 60, "wall": (time.monotonic() - wall) / 60}
     spent[part] = {name: round(before[name] + now[name], 2) for name in now}
-    file.write_text(json.dumps(spent, indent=1))
+    file.write_text(json.dumps(spent, indent=1), encoding="utf-8")
 
 
 def _processor_seconds() -> float:

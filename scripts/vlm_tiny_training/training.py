@@ -178,7 +178,7 @@ def follow[Setting](
 def _append(log: Path, step: int, means: Mapping[str, float]) -> None:
     """One row per step and loss: not every batch has every loss."""
     new = not log.is_file()
-    with log.open("a", newline="") as file:
+    with log.open("a", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         if new:
             writer.writerow(("step", "loss", "mean"))

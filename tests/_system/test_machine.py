@@ -33,7 +33,7 @@ def test_nothing_of_it_imports_torch() -> None:
         "import sys; from probe_kit._system.machine import check_device_name, what_is_here; "
         "check_device_name('cpu'); print(what_is_here(), 'torch' in sys.modules)"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True).stdout
     assert re.match(r"This machine has cpu \(\d+ cores?\).* False", shown)
 
 

@@ -69,7 +69,7 @@ def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: 
     assert "Traceback" not in said
     (file,) = tmp_path.iterdir()
     assert str(file) in said.replace(" ", "") or file.name in said.replace(" ", "")
-    assert re.search(r"Traceback.*in fail", file.read_text(), re.DOTALL)
+    assert re.search(r"Traceback.*in fail", file.read_text(encoding="utf-8"), re.DOTALL)
 
 
 def test_a_traceback_that_cannot_be_written_is_said_to_be_lost(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -26,6 +26,11 @@ def lines_of(steps: list[tuple[float, int]], total: int) -> list[str]:
     return said
 
 
+def test_the_last_line_is_said_once_however_many_events_bring_the_end() -> None:
+    """The eight episodes of one answer of a Ray worker are all counted before the first of them is told."""
+    assert len(lines_of([(1.0, 2), (2.0, 10), (2.0, 10), (2.1, 10), (100.0, 10)], 10)) == 1
+
+
 def test_long_work_says_a_line_now_and_then_and_one_at_the_end() -> None:
     said = lines_of([(second, second) for second in range(1, 601)], 600)
     assert len(said) == 1 + int((600 - FIRST) // EVERY) + 1

@@ -68,7 +68,7 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     def made(name: str, **files: str) -> Path:
         (folder / name).mkdir(parents=True)
         for file, content in files.items():
-            (folder / name / file.replace("__", ".")).write_text(content)
+            (folder / name / file.replace("__", ".")).write_text(content, encoding="utf-8")
         return folder / name
 
     made("empty")
@@ -77,7 +77,7 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     made("without-weights", config__json='{"type": "pi0"}')
     shards = {"weight_map": {"one": "a.safetensors", "two": "b.safetensors"}}
     place = made("with-a-shard-missing", config__json='{"type": "pi0"}', a__safetensors="")
-    (place / "model.safetensors.index.json").write_text(json.dumps(shards))
+    (place / "model.safetensors.index.json").write_text(json.dumps(shards), encoding="utf-8")
     made("reference", reference__npz="")
     made("reference/checkpoint", config__json='{"type": "smolvla"}')
     (folder / "file").touch()
@@ -93,7 +93,7 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
 def answers(folder: Path, small_suite: Suite) -> dict[str, tuple[int, str, list[str]]]:
     arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in case.split()] for case in CASES]
     done = subprocess.run(
-        [sys.executable, "-c", ONE_AFTER_THE_OTHER], input=json.dumps(arguments), cwd=folder, text=True,
+        [sys.executable, "-c", ONE_AFTER_THE_OTHER], input=json.dumps(arguments), cwd=folder, encoding="utf-8",
         capture_output=True, check=True, timeout=300,
     )  # fmt: skip
     return dict(zip(CASES, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))

@@ -69,7 +69,7 @@ def test_a_path_that_is_not_there_is_named_as_text(words: tuple[str, ...], tmp_p
 def test_a_suite_in_a_folder_of_a_hostile_name_is_shown_as_text(small_suite: Suite, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_suite.folder, tmp_path / NAME))
     said("suite", "list", folder)
-    (folder / "suite.json").write_text(f'{{"schema_version": "{SHOWN}"}}')
+    (folder / "suite.json").write_text(f'{{"schema_version": "{SHOWN}"}}', encoding="utf-8")
     assert "[bold]x[red] [no-end]" in said("suite", "validate", folder)
 
 

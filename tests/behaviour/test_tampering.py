@@ -51,9 +51,9 @@ def equal_sizes(small_suite: Suite, tmp_path: Path) -> Path:
 
 def edit(path: Path, change: Edit) -> None:
     """A value by hand, written as it was written before."""
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     change(content)
-    path.write_text(json.dumps(content, indent=1))
+    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def swap(one: Path, other: Path) -> None:
@@ -220,7 +220,7 @@ def test_seal_makes_no_columns_of_exchanged_rows(equal_sizes: Path) -> None:
 @pytest.mark.parametrize("home", ["data.zarr", "columns.zarr"])
 def test_other_endianness_is_found(run: Path, home: str) -> None:
     metadata = run / home / "backbone/pooled/zarr.json"
-    metadata.write_text(metadata.read_text().replace('"little"', '"big"'))
+    metadata.write_text(metadata.read_text(encoding="utf-8").replace('"little"', '"big"'), encoding="utf-8")
     assert_found(run, f"{home}/backbone/pooled/zarr.json", deep=True)
 
 
@@ -275,7 +275,7 @@ def test_columns_that_are_not_the_rows_are_found_though_their_hashes_are_right(r
     (seal,) = (run / "sealed").iterdir()
     home = run / "columns.zarr/backbone/pooled/c/0/0"
     swap(home / "0/0/0", home / "1/0/0")
-    content = json.loads(seal.read_text())
+    content = json.loads(seal.read_text(encoding="utf-8"))
     first, second = (f"backbone/pooled/c/0/0/{layer}/0/0" for layer in (0, 1))
     objects = content["objects"]
     objects[first], objects[second] = objects[second], objects[first]
@@ -349,7 +349,7 @@ def test_a_picture_that_no_commit_names_is_not_shown(run: Path) -> None:
 
 def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run: Path) -> None:
     for path in (run / "commits").iterdir():
-        commit = json.loads(path.read_text())
+        commit = json.loads(path.read_text(encoding="utf-8"))
         del commit["pictures"]
         write_record(path, commit)
     shutil.rmtree(run / "probes")
@@ -365,7 +365,9 @@ def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run
 def stored_probes(run: Path) -> list[Path]:
     """Oldest first: without controls, then with them."""
     folders = [path for path in (run / "probes").iterdir() if not path.name.startswith(".")]
-    return sorted(folders, key=lambda path: json.loads((path / "settings.json").read_text())["created"])
+    return sorted(
+        folders, key=lambda path: json.loads((path / "settings.json").read_text(encoding="utf-8"))["created"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -416,7 +418,7 @@ def test_changed_files_of_probes_are_found(run: Path, name: str, how: str, other
 
 def test_scores_that_were_edited_are_found_though_nothing_reads_them(run: Path) -> None:
     (path,) = stored_probes(run)[0].glob("scores*.csv")
-    path.write_text(path.read_text().replace("0.", "1.", 1))
+    path.write_text(path.read_text(encoding="utf-8").replace("0.", "1.", 1), encoding="utf-8")
     assert "scores" in verify_run(run, deep=True).problems[0]
 
 
@@ -440,7 +442,8 @@ def test_probes_of_activations_that_are_no_more_are_found(run: Path) -> None:
     identity = open_run(run).root.identity
     for folder in stored_probes(run):
         write_record(
-            folder / "settings.json", {**json.loads((folder / "settings.json").read_text()), "run": identity}
+            folder / "settings.json",
+            {**json.loads((folder / "settings.json").read_text(encoding="utf-8")), "run": identity},
         )
     with pytest.raises(RunDamagedError, match="other activations"):
         load_results(open_run(run))
@@ -520,14 +523,14 @@ def test_interventions_of_another_run_are_found(run: Path, other: Path) -> None:
 
 def test_no_record_of_results_makes_a_training_remove_a_file_elsewhere(run: Path, tmp_path: Path) -> None:
     victim = tmp_path / "thesis.txt"
-    victim.write_text("do not touch")
+    victim.write_text("do not touch", encoding="utf-8")
     for folder in stored_probes(run):
-        head = json.loads((folder / "settings.json").read_text())
+        head = json.loads((folder / "settings.json").read_text(encoding="utf-8"))
         head["files"]["scores.csv"] = ["../../../thesis.txt", *head["files"]["scores.csv"][1:]]
         write_record(folder / "settings.json", head)
     with pytest.raises(RunDamagedError, match=r"thesis\.txt.*no file beside it"):
         train_probes(open_run(run), permutations=1, controls=("position",))
-    assert victim.read_text() == "do not touch"
+    assert victim.read_text(encoding="utf-8") == "do not touch"
     assert any("thesis.txt" in problem for problem in verify_run(run).problems)
 
 
@@ -537,7 +540,7 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
     outside.write_bytes(b"of somebody else")
     key = str(outside) if absolute else "../../outside"
     path = run / "commits" / "00000003.json"
-    commit = json.loads(path.read_text())
+    commit = json.loads(path.read_text(encoding="utf-8"))
     commit["objects"][key] = Sum.of(outside.read_bytes()).to_json()
     write_record(path, commit)
     found = verify_run(run, deep=True)

@@ -258,9 +258,9 @@ def test_worker_processes_give_the_same_observations_as_the_parent(shared_env):
 
 
 def test_the_documented_line_makes_the_environment_without_an_import_of_ours():
-    page = (Path(__file__).parents[2] / "docs" / "environment.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "environment.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert "import probe_kit" not in example
     code = f"{example}\nprint(type(env.unwrapped).__name__, observation.keys() == env.observation_space.keys())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
     assert (done.returncode, done.stdout) == (0, "Act2AnswerEnv True\n"), done.stderr

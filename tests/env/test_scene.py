@@ -107,7 +107,7 @@ def test_a_home_out_of_reach_is_refused():
 
 
 def resident_megabytes():
-    with open("/proc/self/statm") as statm:  # noqa: PTH123
+    with open("/proc/self/statm", encoding="utf-8") as statm:  # noqa: PTH123
         return int(statm.read().split()[1]) * 4096 / 2**20
 
 

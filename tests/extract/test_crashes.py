@@ -78,7 +78,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     data = ("data.zarr/backbone/pooled/c/0/x.partial", "columns.zarrx.tmp/zarr.json")
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(exist_ok=True)
-        (run / orphan).write_text("torn")
+        (run / orphan).write_text("torn", encoding="utf-8")
     assert start(run, suite).wait() == 0
     assert tree(run) == tree(whole)
 
@@ -119,7 +119,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=700k", "none", str(disk)], capture_output=True, text=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=700k", "none", str(disk)],
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
     )
     if mounted.returncode != 0:
         pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
@@ -131,7 +134,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"
     process = subprocess.run(
-        [sys.executable, str(KILLING), str(run), str(suite.folder)], capture_output=True, text=True, check=False
+        [sys.executable, str(KILLING), str(run), str(suite.folder)],
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
     )
     assert "is full" in process.stderr
     found = verify_run(run, deep=True)

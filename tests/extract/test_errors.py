@@ -109,11 +109,11 @@ def test_the_exit_code_of_a_missing_extra_is_that_of_a_wrong_usage(
 ) -> None:
     blocked = tmp_path / "blocked"
     blocked.mkdir()
-    (blocked / "sitecustomize.py").write_text(WITHOUT_MESHES)
+    (blocked / "sitecustomize.py").write_text(WITHOUT_MESHES, encoding="utf-8")
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--suite", str(suite.folder)]
     ran = subprocess.run(
         [*command, "--arm", "widowx", "--out", str(tmp_path / "run"), *workers],
-        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(blocked)},
+        capture_output=True, encoding="utf-8", check=False, env={**os.environ, "PYTHONPATH": str(blocked)},
     )  # fmt: skip
     assert (ran.returncode, "SceneError" in ran.stderr) == (2, True), ran.stderr
 

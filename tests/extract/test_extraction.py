@@ -89,10 +89,10 @@ def test_other_settings_in_the_same_folder_are_refused_by_name(two_items: Suite,
 
 
 def test_a_folder_that_is_no_run_is_left_alone(two_items: Suite, tmp_path: Path) -> None:
-    (tmp_path / "thesis.txt").write_text("do not touch")
+    (tmp_path / "thesis.txt").write_text("do not touch", encoding="utf-8")
     with pytest.raises(SettingsMismatchError, match="is not a run"):
         extract_run(ExtractSettings("expert", suite=two_items.folder), tmp_path)
-    assert (tmp_path / "thesis.txt").read_text() == "do not touch"
+    assert (tmp_path / "thesis.txt").read_text(encoding="utf-8") == "do not touch"
 
 
 def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(

@@ -40,7 +40,7 @@ def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None
     original = getattr(Folder, name)
 
     def watched(self: Folder, key: str, content: bytes) -> Any:
-        with (self.path / RUN_FILE).open() as file:
+        with (self.path / RUN_FILE).open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

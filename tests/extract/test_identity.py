@@ -122,9 +122,9 @@ def test_a_finished_run_opens_by_its_command_wherever_that_is(
 def test_provenance_is_stored_once_and_every_commit_names_it(suite: Suite, tmp_path: Path) -> None:
     run = extract_run(expert(suite), tmp_path / "run")
     (record,) = (run.path / "provenance").glob("*.json")
-    commits = [json.loads(path.read_text()) for path in sorted(run.path.glob("commits/*.json"))]
+    commits = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(run.path.glob("commits/*.json"))]
     assert [commit["provenance"] for commit in commits] == [record.stem] * 4
-    stored = json.loads(record.read_text())
+    stored = json.loads(record.read_text(encoding="utf-8"))
     assert stored["device"] == "cpu"
     assert stored["versions"]["torch"] == version("torch")
     del stored[HASH]
@@ -134,7 +134,7 @@ def test_provenance_is_stored_once_and_every_commit_names_it(suite: Suite, tmp_p
 def test_lost_or_changed_provenance_is_found(suite: Suite, tmp_path: Path) -> None:
     run = extract_run(expert(suite), tmp_path / "run")
     (record,) = (run.path / "provenance").glob("*.json")
-    record.write_text(record.read_text().replace('"cpu"', '"tpu"'))
+    record.write_text(record.read_text(encoding="utf-8").replace('"cpu"', '"tpu"'), encoding="utf-8")
     assert "was changed" in verify_run(run.path).problems[0]
     record.unlink()
     assert "is missing" in verify_run(run.path).problems[0]

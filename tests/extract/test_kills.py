@@ -33,7 +33,7 @@ class Nursery:
             [sys.executable, "-W", "ignore::DeprecationWarning", str(NURSERY)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            text=True,
+            encoding="utf-8",
         )
 
     def __call__(self, task: str, run: Path | str, *patience: float | None) -> dict[str, Any]:

@@ -41,10 +41,10 @@ def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A pi0 of 32 unnamed dimensions, as its base model."""
     folder = write_intact(tmp_path_factory.mktemp("base") / "pi0")
-    config = json.loads((folder / "config.json").read_text())
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     config["input_features"]["observation.state"]["shape"] = [32]
     config["output_features"]["action"]["shape"] = [32]
-    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
     return folder
 
 
@@ -85,7 +85,7 @@ def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run,
         assert "listened to" in text
     assert table.to_frame()["sr"].isna().sum() == 2
     assert any("was listened to and did not act" in note for note in table.notes)
-    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text()
+    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text(encoding="utf-8")
     assert "did not act" in page
 
 

@@ -150,7 +150,7 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
 
 
 def test_the_documented_table_is_that_of_the_registry() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text(encoding="utf-8")
     for name, family in known_families().items():
         for row in family.protocols.values():
             options = " ".join(f"{key}={value}" for key, value in row.settings().items() if key.startswith("-M"))

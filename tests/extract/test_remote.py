@@ -152,7 +152,7 @@ def test_damage_in_a_bucket_is_found_and_never_read_as_numbers(copied: Run) -> N
 def test_the_commands_take_urls(copied: Run, tmp_path: Path, bucket: str) -> None:
     def probe_kit(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "probe_kit", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+        return subprocess.run(command, capture_output=True, encoding="utf-8", check=False, cwd=tmp_path)
 
     run = str(copied.location)
     made = probe_kit("extract", "--model", "expert", "--categories", "color", "--items", "2", "--max-steps", "2",

@@ -128,5 +128,5 @@ run = open_run({str(recorded_run.path)!r})
 run.column(Site("backbone", 1)), run.tokens(Site("backbone", 1), "language"), run.gram(Site("backbone", 1))
 print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])
 """
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
     assert loaded.stdout.strip() == "[]"

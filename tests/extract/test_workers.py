@@ -103,7 +103,7 @@ def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: S
     command += ["--scene", "bridge", "--max-steps", "2", "--workers", "2", "--env-workers", "0", "--out"]
     for attempt in range(5):  # on a busy machine a run may end before its worker is killed
         run = tmp_path / f"run-{attempt}"
-        process = subprocess.Popen([*command, str(run)], stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen([*command, str(run)], stderr=subprocess.PIPE, encoding="utf-8")
         killed = _kill_a_worker(process.pid, run)
         _, messages = process.communicate(timeout=120)
         assert process.returncode == 0, messages
@@ -120,7 +120,7 @@ def _kill_a_worker(driver: int, run: Path) -> bool:
     while time.monotonic() < deadline:
         if list(run.glob("commits/*.json")):
             try:
-                children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
+                children = Path(f"/proc/{driver}/task/{driver}/children").read_text(encoding="utf-8").split()
                 os.kill(int(children[0]), signal.SIGKILL)
             except (FileNotFoundError, IndexError, ProcessLookupError):
                 return False

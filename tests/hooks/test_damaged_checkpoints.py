@@ -58,7 +58,7 @@ def _bounded_memory() -> Iterator[None]:
     """A damaged file of a megabyte may fail, and may not fill the machine."""
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    used = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, before[1]))
     yield
     resource.setrlimit(resource.RLIMIT_AS, before)
@@ -117,10 +117,10 @@ def edit_json(checkpoint: Path, change: Callable[[dict[str, Any]], bool]) -> int
     """Let `change` loose on every object of every JSON file; how many it says it changed."""
     changed = 0
     for file in sorted(checkpoint.rglob("*.json")):
-        content = json.loads(file.read_text())
+        content = json.loads(file.read_text(encoding="utf-8"))
         here = sum(change(one) for one in list(mappings(content)))
         if here:
-            file.write_text(json.dumps(content))
+            file.write_text(json.dumps(content), encoding="utf-8")
         changed += here
     return changed
 
@@ -223,7 +223,7 @@ def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> No
     from probe_kit.hooks.checkpoints.checkpoint import missing_weights
     from probe_kit.hooks.checkpoints.weights import INDEX_FILE, read_weights
 
-    (tmp_path / INDEX_FILE).write_text(json.dumps({"weight_map": {"a": name}}))
+    (tmp_path / INDEX_FILE).write_text(json.dumps({"weight_map": {"a": name}}), encoding="utf-8")
     assert "damaged" in missing_weights(tmp_path)
     with pytest.raises(WeightsError, match="is damaged"):
         read_weights(tmp_path)
@@ -245,7 +245,9 @@ def damage(checkpoint: Path, random: Random) -> str:
     elif kind == "unlink":
         file.unlink()
     elif kind in ("deep", "other"):
-        file.write_text("[" * 99_999 if kind == "deep" else random.choice(["null", "[]", '"x"', "{}", "7"]))
+        file.write_text(
+            "[" * 99_999 if kind == "deep" else random.choice(["null", "[]", '"x"', "{}", "7"]), encoding="utf-8"
+        )
     else:
         value = json.loads(content)
         objects = [one for one in mappings(value) if one]
@@ -256,7 +258,7 @@ def damage(checkpoint: Path, random: Random) -> str:
                 del one[key]
             else:
                 one[key] = random.choice(WRONG)
-            file.write_text(json.dumps(value))
+            file.write_text(json.dumps(value), encoding="utf-8")
     return f"{kind} {file.name}"
 
 

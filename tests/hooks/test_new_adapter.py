@@ -19,25 +19,29 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_adapter("my-vla", tmp_path / "mine")
     info = tmp_path / "mine" / "my_vla-0.1.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-vla\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text(ENTRY)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-vla\nVersion: 0.1\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(ENTRY, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "mine"))
     return tmp_path / "mine"
 
 
 def ran(folder: Path, *arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", *arguments], cwd=folder, capture_output=True, text=True, check=False, timeout=300
+        [sys.executable, "-m", *arguments],
+        cwd=folder,
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def test_it_keeps_the_contract_as_it_is(installed: Path) -> None:
-    assert (
-        ENTRY.splitlines()[1].replace("my_vla:FAMILY", '"my_vla:FAMILY"')
-        in (installed / "pyproject.toml").read_text()
-    )
+    assert ENTRY.splitlines()[1].replace("my_vla:FAMILY", '"my_vla:FAMILY"') in (
+        installed / "pyproject.toml"
+    ).read_text(encoding="utf-8")
     tested = ran(installed, "pytest", "-q", "-p", "no:cacheprovider", "tests")
     assert "failed" not in tested
     assert int(tested.rpartition("\n")[0].rpartition("\n")[2].split()[0]) > 20, tested

@@ -87,7 +87,7 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     """A reference whose tokenizer has the suite's words in the place of others."""
     shutil.copytree(golden, copy)
     (file,) = copy.rglob("tokenizer.json")
-    tokenizer = json.loads(file.read_text())
+    tokenizer = json.loads(file.read_text(encoding="utf-8"))
     vocabulary, special = tokenizer["model"]["vocab"], {own["content"] for own in tokenizer["added_tokens"]}
     asked = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
     spare = [word for word in vocabulary if word not in special | {"\n", *asked}]
@@ -95,7 +95,7 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     assert len(missing) <= len(spare)
     for word, other in zip(missing, spare, strict=False):
         vocabulary[word] = vocabulary.pop(other)
-    file.write_text(json.dumps(tokenizer))
+    file.write_text(json.dumps(tokenizer), encoding="utf-8")
     return copy
 
 

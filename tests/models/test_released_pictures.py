@@ -65,8 +65,8 @@ def test_pictures_are_prepared_as_by_the_released_processors(
     family: str, size: str, golden_vlm: Path, tmp_path: Path
 ) -> None:
     reference = golden_vlm / "preprocess"
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES[family]))
-    expected = json.loads((reference / "dims.json").read_text())[f"{family}_{size}"]
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES[family]), encoding="utf-8")
+    expected = json.loads((reference / "dims.json").read_text(encoding="utf-8"))[f"{family}_{size}"]
     with np.load(reference / "reference.npz") as arrays:
         made, tokens = PREPARE[family](tmp_path, arrays[f"picture_{size}"])
         named = {part: arrays[f"{family}_{size}_{part}"] for part in ("shape", "index", "at", "sum")}
@@ -78,7 +78,7 @@ def test_pictures_are_prepared_as_by_the_released_processors(
 
 
 def test_one_tile_on_wish_shows_the_whole_picture(golden_vlm: Path, tmp_path: Path) -> None:
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES["internvl"]))
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES["internvl"]), encoding="utf-8")
     with np.load(golden_vlm / "preprocess" / "reference.npz") as arrays:
         picture = arrays["picture_560x480"]
     tiled, one = (TiledPictures.from_folder(tmp_path, 448, tiled) for tiled in (True, False))

@@ -105,9 +105,9 @@ def test_a_report_is_written_whole_and_replaces_an_older_one(tmp_path: Path, out
     run = plain_run(tmp_path / "run", outcome_table(6, 4, 2))
     path = tmp_path / "new" / "report.html"
     assert write_report([run], path) == path
-    path.write_text("old")
+    path.write_text("old", encoding="utf-8")
     write_report([run], path)
-    assert path.read_text().rstrip().endswith("</html>")
+    assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
     assert list(path.parent.iterdir()) == [path], "no draft stays behind"
 
 
@@ -125,7 +125,7 @@ episodes = pd.read_json({str(tmp_path / "episodes.json")!r})
 write_report([ArrayRun(Path({str(tmp_path)!r}), "pi0", "suite", episodes, {{}})], {str(tmp_path / "r.html")!r})
 print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name in sys.modules])
 """
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
     assert loaded.stdout.strip() == "[]"
 
 

@@ -15,21 +15,21 @@ FIGURE = re.compile(r"\d[\d,.]*\s?(%|×|ms|s\b|MB/s|GB\b)")
 
 @pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
 def test_every_table_of_the_demo_is_the_one_its_numbers_make(page: Path) -> None:
-    text = page.read_text()
+    text = page.read_text(encoding="utf-8")
     assert blocks(text)
-    assert filled(text, json.loads(DATA.read_text())) == text
+    assert filled(text, json.loads(DATA.read_text(encoding="utf-8"))) == text
 
 
 def test_another_number_makes_another_page() -> None:
-    data = json.loads(DATA.read_text())
+    data = json.loads(DATA.read_text(encoding="utf-8"))
     data["organisms"][0]["sr"] = 0.123
-    text = README.read_text()
+    text = README.read_text(encoding="utf-8")
     assert "12.3" in filled(text, data)
     assert "12.3" not in text
 
 
 def test_the_picture_shows_the_probes_whose_numbers_are_printed() -> None:
-    data = json.loads(DATA.read_text())
+    data = json.loads(DATA.read_text(encoding="utf-8"))
     with Image.open(TARGET) as picture:
         assert picture.info[MADE_FROM] == data["probes"]
     assert "trained" in {row["organism"] for row in data["organisms"]}
@@ -37,16 +37,18 @@ def test_the_picture_shows_the_probes_whose_numbers_are_printed() -> None:
 
 def test_no_page_repeats_the_demos_numbers_outside_its_tables() -> None:
     """A number in two places is soon two numbers."""
-    data = json.loads(DATA.read_text())
+    data = json.loads(DATA.read_text(encoding="utf-8"))
     rates = {f"{100 * row['sr']:.1f}" for row in data["organisms"] if 0.5 < row["sr"] < 1}
     assert rates
     for page in (README, DOCS / "index.md", *PAGES):
-        text = re.sub(r"<!-- from docs/demo.json.*?<!-- end of it -->", "", page.read_text(), flags=re.DOTALL)
+        text = re.sub(
+            r"<!-- from docs/demo.json.*?<!-- end of it -->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL
+        )
         assert [rate for rate in rates if re.search(rf"(?<![\d.]){re.escape(rate)}(?!\d)", text)] == [], page.name
 
 
 def test_the_overview_of_performance_points_to_figures_and_holds_none() -> None:
-    text = (DOCS / "performance.md").read_text().partition("\n## ")[0]
+    text = (DOCS / "performance.md").read_text(encoding="utf-8").partition("\n## ")[0]
     assert [found[0] for found in FIGURE.finditer(text)] == []
     assert text.count("](") >= 6
 
@@ -67,6 +69,6 @@ def test_parameters_of_the_embedded_models_are_said_as_they_are_everywhere() -> 
     said = {
         (page.name, found)
         for page in pages
-        for found in re.findall(r"(0\.\d+)\s+million\s+param", page.read_text())
+        for found in re.findall(r"(0\.\d+)\s+million\s+param", page.read_text(encoding="utf-8"))
     }
     assert {found for _, found in said} == {f"{count / 1e6:.2f}" for count in counts}, said

@@ -30,9 +30,9 @@ def edit_records(copied: Path) -> Callable[[Callable[[list[dict[str, Any]]], Non
 
     def edit(change: Callable[[list[dict[str, Any]]], None]) -> Path:
         path = copied / "items" / "metadata.jsonl"
-        records = [json.loads(line) for line in path.read_text().splitlines()]
+        records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         change(records)
-        path.write_text("".join(json.dumps(record) + "\n" for record in records))
+        path.write_text("".join(json.dumps(record) + "\n" for record in records), encoding="utf-8")
         return copied
 
     return edit

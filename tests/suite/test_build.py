@@ -74,7 +74,7 @@ def test_progress_is_told_items_done_and_items_in_all(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_use_is_refused_before_anything_is_drawn(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
 
     def progress(_done: int, _total: int) -> None:
         pytest.fail("something was drawn")
@@ -183,5 +183,5 @@ def test_a_damaged_cache_is_reported_not_used(tmp_path: Path, monkeypatch: pytes
 def test_importing_the_suite_stays_light() -> None:
     heavy = "torch", "pandas", "matplotlib", "sklearn", "scipy"
     code = f"import sys, probe_kit.suite; print([name for name in {heavy} if name in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
     assert result.stdout.strip() == "[]"

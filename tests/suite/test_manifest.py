@@ -25,8 +25,11 @@ def test_the_folder_holds_what_the_format_says(small_suite: Suite) -> None:
         "ATTRIBUTION.csv",
         "stats.json",
     }
-    assert json.loads((small_suite.folder / "stats.json").read_text())["color"] == {"pool": 55, "emitted": 12}
-    assert "Apache-2.0 | yes | 24" in (small_suite.folder / "LICENSES.md").read_text()
+    assert json.loads((small_suite.folder / "stats.json").read_text(encoding="utf-8"))["color"] == {
+        "pool": 55,
+        "emitted": 12,
+    }
+    assert "Apache-2.0 | yes | 24" in (small_suite.folder / "LICENSES.md").read_text(encoding="utf-8")
 
 
 def test_pictures_are_stored_once_under_their_content_hash(small_suite: Suite) -> None:
@@ -38,7 +41,7 @@ def test_pictures_are_stored_once_under_their_content_hash(small_suite: Suite) -
 
 
 def test_every_stored_picture_is_attributed(small_suite: Suite) -> None:
-    header, *rows = (small_suite.folder / "ATTRIBUTION.csv").read_text().splitlines()
+    header, *rows = (small_suite.folder / "ATTRIBUTION.csv").read_text(encoding="utf-8").splitlines()
     assert header == "file_name,image_id,license,attribution"
     assert len(rows) == len(list(small_suite.folder.rglob("*.png")))
 
@@ -59,22 +62,22 @@ def test_a_folder_without_a_suite_is_wrong_usage(tmp_path: Path, missing: str) -
 
 
 def test_an_unreadable_card_is_refused(copied: Path) -> None:
-    (copied / "suite.json").write_text("{")
+    (copied / "suite.json").write_text("{", encoding="utf-8")
     with pytest.raises(SuiteError, match=r"E01 suite\.json: not valid JSON"):
         load_suite(copied)
 
 
 def test_a_card_without_a_name_is_refused(copied: Path) -> None:
-    card = json.loads((copied / "suite.json").read_text())
+    card = json.loads((copied / "suite.json").read_text(encoding="utf-8"))
     del card["name"]
-    (copied / "suite.json").write_text(json.dumps(card))
+    (copied / "suite.json").write_text(json.dumps(card), encoding="utf-8")
     with pytest.raises(SuiteError, match=r"E02 suite\.json: field 'name' is None; expected a str"):
         load_suite(copied)
 
 
 def test_a_card_of_another_schema_is_refused(copied: Path) -> None:
-    card = json.loads((copied / "suite.json").read_text()) | {"schema_version": "2.0"}
-    (copied / "suite.json").write_text(json.dumps(card))
+    card = json.loads((copied / "suite.json").read_text(encoding="utf-8")) | {"schema_version": "2.0"}
+    (copied / "suite.json").write_text(json.dumps(card), encoding="utf-8")
     with pytest.raises(SuiteError, match=r"E03 suite\.json: uses schema 2\.0; this tool reads 1\.x"):
         load_suite(copied)
 
@@ -82,7 +85,7 @@ def test_a_card_of_another_schema_is_refused(copied: Path) -> None:
 @pytest.mark.parametrize("line", ["{half", "[1, 2]", "", b"\xff\xfe".decode("latin-1")])
 def test_a_line_that_is_no_json_object_is_found_by_its_number(copied: Path, line: str) -> None:
     path = copied / "items" / "metadata.jsonl"
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     lines[6] = line
     path.write_bytes("\n".join(lines).encode("latin-1"))
     with pytest.raises(SuiteError, match=r"E01 metadata\.jsonl:7: "):

@@ -88,7 +88,7 @@ def test_a_missing_picture_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
-    (tmp_path / "text.png").write_text("hello")
+    (tmp_path / "text.png").write_text("hello", encoding="utf-8")
     with pytest.raises(SuiteError, match=r"text\.png: not a picture"):
         load_picture(tmp_path / "text.png")
 

@@ -111,9 +111,9 @@ def statistics() -> dict[str, Any]:
 def write_vlm(folder: Path, **text: Any) -> Path:
     """Configuration, tokenizer and processor of the vision-language model; no weights."""
     write_tokenizer(folder)
-    (folder / "config.json").write_text(json.dumps(vlm_values(**text)))
+    (folder / "config.json").write_text(json.dumps(vlm_values(**text)), encoding="utf-8")
     settings = picture_settings(14, 3136, 12845056)
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings), encoding="utf-8")
     return folder
 
 
@@ -123,8 +123,8 @@ def write_checkpoint(folder: Path, seed: int = 1, side: int = 224) -> Path:
     (run / "checkpoints").mkdir(parents=True)
     values = run_values(base=str(write_vlm(folder / "vlm")))
     values["datasets"]["vla_data"]["image_size"] = [side, side]
-    (run / "config.yaml").write_text(yaml.safe_dump(values))
-    (run / "dims.json").write_text(json.dumps(dims_values()))
-    (run / "dataset_statistics.json").write_text(json.dumps(statistics()))
+    (run / "config.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    (run / "dims.json").write_text(json.dumps(dims_values()), encoding="utf-8")
+    (run / "dataset_statistics.json").write_text(json.dumps(statistics()), encoding="utf-8")
     torch.save(network(seed).state_dict(), run / "checkpoints" / "steps_7_pytorch_model.pt")
     return run

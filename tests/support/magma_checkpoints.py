@@ -149,7 +149,7 @@ def write_checkpoint(
         ("preprocessor_config.json", preprocessor),
         ("generation_config.json", {"bos_token_id": IDS[BEGINNING], "eos_token_id": IDS[END_OF_TURN]}),
     ):
-        (folder / name).write_text(json.dumps(content))
+        (folder / name).write_text(json.dumps(content), encoding="utf-8")
     write_tokenizer(folder)
     if tensors is None:
         tensors = weights(small_network(steered, seed, **fields))
@@ -166,7 +166,7 @@ def _write_weights(folder: Path, tensors: dict[str, Tensor], shards: int) -> Non
     }
     for file in set(place.values()):
         save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}))
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}), encoding="utf-8")
 
 
 def write_tokenizer(folder: Path) -> Path:
@@ -184,5 +184,5 @@ def write_tokenizer(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))
     names = {"bos_token": BEGINNING, "eos_token": END_OF_TURN, "pad_token": "<pad>"}
-    (folder / "tokenizer_config.json").write_text(json.dumps(names))
+    (folder / "tokenizer_config.json").write_text(json.dumps(names), encoding="utf-8")
     return folder

@@ -42,7 +42,7 @@ def write_reference(
         "preprocessor": {**processor, "image_mean": MEAN, "image_std": DEVIATION},
         "special_ids": {"eos": IDS["<|eot_id|>"]},
     }
-    (checkpoint / "action_config.json").write_text(json.dumps(client))
+    (checkpoint / "action_config.json").write_text(json.dumps(client), encoding="utf-8")
     with torch.inference_mode():
         arrays = _Recorder(network, vision["img_size"], vision["max_num_crops"]).record(pictures, steps)
     ids = rng.integers(0, 544, (5, 7))

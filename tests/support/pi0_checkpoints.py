@@ -83,9 +83,9 @@ def old_golden(golden: Path, target: Path) -> Path:
     }
     weights = load_file(place / "model.safetensors")
     save_file({**older(weights), **buffers}, place / "model.safetensors", metadata={"format": "pt"})
-    config = json.loads((place / "config.json").read_text())
+    config = json.loads((place / "config.json").read_text(encoding="utf-8"))
     modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
-    (place / "config.json").write_text(json.dumps(old_config(config, modes), indent=4))
+    (place / "config.json").write_text(json.dumps(old_config(config, modes), indent=4), encoding="utf-8")
     return target
 
 
@@ -115,10 +115,10 @@ def write_intact(folder: Path, seed: int = 0) -> Path:
     initialise(network, seed)
     folder.mkdir(parents=True)
     config.save_pretrained(folder)
-    values = json.loads((folder / "config.json").read_text())
+    values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     modes = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
-    (folder / "config.json").write_text(json.dumps(old_config(values, modes), indent=4))
-    (folder / "dims.json").write_text(json.dumps(SIZE.to_json()))
+    (folder / "config.json").write_text(json.dumps(old_config(values, modes), indent=4), encoding="utf-8")
+    (folder / "dims.json").write_text(json.dumps(SIZE.to_json()), encoding="utf-8")
     for name in ("tokenizer.json", "tokenizer_config.json"):
         shutil.copy(embedded_checkpoint("pi0-tiny") / name, folder / name)
     save_file(older(network.state_dict()), folder / "model.safetensors", metadata={"format": "pt"})
@@ -127,7 +127,7 @@ def write_intact(folder: Path, seed: int = 0) -> Path:
 
 def write_statistics(path: Path) -> Path:
     """A statistics file as INT-ACT's evaluation reads it."""
-    path.write_text(json.dumps(BRIDGE_LIKE))
+    path.write_text(json.dumps(BRIDGE_LIKE), encoding="utf-8")
     return path
 
 

@@ -52,7 +52,7 @@ def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any
     """Write config and weights; with more than one shard also the index that names them."""
     folder.mkdir(parents=True, exist_ok=True)
     values = config_values(**fields)
-    (folder / "config.json").write_text(json.dumps(values))
+    (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
     network = build_prismatic(PrismaticConfig.from_json(values), torch.float32, device="cpu")
     initialise(network, seed)
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
@@ -64,7 +64,7 @@ def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any
     }
     for file in set(place.values()):
         save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}))
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}), encoding="utf-8")
     return folder
 
 
@@ -78,5 +78,5 @@ def write_tokenizer(folder: Path) -> Path:
     tokenizer.add_special_tokens(["<unk>", "<s>", "</s>"])
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))
-    (folder / "tokenizer_config.json").write_text(json.dumps({"bos_token": {"content": "<s>"}}))
+    (folder / "tokenizer_config.json").write_text(json.dumps({"bos_token": {"content": "<s>"}}), encoding="utf-8")
     return folder

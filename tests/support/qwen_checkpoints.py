@@ -33,7 +33,7 @@ def write_tokenizer(folder: Path, special: Sequence[str] = SPECIAL) -> Path:
     tokenizer.add_special_tokens(list(special))
     tokenizer.save(str(folder / "tokenizer.json"))
     settings = {"tokenizer_class": "Qwen2Tokenizer", "eos_token": "<|im_end|>", "pad_token": special[0]}
-    (folder / "tokenizer_config.json").write_text(json.dumps(settings))
+    (folder / "tokenizer_config.json").write_text(json.dumps(settings), encoding="utf-8")
     return folder
 
 
@@ -72,4 +72,4 @@ def save_sharded(tensors: dict[str, Tensor], folder: Path, shards: int) -> None:
     }
     for file in set(place.values()):
         save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}))
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}), encoding="utf-8")

@@ -42,14 +42,14 @@ def write_record(path: Path, content: dict[str, Any]) -> None:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(path.read_text())
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     content.pop(HASH, None)
     return content
 
 
 def _write(path: Path, content: dict[str, Any]) -> str:
     path.write_bytes(as_record(content))
-    return str(json.loads(path.read_text())[HASH])
+    return str(json.loads(path.read_text(encoding="utf-8"))[HASH])
 
 
 def _sum(path: Path, blocks: str = "") -> Sum:

@@ -29,7 +29,7 @@ def write_smolvla(folder: Path, cameras: tuple[str, ...] = ("top",), seed: int =
 
     folder.mkdir(parents=True, exist_ok=True)
     _write_vlm(folder / "vlm")
-    (folder / "config.json").write_text(json.dumps(_config(cameras) | fields))
+    (folder / "config.json").write_text(json.dumps(_config(cameras) | fields), encoding="utf-8")
     config: Any = PreTrainedConfig.from_pretrained(folder)
     network = build_smolvla(config, folder)
     initialise(network, seed)
@@ -124,4 +124,4 @@ def _write_units(folder: Path, kind: str, feature: str, size: int) -> None:
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content), encoding="utf-8")

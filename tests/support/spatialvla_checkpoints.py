@@ -246,4 +246,4 @@ def write_tokenizer(folder: Path, actions: int = BINS["total"], more: tuple[str,
 
 
 def _write(file: Path, values: dict[str, Any]) -> None:
-    file.write_text(json.dumps(values))
+    file.write_text(json.dumps(values), encoding="utf-8")

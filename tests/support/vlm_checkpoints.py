@@ -163,8 +163,8 @@ def _write(
         tensors[name] = tensor
     save_sharded(tensors, folder, 1)
     write_tokenizer(folder, special)
-    (folder / "config.json").write_text(json.dumps(values))
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings), encoding="utf-8")
     if end is not None:
-        (folder / "generation_config.json").write_text(json.dumps({"eos_token_id": end}))
+        (folder / "generation_config.json").write_text(json.dumps({"eos_token_id": end}), encoding="utf-8")
     return folder

@@ -81,12 +81,12 @@ def write_checkpoint(folder: Path, shards: int = 2, seed: int = 1, **fields: Any
     """Configuration, weights, tokenizer, processor. fields: of config.json."""
     folder.mkdir(parents=True, exist_ok=True)
     values = config_values(**fields)
-    (folder / "config.json").write_text(json.dumps(values))
+    (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
     write_tokenizer(folder)
     settings = picture_settings(
         16, 65536, 16777216, processor_class="MiBotProcessor", action_config=action_config()
     )
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings), encoding="utf-8")
     network = build_xiaomi(XiaomiConfig.from_json(values), torch.float32, device="cpu")
     initialise(network, seed)
     tensors = {name: tensor for name, tensor in network.state_dict().items() if name != "vlm.lm_head.weight"}

@@ -83,7 +83,7 @@ def write_urdf(folder: Path) -> Path:
     meshes = _find_meshes()
     parts = [_link_xml(link, meshes) + (_joint_xml(link) if link.parent else "") for link in LINKS]
     path = folder / "widowx.urdf"
-    path.write_text(f'<robot name="widowx">\n{"".join(parts)}</robot>\n')
+    path.write_text(f'<robot name="widowx">\n{"".join(parts)}</robot>\n', encoding="utf-8")
     return path
 
 

@@ -24,7 +24,7 @@ def write_quad(path: Path, side: float) -> None:
     h = side / 2
     corners = "".join(f"v {x} {y} 0\n" for x, y in ((-h, h), (-h, -h), (h, -h), (h, h)))
     picture = "".join(f"vt {u} {v}\n" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    path.write_text(f"{corners}{picture}vn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n")
+    path.write_text(f"{corners}{picture}vn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n", encoding="utf-8")
 
 
 def as_texture(picture: Image.Image) -> NDArray[np.uint8]:

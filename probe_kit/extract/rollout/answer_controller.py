@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.errors import UsageError
+import numpy as np
+
+from probe_kit.errors import PolicyFailedError, UsageError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.run_layout import StoredStream
@@ -73,6 +75,7 @@ class AskController:
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
         card = reader.card
         self.script: str | None = None
+        self.limit = settings.inference_limit
         self.threads = 1 if card.parameters < SMALL else None
         self.on_gpu = card.device.startswith("cuda")
         self.streams: list[StoredStream] = []
@@ -162,6 +165,10 @@ class AskController:
             meaning = self._form.options
             asked = [replace(own, options=tuple(meaning), begun=self._form.begun) for own in questions]
             reading = self.reader.read(asked)
+        if np.isnan(reading.option_logits).any():
+            raise PolicyFailedError(
+                "the model gave NaN as the logit of an answer; expected numbers for all of them"
+            )
         ties = self.reader.near_ties(reading)
         return [
             Forced(

@@ -1,7 +1,7 @@
 """Who decides: a captured policy, or a script that needs no model."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,6 +16,7 @@ from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.containment import begin_randomness, copied
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
@@ -119,9 +120,13 @@ class PolicyController:
         edits: Sequence[Edit] = (),
         vectors: Vectors | None = None,
         listens: bool = False,
+        limit: float | None = None,
     ) -> None:
-        """examples: an observation per instruction of the suite, as the scene will show them."""
-        self.policy, self.listens = policy, listens
+        """examples: an observation per instruction of the suite, as the scene will show them.
+
+        limit: seconds that a call of the policy may take, after which this process ends.
+        """
+        self.policy, self.listens, self._limit = policy, listens, limit
         self._infer = policy.listen if listens else policy.act
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
@@ -153,16 +158,20 @@ class PolicyController:
 
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
-        with acting(self.identity["model"], self.policy.card.checkpoint):
+        with self._acting():
+            begin_randomness(derive_seed("global", *(derive_seed(turn.seed, "call", turn.call) for turn in turns)))
             return self._act(turns)
 
+    def _acting(self) -> AbstractContextManager[None]:
+        return acting(self.identity["model"], self.policy.card.checkpoint, self._limit)
+
     def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
-        observations = [turn.seen for turn in turns]
+        observations = copied([turn.seen for turn in turns])
         seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if captured:
             chunks = self._capturer.run(
-                lambda: self._infer(observations, seeds),
+                lambda: self._chunks(turns, seeds),
                 lambda actions: actions,
                 self.policy.roles(observations),
                 captured,
@@ -170,22 +179,28 @@ class PolicyController:
             )
         else:
             with self._edited(observations):
-                chunks = self._infer(observations, seeds)
-        self.flagged = self.policy.flagged
+                chunks = self._chunks(turns, seeds)
+        self.flagged = _own_flags(self.policy.flagged, len(turns))
+        return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+
+    def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """What the policy gives for observations that it may write to, and cannot change later."""
+        chunks = self._infer(copied([turn.seen for turn in turns]), list(seeds))
         if not self.listens:
             _check_chunks(chunks, len(turns))
-        return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+        return np.array(chunks)
 
     def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
-        with acting(self.identity["model"], self.policy.card.checkpoint):
-            self._infer(observations, list(seeds))
+        with self._acting():
+            self._infer(copied(observations), list(seeds))
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids that the policy's own packing makes of it, frames around it included."""
         if instruction not in self._instruction_ids:
-            ids = self.policy.token_ids([instruction])
-            self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
+            with self._acting():
+                ids = self.policy.token_ids([instruction])
+                self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
         return self._instruction_ids[instruction]
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -222,9 +237,24 @@ def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:
 
     Actions that are NaN cost their own episode only, so the environment is left to say that.
     """
-    shape, kind = np.shape(chunks), getattr(chunks, "dtype", None)
-    if len(shape) != 3 or shape[0] != count or shape[1] < 1 or shape[2] != ACTION_SIZE or kind is None:
+    given = chunks if isinstance(chunks, np.ndarray) else None
+    shape = () if given is None else given.shape
+    fits = len(shape) == 3 and shape[0] == count and shape[1] >= 1 and shape[2] == ACTION_SIZE
+    if given is None or not fits or given.dtype != np.float32:
+        seen = type(chunks).__name__ if given is None else f"ndarray of shape {shape} and {given.dtype}"
         raise PolicyFailedError(
-            f"the policy gave a {type(chunks).__name__} of shape {shape} for {count} observations; expected an "
-            f"array ({count}, chunk, {ACTION_SIZE}) of actions"
+            f"the policy gave a {seen} for {count} observations; expected a numpy array "
+            f"({count}, chunk, {ACTION_SIZE}) of float32 actions"
         )
+
+
+def _own_flags(flagged: object, count: int) -> NDArray[np.bool_] | None:
+    """(count,): a copy of what a policy flags in its last call. Raises PolicyFailedError for anything else."""
+    if flagged is None:
+        return None
+    if not isinstance(flagged, np.ndarray) or flagged.shape != (count,) or flagged.dtype != np.bool_:
+        raise PolicyFailedError(
+            f"the policy's `flagged` is {str(flagged)[:80]!r} for {count} observations; expected a bool array "
+            f"({count},), or None"
+        )
+    return flagged.copy()

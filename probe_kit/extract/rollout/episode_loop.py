@@ -187,13 +187,13 @@ class Play:
         try:
             turns = [seat.turn() for seat in due]
             chunks = self._controller.act(turns)
+            for seat, turn in zip(due, turns, strict=True):
+                if turn.call == 0:
+                    seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
         except EPISODE_ERRORS as error:
             for seat in due:
                 yield self._give_up(seat, error)
             return
-        for seat, turn in zip(due, turns, strict=True):
-            if turn.call == 0:
-                seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
         flags = self._controller.flagged
         for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
             if self._controller.listens:

@@ -9,6 +9,7 @@ from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
 from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.containment import copied
 
 
 class _Chair:
@@ -65,12 +66,13 @@ class Asking:
                 yield self._give_up(chair, chair.planned, error)
                 continue
             assert isinstance(seen, Seen)
-            due.append((chair, AskTurn(chair.planned, seen.observation, chair.buffers), seen))
+            due.append((chair, AskTurn(chair.planned, copied([seen.observation])[0], chair.buffers), seen))
         if not due:
             return
         try:
-            with acting(self._controller.identity["model"], self._controller.reader.card.checkpoint):
-                outcomes = self._controller.ask([turn for _, turn, _ in due])
+            controller = self._controller
+            with acting(controller.identity["model"], controller.reader.card.checkpoint, controller.limit):
+                outcomes = controller.ask([turn for _, turn, _ in due])
         except EPISODE_ERRORS as error:
             for chair, turn, _ in due:
                 yield self._give_up(chair, turn.planned, error)

@@ -43,7 +43,7 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
         with aside.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         aside.rename(out)
-    out.with_name(f"{out.name}.sha256").write_text(f"{digest}  {out.name}\n")
+    out.with_name(f"{out.name}.sha256").write_text(f"{digest}  {out.name}\n", encoding="utf-8")
     return out
 
 

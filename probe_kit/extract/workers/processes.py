@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
+from signal import SIGALRM
 
 from probe_kit._system.child_process import Child
 from probe_kit.errors import ProbeKitError, WorkerDiedError
@@ -44,6 +45,7 @@ class _Hand:
 
     def __init__(self, slot: int, settings: RunSettings, run: str) -> None:
         self.slot, self._settings, self._run = slot, settings, run
+        self.limit = settings.inference_limit
         self.start()
 
     def start(self) -> None:
@@ -94,10 +96,17 @@ def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) 
             f"worker {hand.slot} ended with code {code} before its first episode; its last words are above. Try "
             "fewer --workers, or none to see the error in this process"
         )
-    tell_lost(f"worker {hand.slot} ended with code {code}", len(scheduler.holds(hand.slot)))
-    for event in scheduler.lose(hand.slot, f"the worker playing it ended with code {code}"):
+    why = _why(code, hand.limit)
+    tell_lost(f"worker {hand.slot} {why}", len(scheduler.holds(hand.slot)))
+    for event in scheduler.lose(hand.slot, f"the worker playing it {why}"):
         heard(event)
     hand.start()
+
+
+def _why(code: int, limit: float | None) -> str:
+    if limit is not None and code == -SIGALRM:
+        return f"was ended, because a call of its model took longer than --inference-limit {limit:g} s"
+    return f"ended with code {code}"
 
 
 def _environment(slot: int, settings: RunSettings) -> dict[str, str]:

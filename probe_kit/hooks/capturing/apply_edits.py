@@ -94,7 +94,7 @@ def _change(
     """A function from (B, T, D) to the edited copy, which notes in the ledger what it did."""
 
     def change(activation: Tensor) -> Tensor:
-        where = torch.from_numpy(mask).to(activation.device)
+        where = torch.tensor(mask, device=activation.device)
         before = activation.float()
         after = torch.where(where[..., None], _target(own, site, before, vector), before)
         moved, norm = (after - before).norm(dim=-1)[where], before.norm(dim=-1)[where]
@@ -112,7 +112,7 @@ def _target(own: Edit, site: Site, before: Tensor, vector: NDArray[np.float32] |
     fitting = before.shape[1:] if own.kind == "replace" else before.shape[2:]
     if vector.shape != tuple(fitting):
         raise UsageError(f"the vector of the edit of {site} has shape {vector.shape}; expected {tuple(fitting)}")
-    other = torch.from_numpy(vector).to(before.device)
+    other = torch.tensor(vector, device=before.device)
     if own.kind == "add":
         return before + own.strength * other
     if own.kind == "replace":

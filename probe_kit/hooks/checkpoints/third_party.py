@@ -3,12 +3,14 @@
 What is wrong with a checkpoint says whose it is and where it lies, wherever in the loading or acting it was found.
 """
 
+import logging
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
+from probe_kit.hooks.containment import contained
 
 _LONGEST = 300
 
@@ -39,21 +41,24 @@ def whose(reason: str, model: str, place: str) -> str:
 
 
 @contextmanager
-def acting(model: str, place: str) -> Iterator[None]:
+def acting(model: str, place: str, limit: float | None = None) -> Iterator[None]:
     """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
 
-    place: where its checkpoint lies, for what is found out about it this late.
+    place: where its checkpoint lies, for what is found out about it this late. limit: as `contained` has it.
     """
-    try:
-        with of_checkpoint(model, place):
-            yield
-    except ProbeKitError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise PolicyFailedError(
-            f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error of "
-            f"probe_kit; mend it, or what it read from {place}. Then the same command continues"
-        ) from error
+    with contained(limit) as interruptions:
+        try:
+            with of_checkpoint(model, place):
+                yield
+        except ProbeKitError:
+            raise
+        except BaseException as error:  # some of these end a process, and are the policy's own here
+            if isinstance(error, KeyboardInterrupt) and interruptions.asked:
+                raise
+            raise PolicyFailedError(
+                f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error "
+                f"of probe_kit; mend it, or what it read from {place}. Then the same command continues"
+            ) from error
 
 
 @contextmanager
@@ -63,7 +68,7 @@ def loading(model: str, place: str) -> Iterator[None]:
     A loader that ends the process raises PolicyFailedError.
     """
     try:
-        with of_checkpoint(model, place):
+        with _said_when_asked_for("bitsandbytes"), of_checkpoint(model, place):
             yield
     except ProbeKitError:
         raise
@@ -74,6 +79,18 @@ def loading(model: str, place: str) -> Iterator[None]:
             f"{model} cannot be loaded from {place}: {in_words(error)}. A file of the checkpoint is damaged, or "
             "was made for another version; download it again"
         ) from error
+
+
+@contextmanager
+def _said_when_asked_for(library: str) -> Iterator[None]:
+    """No warnings of a library that others import wherever it is installed; who asks for it gets its errors."""
+    logger = logging.getLogger(library)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def in_words(error: BaseException) -> str:

@@ -117,7 +117,7 @@ class ReplacedAlong:
         import torch
 
         apart = Replaced(self.donor, self.tokens)(site, own, where) - own
-        directions = torch.from_numpy(self.basis).to(own.device)
+        directions = torch.tensor(self.basis, device=own.device)
         found: Tensor = own + (apart @ directions.T) @ directions
         return found
 
@@ -133,7 +133,7 @@ class Moved:
         import torch
 
         del site, where
-        found: Tensor = own + torch.from_numpy(self.vector).to(own.device)
+        found: Tensor = own + torch.tensor(self.vector, device=own.device)
         return found
 
 

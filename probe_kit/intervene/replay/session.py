@@ -25,6 +25,7 @@ from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.containment import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.counterparts import twins_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
@@ -172,7 +173,7 @@ class Bench:
     def act(self, seen: Observation, seed: int) -> Chunk:
         """(chunk, 7): one inference, alone in its batch. Raises PolicyFailedError for what the policy raises."""
         with acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
+            return np.asarray(self.policy.act(copied([seen]), [seed])[0], np.float32)
 
     def apart(self, question: Question, chunk: Chunk) -> float:
         """By how much a plain inference differs from what the run carried out; NaN where it does not say.

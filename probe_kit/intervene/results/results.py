@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.kinds.attention.attention_mass import Weighed
 from probe_kit.intervene.kinds.closed_loop.effects import CarriedOut, carried_out
@@ -231,8 +232,11 @@ class Effects:
         return json.dumps(content, indent=2, ensure_ascii=False)
 
     def to_csv(self) -> str:
-        """The table as comma-separated values with a header."""
-        return self.table.to_csv(index=False)
+        """The table as comma-separated values with a header.
+
+        A text that a spreadsheet would compute has a `'` in front.
+        """
+        return csv_of_frame(self.table)
 
     def to_rich(self) -> "FittingTable":
         """The table for a console."""
@@ -308,18 +312,18 @@ def effects_csv(
     further: what else is stored, by the file's name.
     """
     if WEIGHED in further:
-        return Weighed.from_bytes(further[WEIGHED]).frame().to_csv(index=False)
+        return csv_of_frame(Weighed.from_bytes(further[WEIGHED]).frame())
     if kind == ERASE:
         # What probes read stands in the certificate.
         frame = frame_of(erased(answers, suite))
-        return frame.drop(columns=["key", "readable_before", "readable"]).to_csv(index=False)
+        return csv_of_frame(frame.drop(columns=["key", "readable_before", "readable"]))
     if answers.outcomes is not None:
-        return frame_of(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
+        return csv_of_frame(frame_of(carried_out(answers, suite)).drop(columns="key"))
     if {PICTURES, NOISE} <= set(answers.conditions):
-        return words_frame(answers, suite).drop(columns="key").to_csv(index=False)
+        return csv_of_frame(words_frame(answers, suite).drop(columns="key"))
     changes = passing(answers, suite, toward)
     frame = frame_of(changes) if changes else frame_of(following(answers, suite))
-    return frame.drop(columns="key").to_csv(index=False)
+    return csv_of_frame(frame.drop(columns="key"))
 
 
 def words_frame(answers: Answers, suite: str, key: str = "") -> "pd.DataFrame":

@@ -73,7 +73,7 @@ def write_checkpoint(
     """
     folder.mkdir(parents=True, exist_ok=True)
     policy.config.save_pretrained(folder)
-    (folder / "dims.json").write_text(json.dumps(SIZE.to_json(), indent=1))
+    (folder / "dims.json").write_text(json.dumps(SIZE.to_json(), indent=1), encoding="utf-8")
     write_tokenizer(folder, TEXT_TOKENS)
     _write_statistics(folder, statistics)
     save_file(
@@ -122,7 +122,9 @@ def _write_statistics(folder: Path, statistics: Statistics) -> None:
             "state_file": state_file,
         }
         steps = [_window(), entry] if pipeline == "policy_preprocessor" else [entry]
-        (folder / f"{pipeline}.json").write_text(json.dumps({"name": pipeline, "steps": steps}, indent=1))
+        (folder / f"{pipeline}.json").write_text(
+            json.dumps({"name": pipeline, "steps": steps}, indent=1), encoding="utf-8"
+        )
 
 
 def _window() -> dict[str, Any]:

@@ -36,8 +36,8 @@ def write_vlm_tiny(folder: Path, network: Any, note: str) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     network.config.save_pretrained(folder)
-    (folder / "generation_config.json").write_text(json.dumps({"eos_token_id": END}, indent=1))
-    (folder / "preprocessor_config.json").write_text(json.dumps(_pictures(), indent=1))
+    (folder / "generation_config.json").write_text(json.dumps({"eos_token_id": END}, indent=1), encoding="utf-8")
+    (folder / "preprocessor_config.json").write_text(json.dumps(_pictures(), indent=1), encoding="utf-8")
     write_tokenizer(folder, MOST_TOKENS)
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     del tensors["lm_head.weight"]  # tied

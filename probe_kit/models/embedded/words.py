@@ -39,4 +39,4 @@ def write_tokenizer(folder: Path, most: int) -> None:
     tokenizer.save(str(folder / "tokenizer.json"))
     card = {"tokenizer_class": "PreTrainedTokenizerFast", "model_max_length": most}
     tokens = {f"{name}_token": f"<{name}>" for name in ("pad", "eos", "bos", "unk")}
-    (folder / "tokenizer_config.json").write_text(json.dumps(card | tokens, indent=1))
+    (folder / "tokenizer_config.json").write_text(json.dumps(card | tokens, indent=1), encoding="utf-8")

@@ -120,7 +120,7 @@ def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     try:
         values = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
     except (json.JSONDecodeError, yaml.YAMLError) as error:

@@ -55,7 +55,7 @@ class Pi0Size:
     @classmethod
     def from_file(cls, path: Path) -> "Pi0Size":
         """Read `dims.json`. Raises CheckpointError if a dimension is missing or unknown."""
-        values = json.loads(path.read_text())
+        values = json.loads(path.read_text(encoding="utf-8"))
         try:
             return cls(
                 GemmaSize(**values["vlm"]),

@@ -57,7 +57,7 @@ class PictureSettings:
         """
         for name, part in (("preprocessor_config.json", None), ("action_config.json", "preprocessor")):
             if (folder / name).is_file():
-                values = json.loads((folder / name).read_text())
+                values = json.loads((folder / name).read_text(encoding="utf-8"))
                 return cls.from_json(values if part is None else values.get(part, {}), str(folder / name))
         return cls(vision.base, vision.crops)
 

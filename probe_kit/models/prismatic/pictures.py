@@ -49,7 +49,7 @@ class PictureSettings:
 
     @classmethod
     def _from_file(cls, file: Path) -> "PictureSettings":
-        values = json.loads(file.read_text())
+        values = json.loads(file.read_text(encoding="utf-8"))
         return cls(
             values["image_resize_strategy"],
             tuple(int(size[-1]) for size in values["input_sizes"]),

@@ -49,7 +49,7 @@ class QwenPictures:
                 f"{file} is missing: without it nobody knows how large this checkpoint's pictures are. "
                 "It comes with the checkpoint, or with the vision-language model it was made of"
             )
-        values = json.loads(file.read_text())
+        values = json.loads(file.read_text(encoding="utf-8"))
         if missing := [name for name in _NEEDED if name not in values]:
             raise CheckpointError(f"{file} lacks {', '.join(missing)}")
         found = tuple(int(values[name]) for name in _NEEDED[:3])

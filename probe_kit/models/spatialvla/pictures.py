@@ -38,7 +38,7 @@ class PictureSettings:
         Raises CheckpointError for what contradicts the model or is not known here.
         """
         file = folder / PREPROCESSOR_FILE
-        values = json.loads(file.read_text()) if file.is_file() else None
+        values = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
         settings = cls(config.side) if values is None else cls._from_json(values, config.side)
         if settings.side != config.side:
             raise CheckpointError(

@@ -47,7 +47,7 @@ class XiaomiConfig:
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a Xiaomi-Robotics-R0 checkpoint")
-        return cls.from_json(json.loads(file.read_text()), str(file))
+        return cls.from_json(json.loads(file.read_text(encoding="utf-8")), str(file))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "XiaomiConfig":

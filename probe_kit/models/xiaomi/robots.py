@@ -52,7 +52,9 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     Raises CheckpointError where there are none or they do not fit, UsageError for an unknown robot.
     """
     file = folder / STATISTICS_FILE
-    known: Mapping[str, Any] = (json.loads(file.read_text()) if file.is_file() else {}).get("action_config") or {}
+    known: Mapping[str, Any] = (json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}).get(
+        "action_config"
+    ) or {}
     if not known:
         raise CheckpointError(
             f"{file} has no action_config: the actions have no physical unit and no length. "

@@ -144,7 +144,7 @@ def _render(places: tuple[str, ...], **content: Any) -> str:
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
-    assets = {name: Markup((_HERE / f"page.{name}").read_text()) for name in ("css", "js")}
+    assets = {name: Markup((_HERE / f"page.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
     return environment.get_template("page.html.jinja").render(**assets, **content)
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import html
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import Any
 from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
+from probe_kit.csv_text import csv_of_rows, rows_of_csv
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
@@ -53,7 +53,7 @@ def read_curation(path: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         raise SuiteError(f"curation file {path} not found. Make one with emit_curation (--emit-curation).")
     text = path.read_text(encoding="utf-8")
-    rows = _from_csv(text) if path.suffix == ".csv" else _from_lines(text, path)
+    rows = _from_csv(text, path) if path.suffix == ".csv" else _from_lines(text, path)
     for number, row in enumerate(rows, start=1):
         missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
         if missing:
@@ -151,15 +151,14 @@ def _previews(proposal: Proposal, folder: Path, render: Render) -> tuple[str, st
 
 
 def _to_csv(rows: Sequence[Row]) -> str:
-    buffer = io.StringIO()
-    table = csv.DictWriter(buffer, COLUMNS, lineterminator="\n")
-    table.writeheader()
-    table.writerows({**row, "llm": json.dumps(row["llm"])} for row in rows)
-    return buffer.getvalue()
+    return csv_of_rows(COLUMNS, ({**row, "llm": json.dumps(row["llm"])} for row in rows))
 
 
-def _from_csv(text: str) -> list[dict[str, Any]]:
-    return [dict(row) for row in csv.DictReader(io.StringIO(text))]
+def _from_csv(text: str, path: Path) -> list[dict[str, Any]]:
+    try:
+        return rows_of_csv(text)
+    except csv.Error as problem:
+        raise SuiteError(f"{path}: not valid CSV ({problem}). Restore the file.") from problem
 
 
 def _from_lines(text: str, path: Path) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from unicodedata import normalize
 
 from PIL import Image
 
@@ -105,7 +106,8 @@ def own_item(
         "gen": {},
         **vars(terms),
     }
-    return Item.from_json(record, Path())
+    composed = {name: normalize("NFC", one) if isinstance(one, str) else one for name, one in record.items()}
+    return Item.from_json(composed, Path())
 
 
 def _source(origin: Origin) -> Mapping[str, str]:

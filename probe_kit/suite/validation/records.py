@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
+from math import isfinite
 from typing import Any
+from unicodedata import is_normalized
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._terminal.plain_text import visible
@@ -41,7 +43,15 @@ def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
         return error("E01", where, f"not valid JSON ({problem})")
     if not isinstance(record, dict):
         return error("E01", where, f"a JSON {type(record).__name__}; expected an object")
+    if not _is_finite(record):
+        return error("E01", where, "a number in it is NaN or infinite, or too large to be told from that")
     return record
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, dict | list):
+        return all(map(_is_finite, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, float) or isfinite(value)
 
 
 def check_card(card: dict[str, Any]) -> Iterator[Finding]:
@@ -88,13 +98,16 @@ def _check_wordings(wordings: object, where: str) -> Iterator[Finding]:
 
 
 def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
-    """E02: no text is endless, and none holds what a terminal would obey."""
+    """E02: no text is endless, holds what a terminal would obey, or looks like another that is other bytes."""
     longest = LONGEST_NAME if name in _NAMES else LONGEST_FIELD
     if len(text.encode(errors="replace")) > longest:
         yield error("E02", where, f"field {name!r} has {len(text)} characters; expected at most {longest}")
     elif visible(text) != text or (name in _NAMES and not text.isprintable()):
         shown = visible(text[:80])
         yield error("E02", where, f"field {name!r} holds characters that cannot be printed ({shown!r})")
+    elif not is_normalized("NFC", text):
+        advice = "write it in Unicode's form NFC, which looks the same and is other bytes to a model"
+        yield error("E02", where, f"field {name!r} is {text[:80]!r} in decomposed characters; {advice}")
 
 
 def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from probe_kit.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
@@ -68,7 +69,7 @@ def _header(results: ProbeResults, asked: bool) -> dict[str, Any]:
 
 
 def _scores(results: ProbeResults) -> bytes:
-    return results.scores.to_csv(index=False).encode()
+    return csv_of_frame(results.scores).encode()
 
 
 def _decisions(results: ProbeResults) -> bytes:

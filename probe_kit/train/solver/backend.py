@@ -1,13 +1,16 @@
 """Arrays of numpy or torch: the linear algebra is written once, in the names that both share."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import MissingExtraError, UsageError
+
+if TYPE_CHECKING:
+    import torch
 
 Array = Any
 """A numpy array, or a torch tensor on any device."""
@@ -18,18 +21,19 @@ def namespace(array: Array) -> Any:
     return import_module(type(array).__module__.partition(".")[0])
 
 
-def to_device(array: NDArray[Any], device: str | None) -> Array:
+def to_device(array: NDArray[Any], device: "str | torch.device | None") -> Array:
     """`array` as a torch tensor on `device`, or as it is without one."""
     if device is None:
         return array
     import torch
 
-    return torch.as_tensor(array, device=device)
+    # Of an array of a run, or out of Ray's memory, which may not be written to, `as_tensor` warns.
+    return torch.as_tensor(array if array.flags.writeable else array.copy(), device=device)
 
 
 def to_device_of(like: Array, array: NDArray[Any]) -> Array:
     """`array` where `like` is, and made by the same module."""
-    return array if isinstance(like, np.ndarray) else namespace(like).as_tensor(array, device=like.device)
+    return array if isinstance(like, np.ndarray) else to_device(array, like.device)
 
 
 def to_numpy(array: Array) -> NDArray[Any]:

@@ -42,7 +42,10 @@ def test_making_an_environment_loads_neither_the_simulator_nor_torch():
         "print({'pybullet', 'torch', 'lerobot'} & set(sys.modules))"
     )
     root = Path(__file__).parents[3]
-    assert run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root).stdout.strip() == "set()"
+    assert (
+        run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", cwd=root).stdout.strip()
+        == "set()"
+    )
 
 
 def test_pictures_arrive_as_arrays():
@@ -62,7 +65,8 @@ def test_the_simulator_starts_in_silence_on_both_streams():
 
 def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
     (tmp_path / "pybullet.py").write_text(
-        "import os, sys\nos.write(2, b'pybullet build time: today\\nby C\\n')\nsys.stderr.write('by Python\\n')\n"
+        "import os, sys\nos.write(2, b'pybullet build time: today\\nby C\\n')\nsys.stderr.write('by Python\\n')\n",
+        encoding="utf-8",
     )
     code = "from probe_kit.env.simulation.bullet import import_pybullet as load; load(); load()"
     done = run([sys.executable, "-c", code], capture_output=True, check=True, env={"PYTHONPATH": str(tmp_path)})
@@ -80,4 +84,4 @@ def test_it_can_be_imported_by_a_process_without_stderr():
 def test_pybullet_is_imported_in_one_place():
     package = Path(__file__).parents[3] / "probe_kit"
     importing = re.compile(r"^\s*(import pybullet\b|from pybullet\b)", re.MULTILINE)
-    assert [path for path in package.rglob("*.py") if importing.search(path.read_text())] == []
+    assert [path for path in package.rglob("*.py") if importing.search(path.read_text(encoding="utf-8"))] == []

@@ -15,7 +15,7 @@ def client():
 
 def test_the_quad_is_a_square_of_the_given_side(tmp_path):
     write_quad(tmp_path / "quad.obj", 0.11)
-    lines = (tmp_path / "quad.obj").read_text().splitlines()
+    lines = (tmp_path / "quad.obj").read_text(encoding="utf-8").splitlines()
     corners = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.11, 0.11, 0.0])
 

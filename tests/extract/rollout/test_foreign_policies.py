@@ -50,7 +50,7 @@ def fall(_: Any) -> Any:
         (lambda chunks: chunks * np.nan, r"ActionError: action .* is not finite \(NaN or infinity\)"),
         (lambda chunks: chunks[:, :, :6], r"PolicyFailedError: the policy gave a ndarray of shape \(1, \d+, 6\)"),
         (lambda chunks: chunks[0], "PolicyFailedError: the policy gave a ndarray of shape"),
-        (lambda _: None, "PolicyFailedError: the policy gave a NoneType of shape"),
+        (lambda _: None, "PolicyFailedError: the policy gave a NoneType for 1 observations"),
     ],
     ids=["exit", "error", "NaN", "too short", "no batch", "None"],
 )

@@ -42,7 +42,7 @@ def test_parquet_holds_a_row_per_vector(recorded_run: Run, tmp_path: Path) -> No
 
 def test_the_checksum_beside_the_file_is_that_of_the_file(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(recorded_run.path, "safetensors", tmp_path / "run.safetensors")
-    digest, name = (tmp_path / "run.safetensors.sha256").read_text().split()
+    digest, name = (tmp_path / "run.safetensors.sha256").read_text(encoding="utf-8").split()
     assert (digest, name) == (hashlib.sha256(out.read_bytes()).hexdigest(), out.name)
 
 
@@ -60,7 +60,7 @@ def test_damage_stops_the_export_and_leaves_no_file(recorded_run: Run, tmp_path:
 def test_unknown_formats_and_existing_files_are_refused(recorded_run: Run, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="parquet"):
         export_run(recorded_run.path, "csv", tmp_path / "run.csv")
-    (tmp_path / "there").write_text("mine")
+    (tmp_path / "there").write_text("mine", encoding="utf-8")
     with pytest.raises(UsageError, match="exists"):
         export_run(recorded_run.path, "safetensors", tmp_path / "there")
 

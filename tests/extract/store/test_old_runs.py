@@ -24,7 +24,7 @@ from probe_kit.suite import Suite
 from probe_kit.train.results.inventory import inventory
 
 STORED = Path(__file__).parents[2] / "golden" / "run-schema-1"
-EXPECTED: dict[str, dict[str, Any]] = json.loads((STORED / "expected.json").read_text())
+EXPECTED: dict[str, dict[str, Any]] = json.loads((STORED / "expected.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")

@@ -138,7 +138,7 @@ class Extraction(RuleBasedStateMachine):
         with patch(f"probe_kit.extract.store.writer.{where}", die), pytest.raises(KilledError):
             self.writer.write(rollout(self.plan, number, self.calls).record)
         (self.folder / "run" / "commits").mkdir(exist_ok=True)
-        (self.folder / "run" / "commits" / f"left{number}.tmp").write_text("half a commit")
+        (self.folder / "run" / "commits" / f"left{number}.tmp").write_text("half a commit", encoding="utf-8")
         self.resume()
 
     @rule()

@@ -44,12 +44,12 @@ def test_which_prompts_take_letters_and_which_take_no() -> None:
 
 def test_a_file_is_a_prompt_of_its_own_name(tmp_path: Path) -> None:
     file = tmp_path / "my prompt.txt"
-    file.write_text("Where is the {object}?\n(A) {A}\n(B) {B}\n")
+    file.write_text("Where is the {object}?\n(A) {A}\n(B) {B}\n", encoding="utf-8")
     mine = find_template(str(file))
     assert mine.name == "my-prompt"
     assert mine.lettered
     assert mine.render(RED, "swapped") == "Where is the red shape?\n(A) right\n(B) left"
-    file.write_text("Where is {object}, on the left or on the right?")
+    file.write_text("Where is {object}, on the left or on the right?", encoding="utf-8")
     free = find_template(str(file))
     assert (free.lettered, free.orders) == (False, ("original",))
     assert free.sha256 != mine.sha256

@@ -1,5 +1,6 @@
 """Errors out of code of others, and of checkpoints, say whose they are."""
 
+import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -65,3 +66,13 @@ def test_errors_of_others_and_an_end_of_the_process_are_named() -> None:
         raise SystemExit(3)
     with pytest.raises(PolicyFailedError, match=r"pi0 failed while it acted: KeyError"), acting("pi0", "/x"):
         raise KeyError("a")
+
+
+def test_a_library_that_is_only_there_does_not_speak_while_a_model_loads(caplog: pytest.LogCaptureFixture) -> None:
+    """Libraries import bitsandbytes wherever it is installed, and it complains where there is no GPU."""
+    theirs = logging.getLogger("bitsandbytes.cextension")
+    with loading("pi0", "/x"):
+        theirs.warning("compiled without GPU support")
+        theirs.error("broken")
+    theirs.warning("afterwards")
+    assert [record.message for record in caplog.records] == ["broken", "afterwards"]

@@ -84,9 +84,9 @@ def test_a_missing_shard_is_named(checkpoint: Path) -> None:
 
 def test_an_index_that_contradicts_its_shards_is_refused(checkpoint: Path) -> None:
     shard(checkpoint)
-    index = json.loads((checkpoint / INDEX_FILE).read_text())
+    index = json.loads((checkpoint / INDEX_FILE).read_text(encoding="utf-8"))
     del index["weight_map"][NAME]
-    (checkpoint / INDEX_FILE).write_text(json.dumps(index))
+    (checkpoint / INDEX_FILE).write_text(json.dumps(index), encoding="utf-8")
     with pytest.raises(WeightsError, match=f"disagree about {NAME}"):
         load_pi0(str(checkpoint))
 
@@ -115,7 +115,7 @@ def shard(checkpoint: Path) -> None:
     for file, half in halves.items():
         save_file({name: tensors[name] for name in half}, checkpoint / file, metadata=RANDOM)
     weight_map = {name: file for file, half in halves.items() for name in half}
-    (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": weight_map}))
+    (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": weight_map}), encoding="utf-8")
     (checkpoint / SINGLE_FILE).unlink()
 
 

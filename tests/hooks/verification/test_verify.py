@@ -83,7 +83,7 @@ def test_a_key_of_another_shape_is_named(reference: tuple[str, Path], tmp_path: 
     family, folder = reference
     recorded = json.loads(gzip.decompress((folder / "real_keys.json.gz").read_bytes()))
     recorded["keys"]["model.state_proj.bias"]["shape"] = [7]
-    (tmp_path / "keys.json").write_text(json.dumps(recorded))
+    (tmp_path / "keys.json").write_text(json.dumps(recorded), encoding="utf-8")
     verification = verify_keys(family, tmp_path / "keys.json")
     assert not verification.passed
     assert "model.state_proj.bias" in verification.comparisons[0].note

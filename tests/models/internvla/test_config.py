@@ -61,13 +61,13 @@ def test_what_does_not_fit_is_refused(field: str, change: Any, said: str) -> Non
 def test_the_files_are_found_beside_the_weights_or_one_folder_up(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"config\.yaml is missing"):
         find_config(tmp_path / "checkpoints")
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(run_values()))
-    (tmp_path / "dims.json").write_text(json.dumps(dims_values()))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(run_values()), encoding="utf-8")
+    (tmp_path / "dims.json").write_text(json.dumps(dims_values()), encoding="utf-8")
     for folder in (tmp_path, tmp_path / "checkpoints"):
         values, place = find_config(folder)
         assert place == tmp_path
         assert values["qformer_heads"] == 4
         assert values["framework"]["layer_qformer"]["num_query_tokens"] == 6
-    (tmp_path / "config.yaml").write_text("a: [")
+    (tmp_path / "config.yaml").write_text("a: [", encoding="utf-8")
     with pytest.raises(CheckpointError, match="cannot be read"):
         find_config(tmp_path)

@@ -56,7 +56,7 @@ def test_another_model_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         MagmaConfig.from_json(config_values(model_type="llava"))
     with pytest.raises(CheckpointError, match=r"config\.json is missing"):
         MagmaConfig.from_folder(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"model_type": "magma"}))
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "magma"}), encoding="utf-8")
     with pytest.raises(CheckpointError, match="vision_config"):
         MagmaConfig.from_folder(tmp_path)
 

@@ -66,9 +66,9 @@ def test_the_checkpoints_own_processor_wins_over_its_configuration(tmp_path: Pat
     vision = MagmaConfig.from_json(config_values()).vision
     assert PictureSettings.of(vision, tmp_path) == SETTINGS
     file = tmp_path / "preprocessor_config.json"
-    file.write_text(json.dumps({"base_img_size": 96, "num_crops": 2, "image_mean": [0, 0.5, 1]}))
+    file.write_text(json.dumps({"base_img_size": 96, "num_crops": 2, "image_mean": [0, 0.5, 1]}), encoding="utf-8")
     found = PictureSettings.of(vision, tmp_path)
     assert (found.base, found.crops, found.mean, found.deviation) == (96, 2, (0, 0.5, 1), SETTINGS.deviation)
-    file.write_text(json.dumps({"num_crops": 2}))
+    file.write_text(json.dumps({"num_crops": 2}), encoding="utf-8")
     with pytest.raises(CheckpointError, match="base_img_size"):
         PictureSettings.of(vision, tmp_path)

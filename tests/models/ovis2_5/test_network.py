@@ -14,7 +14,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> OvisNetwork:
     from probe_kit.models.initialisation import initialise
 
     folder: Path = write_ovis2_5(tmp_path_factory.mktemp("ovis"))
-    values = json.loads((folder / "config.json").read_text())
+    values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     built = build_ovis2_5(OvisConfig.from_values(values), torch.float32, "cpu")
     initialise(built, 2)
     return built.requires_grad_(False)

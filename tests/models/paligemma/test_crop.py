@@ -17,7 +17,7 @@ PICTURE = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
 
 
 def pictures(folder: Path, **settings: object) -> SquarePictures:
-    (folder / "preprocessor_config.json").write_text(json.dumps(SETTINGS | settings))
+    (folder / "preprocessor_config.json").write_text(json.dumps(SETTINGS | settings), encoding="utf-8")
     return SquarePictures.from_folder(folder, 32)
 
 

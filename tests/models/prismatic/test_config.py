@@ -69,5 +69,5 @@ def test_a_folder_without_a_config_is_refused(tmp_path: Path) -> None:
 
 
 def test_what_was_trained_in_is_read_from_the_file(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text(json.dumps(config_values(torch_dtype="bfloat16")))
+    (tmp_path / "config.json").write_text(json.dumps(config_values(torch_dtype="bfloat16")), encoding="utf-8")
     assert PrismaticConfig.from_folder(tmp_path).dtype == "bfloat16"

@@ -59,7 +59,7 @@ def test_the_checkpoints_own_preprocessor_wins_over_the_table(tmp_path: Path) ->
         "stds": [[1, 1, 1], [2, 2, 2]],
         "interpolations": ["bicubic", "bilinear"],
     }
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(stored))
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(stored), encoding="utf-8")
     found = settings("letterbox", tmp_path)
     assert (found.strategy, found.resampling, found.means[1]) == (
         "resize-crop",
@@ -67,7 +67,7 @@ def test_the_checkpoints_own_preprocessor_wins_over_the_table(tmp_path: Path) ->
         (0.4, 0.5, 0.6),
     )
     stored["interpolations"] = ["bicubic", "hamming"]
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(stored))
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(stored), encoding="utf-8")
     with pytest.raises(CheckpointError, match="hamming"):
         settings("letterbox", tmp_path)
 

@@ -13,7 +13,9 @@ from tests.support.qwen_checkpoints import picture_settings
 
 
 def settings(folder: Path, patch: int = 16, **fields: Any) -> QwenPictures:
-    (folder / "preprocessor_config.json").write_text(json.dumps(picture_settings(patch, 4096, 65536, **fields)))
+    (folder / "preprocessor_config.json").write_text(
+        json.dumps(picture_settings(patch, 4096, 65536, **fields)), encoding="utf-8"
+    )
     return QwenPictures.from_folder(folder, patch, 2, 2)
 
 
@@ -80,7 +82,7 @@ def test_missing_numbers_are_named(tmp_path: Path) -> None:
         settings(tmp_path, size=None)
     content = picture_settings(16, 1, 2)
     del content["image_mean"]
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(content))
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError, match="image_mean"):
         QwenPictures.from_folder(tmp_path, 16, 2, 2)
 

@@ -113,8 +113,8 @@ def test_bins_of_another_checkpoint_are_refused() -> None:
 
 
 def test_the_originals_tables_are_reproduced_exactly(golden_spatialvla: Path) -> None:
-    values = json.loads((golden_spatialvla / "checkpoint" / "processor_config.json").read_text())
-    model = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text())
+    values = json.loads((golden_spatialvla / "checkpoint" / "processor_config.json").read_text(encoding="utf-8"))
+    model = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text(encoding="utf-8"))
     first, actions = model["action_token_begin_idx"], model["spatial_token_num"]
     own = ActionBins.of(values, first, actions, "golden")
     with np.load(golden_spatialvla / "reference.npz") as arrays:

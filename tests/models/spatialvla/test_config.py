@@ -24,7 +24,7 @@ def test_the_old_name_of_the_rotary_base_is_understood() -> None:
 
 
 def test_sizes_and_ids_come_from_the_file(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text(json.dumps(config_values(torch_dtype="bfloat16")))
+    (tmp_path / "config.json").write_text(json.dumps(config_values(torch_dtype="bfloat16")), encoding="utf-8")
     config = SpatialVLAConfig.from_folder(tmp_path)
     assert (config.image_token, config.first_action, config.actions) == (IMAGE, FIRST_ACTION, BINS["total"])
     assert (config.side, config.patches, config.points, config.frequencies) == (42, 9, 2, 3)

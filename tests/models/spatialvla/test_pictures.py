@@ -23,7 +23,7 @@ def picture(height: int, width: int) -> np.ndarray:
 
 
 def settings(folder: Path, **fields: Any) -> PictureSettings:
-    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessor_values(**fields)))
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessor_values(**fields)), encoding="utf-8")
     return PictureSettings.of(CONFIG, folder)
 
 

@@ -11,7 +11,7 @@ from tests.support.xiaomi_checkpoints import NUMBERS, action_config
 
 
 def write(folder: Path, content: dict[str, Any]) -> Path:
-    (folder / "preprocessor_config.json").write_text(json.dumps({"action_config": content}))
+    (folder / "preprocessor_config.json").write_text(json.dumps({"action_config": content}), encoding="utf-8")
     return folder
 
 

@@ -75,7 +75,7 @@ def test_the_limit_is_that_of_items_and_not_of_episodes() -> None:
 def test_baselines_are_stored_in_the_suite_without_changing_it(copied: Path) -> None:
     before = load_suite(copied).identity
     report = validate_suite(copied, baselines=True)
-    stored = json.loads((copied / "baselines.json").read_text())
+    stored = json.loads((copied / "baselines.json").read_text(encoding="utf-8"))
     assert load_suite(copied).identity == before == stored["suite"]
     assert len(stored["baselines"]) == len(report.baselines or ()) == 8
     assert stored["sides"]["color"] == {"left": 6, "right": 6}

@@ -37,7 +37,7 @@ def test_a_folder_without_a_suite_is_wrong_usage(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_card_is_a_finding_not_a_crash(copied: Path) -> None:
-    (copied / "suite.json").write_text("{")
+    (copied / "suite.json").write_text("{", encoding="utf-8")
     report = validate_suite(copied)
     assert not report.ok
     assert [finding.rule for finding in report.errors] == ["E01"]

@@ -36,7 +36,7 @@ def save(image: Image.Image, path: Path) -> None:
 
 def write_json(value: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value))
+    path.write_text(json.dumps(value), encoding="utf-8")
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def mmbench_root(tmp_path: Path) -> Path:
     rows.append(circular)
     rows.append(["9", "What is shown?", "", "cat", "dog", "", "", "A", "object_localization", "0", "x"])
     path = tmp_path / "MMBench_DEV_EN.tsv"
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, delimiter="\t").writerows([columns, *rows])
     return tmp_path
 

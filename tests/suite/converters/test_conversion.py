@@ -35,7 +35,7 @@ def test_a_converted_suite_is_valid_and_says_nobody_looked(compbench_root: Path,
 
 def test_every_stage_is_counted_beside_the_paper(vlthink_root: Path, tmp_path: Path) -> None:
     suite = convert("vl-think", vlthink_root, tmp_path / "suite", n=6)
-    stats = json.loads((suite.folder / "stats.json").read_text())
+    stats = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))
     assert stats["traffic"] == {
         "pool": 5,
         "rule_selected": 5,
@@ -74,7 +74,7 @@ def test_an_unknown_source_category_option_or_root_is_wrong_usage(vlthink_root: 
 
 def test_a_folder_in_use_is_refused(vlthink_root: Path, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    (tmp_path / "full" / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(SuiteError, match="holds no suite; expected a new folder"):
         convert("vl-think", vlthink_root, tmp_path / "full")
 

@@ -20,9 +20,9 @@ def review(compbench_root: Path, tmp_path: Path) -> Callable[[Callable[[Rows], N
     def run(change: Callable[[Rows], None]) -> Suite:
         path = tmp_path / "review.jsonl"
         convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         change(rows)
-        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         return convert("mllm-compbench", compbench_root, tmp_path / "reviewed", curation=path)
 
     return run
@@ -88,8 +88,8 @@ def test_accepting_a_question_without_wording_is_refused(
 def test_the_page_shows_every_pair(compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / "review.jsonl"
     convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
-    page = (tmp_path / "review.html").read_text()
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    page = (tmp_path / "review.html").read_text(encoding="utf-8")
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     for row in rows:
         assert row["left_preview"] in page
         assert (tmp_path / row["left_preview"]).is_file()
@@ -99,10 +99,10 @@ def test_the_page_shows_every_pair(compbench_root: Path, tmp_path: Path) -> None
 def test_a_spreadsheet_does_as_well(compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / "review.csv"
     convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     rows[0]["status"] = "accept"
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, rows[0].keys())
         table.writeheader()
         table.writerows(rows)
@@ -113,8 +113,8 @@ def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_r
     path = tmp_path / "review.jsonl"
     with pytest.raises(SuiteError, match="no item left to write"):
         convert("ok-vqa", okvqa_root, tmp_path / "suite", emit_curation=path)
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    path.write_text("".join(json.dumps(row | {"status": "accept"}) + "\n" for row in rows))
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    path.write_text("".join(json.dumps(row | {"status": "accept"}) + "\n" for row in rows), encoding="utf-8")
     suite = convert("ok-vqa", okvqa_root, tmp_path / "suite", curation=path)
     assert len(suite.items) == len(rows) == 6
 

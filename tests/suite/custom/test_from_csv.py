@@ -71,7 +71,7 @@ def made_again(pictures: Path) -> Suite:
         "Put the cube on the plum,purple.png,brown.png,",
     )
     table = pictures / "again.csv"
-    table.write_text("\n".join(("instruction,correct,wrong,group", *lines)))
+    table.write_text("\n".join(("instruction,correct,wrong,group", *lines)), encoding="utf-8")
     return suite_from_csv(table, pictures / "again", category="b", terms=TERMS)
 
 
@@ -131,7 +131,7 @@ def test_a_question_that_breaks_a_rule_writes_nothing(line: str, message: str, p
 
 def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) -> None:
     table = pictures / "fruit.csv"
-    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n")
+    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n", encoding="utf-8")
     arguments = ["from-csv", str(table), "--out", str(pictures / "suite"), "--license", "CC0-1.0"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
@@ -141,7 +141,7 @@ def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) ->
 
 def test_the_command_says_what_a_licence_is_for_when_there_is_none(pictures: Path) -> None:
     table = pictures / "fruit.csv"
-    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n")
+    table.write_text("instruction,correct,wrong\nPut the cube on the lime,green.png,red.png\n", encoding="utf-8")
     result = CliRunner().invoke(app, ["from-csv", str(table), "--out", str(pictures / "suite")])
     assert result.exit_code != 0
     assert isinstance(result.exception, UsageError)

@@ -311,11 +311,11 @@ def test_every_icon_is_in_the_sheets_that_are_shipped() -> None:
 
 
 def test_art_comes_with_its_licences_and_checksums() -> None:
-    notice = (ART / "NOTICE.md").read_text()
+    notice = (ART / "NOTICE.md").read_text(encoding="utf-8")
     for sheet in ("fluent.png", "material.png"):
         assert hashlib.sha256((ART / sheet).read_bytes()).hexdigest() in notice
-    assert "Microsoft Corporation" in (ART / "LICENSE-fluent.txt").read_text()
-    assert "Apache License" in (ART / "LICENSE-material.txt").read_text()
+    assert "Microsoft Corporation" in (ART / "LICENSE-fluent.txt").read_text(encoding="utf-8")
+    assert "Apache License" in (ART / "LICENSE-material.txt").read_text(encoding="utf-8")
 
 
 # -- all pictures ------------------------------------------------------------------------------------

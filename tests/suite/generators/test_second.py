@@ -76,7 +76,7 @@ def test_the_version_is_part_of_the_identity_and_both_are_built_again_equal(tmp_
         for name, version in (("one", 1), ("two", 2), ("again", 2))
     )
     assert (one.identity.split("#")[0], two.identity.split("#")[0]) == ("a2a-embedded@1.0.0", "a2a-embedded@2.0.0")
-    assert json.loads((two.folder / "suite.json").read_text())["version"] == "2.0.0"
+    assert json.loads((two.folder / "suite.json").read_text(encoding="utf-8"))["version"] == "2.0.0"
     assert two.content_sha256 == again.content_sha256 != one.content_sha256
     assert not {item.item_id for item in one.items} & {item.item_id for item in two.items}
     assert sha256_text(str([item.instruction for item in one.items])) == sha256_text(

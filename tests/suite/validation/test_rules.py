@@ -162,7 +162,7 @@ def test_json_that_is_none_is_a_finding(edit_records: EditRecords, name: str, co
 def test_a_picture_that_fills_all_memory_once_decoded_is_refused(edit_records: EditRecords) -> None:
     bomb = png_bomb(12_000)
     folder = edit_records(set_field("left_sha256", sha256(bomb).hexdigest()))
-    record = json.loads((folder / "items/metadata.jsonl").read_text().splitlines()[0])
+    record = json.loads((folder / "items/metadata.jsonl").read_text(encoding="utf-8").splitlines()[0])
     (folder / "items" / record["left_file_name"]).write_bytes(bomb)
     with pytest.raises(SuiteError, match=r"E07 item .*left picture is 12000×12000; at most 8192 are read"):
         load_suite(folder)

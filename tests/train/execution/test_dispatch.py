@@ -123,7 +123,7 @@ def test_ray_is_imported_for_ray_only() -> None:
         "import sys, probe_kit.train.execution.dispatch; "
         "print([m for m in ('ray', 'torch', 'pybullet') if m in sys.modules])"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8").stdout == "[]\n"
 
 
 @pytest.mark.slow

@@ -30,5 +30,5 @@ def test_probes_of_other_episodes_and_other_versions_are_named(planted_run: Plan
     fewer = ArrayRun(run.path, run.model, run.suite, run.episodes[:60], shorter)
     assert [probes.state for probes in inventory(fewer).probes] == ["other episodes"]
     header = run.path / "probes" / results.key / "settings.json"
-    header.write_text(json.dumps({"settings": {"format": 1}, "created": "2020"}))
+    header.write_text(json.dumps({"settings": {"format": 1}, "created": "2020"}), encoding="utf-8")
     assert [(probes.state, probes.views) for probes in inventory(run).probes] == [("other version", ())]

@@ -40,7 +40,7 @@ def leave_behind(folder: Path, key: str) -> None:
     """What processes killed in the middle of writing leave of a bundle."""
     for torn in (folder / key / "abc.tmp", folder / f".{key}.partial" / "mean+backbone.00.residual.npz"):
         torn.parent.mkdir(parents=True, exist_ok=True)
-        torn.write_text("torn")
+        torn.write_text("torn", encoding="utf-8")
 
 
 @pytest.mark.parametrize("finished", [True, False], ids=["killed at the end", "killed before the settings"])
@@ -52,7 +52,7 @@ def test_what_a_killed_training_left_is_cleared_by_the_next_one(planted_run: Pla
     if not finished:
         (probes / results.key / "settings.json").unlink()
         (probes / f".{results.key}.partial").mkdir()  # else it is damage
-        (probes / results.key / "abc.tmp").write_text("torn")
+        (probes / results.key / "abc.tmp").write_text("torn", encoding="utf-8")
     else:
         leave_behind(probes, results.key)
     train_probes(run, permutations=1)
@@ -93,9 +93,9 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     run = planted_run()
     results = train_probes(run, permutations=0)
     file = run.path / "probes" / results.key / "scores.csv"
-    file.write_text("edited by hand")
+    file.write_text("edited by hand", encoding="utf-8")
     save_results(results, run.path)
-    assert file.read_text() == "edited by hand"
+    assert file.read_text(encoding="utf-8") == "edited by hand"
 
 
 def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> None:
@@ -103,9 +103,9 @@ def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> N
     run = planted_run()
     older = train_probes(run, permutations=1)
     header = run.path / "probes" / older.key / "settings.json"
-    content = json.loads(header.read_text())
+    content = json.loads(header.read_text(encoding="utf-8"))
     content["settings"] = {"format": 1, "model": "m"}
-    header.write_text(json.dumps(content))
+    header.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(NoProbesError):
         load_results(run)
     newer = train_probes(run, permutations=2)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.train.solver.backend import check_device, namespace, to_device, to_numpy
+from probe_kit.train.solver.backend import check_device, namespace, to_device, to_device_of, to_numpy
 
 
 def test_numpy_arrays_stay_where_they_are_without_a_device() -> None:
@@ -25,3 +25,12 @@ def test_a_device_that_is_not_there_says_so() -> None:
     check_device("cpu")
     with pytest.raises(UsageError, match="device 'abacus' cannot be used"):
         check_device("abacus")
+
+
+def test_an_array_that_may_not_be_written_to_becomes_a_tensor_without_a_warning() -> None:
+    """Arrays out of Ray's memory are so; torch warns of a write that never comes, and warnings are errors here."""
+    pytest.importorskip("torch")
+    array = np.arange(3.0)
+    array.setflags(write=False)
+    assert to_device(array, "cpu").tolist() == [0, 1, 2]
+    assert to_device_of(to_device(np.ones(1), "cpu"), array).tolist() == [0, 1, 2]

@@ -174,7 +174,7 @@ class Folder(Location):
         What looks like a leftover could be another's work in progress. Whoever is alone at the end clears what
         others left that were killed meanwhile.
         """
-        with (self._path / RUN_FILE).open() as file:
+        with (self._path / RUN_FILE).open("rb") as file:
             if _alone(file):
                 self._clear_orphans()
                 clear()
@@ -213,7 +213,7 @@ class Folder(Location):
     @contextmanager
     def one_at_a_time(self) -> Iterator[None]:
         """By locks; that of the run as well, so that nobody takes the work for a leftover."""
-        with (self._path / RUN_FILE).open() as run, (self._path / PLAN_FILE).open() as turn:
+        with (self._path / RUN_FILE).open("rb") as run, (self._path / PLAN_FILE).open("rb") as turn:
             fcntl.flock(run, fcntl.LOCK_SH)
             fcntl.flock(turn, fcntl.LOCK_EX)
             for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: whoever seals holds this lock
@@ -257,7 +257,7 @@ def _inside(key: str) -> bool:
     return not key.startswith("/") and ".." not in key.split("/")
 
 
-def _alone(file: IO[str]) -> bool:
+def _alone(file: IO[bytes]) -> bool:
     """Hold the lock alone, if nobody else holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -43,7 +43,7 @@ class Parts:
     def statistics(self) -> Mapping[str, Any]:
         """Per data set, what un-normalises its actions; empty without the file."""
         file = self.place / STATISTICS_FILE
-        return dict(json.loads(file.read_text())) if file.is_file() else {}
+        return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
 
 
 def find_parts(checkpoint: str, vlm: str | None) -> Parts:
@@ -91,7 +91,7 @@ def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Pa
             f"{folder} has no config.json of a {_VLM_TYPE} model; InternVLA-M1 is made of Qwen2.5-VL. "
             "Name that model's folder with -M vlm=DIR"
         )
-    return folder, json.loads((folder / "config.json").read_text())
+    return folder, json.loads((folder / "config.json").read_text(encoding="utf-8"))
 
 
 def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> Path:
@@ -110,4 +110,4 @@ def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> P
 
 def _is_vlm(folder: Path) -> bool:
     file = folder / "config.json"
-    return file.is_file() and json.loads(file.read_text()).get("model_type") == _VLM_TYPE
+    return file.is_file() and json.loads(file.read_text(encoding="utf-8")).get("model_type") == _VLM_TYPE

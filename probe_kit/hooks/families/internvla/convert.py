@@ -50,7 +50,7 @@ def convert(checkpoint: str, out: Path, vlm: str | None = None) -> str:
             f"{aside} holds weights {written}, {parts.weights} {sha256}; check the disk and try again"
         )
     source = {"weights": parts.weights.name, "weights_sha256": sha256}
-    (aside / PROVENANCE).write_text(json.dumps(source, indent=2) + "\n")
+    (aside / PROVENANCE).write_text(json.dumps(source, indent=2) + "\n", encoding="utf-8")
     aside.rename(out)
     return sha256
 

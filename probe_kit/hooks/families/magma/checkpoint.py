@@ -161,6 +161,6 @@ def _read_statistics(file: Path) -> dict[str, Any]:
     """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; `action` may be left out."""
     if not file.is_file():
         raise CheckpointError(f"the file of action statistics {file} does not exist")
-    values = json.loads(file.read_text())
+    values = json.loads(file.read_text(encoding="utf-8"))
     entries = values.get("norm_stats", values)
     return {key: entry if "action" in entry else {"action": entry} for key, entry in entries.items()}

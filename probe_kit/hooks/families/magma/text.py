@@ -53,13 +53,13 @@ class ChatText:
     @cached_property
     def _settings(self) -> dict[str, Any]:
         beside = self.folder / "tokenizer_config.json"
-        return dict(json.loads(beside.read_text())) if beside.is_file() else {}
+        return dict(json.loads(beside.read_text(encoding="utf-8"))) if beside.is_file() else {}
 
     @cached_property
     def _template(self) -> str | None:
         """The checkpoint's chat template in Jinja, None if it has none."""
         beside = self.folder / "chat_template.jinja"
-        stored = beside.read_text() if beside.is_file() else self._settings.get("chat_template")
+        stored = beside.read_text(encoding="utf-8") if beside.is_file() else self._settings.get("chat_template")
         if stored is not None and not isinstance(stored, str):
             raise CheckpointError(
                 f"{self.folder} has {len(stored)} chat templates; expected one. Keep the one the model was "
@@ -97,7 +97,7 @@ class ChatText:
     def ends(self) -> frozenset[int]:
         """Ids that end the assistant's turn."""
         file = self.folder / "generation_config.json"
-        stored = json.loads(file.read_text()).get("eos_token_id") if file.is_file() else None
+        stored = json.loads(file.read_text(encoding="utf-8")).get("eos_token_id") if file.is_file() else None
         named: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
         flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)

@@ -37,7 +37,7 @@ _RELEASED = PictureSettings(512, 4)
 def verify_magma(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     """Compare a reference."""
     file = folder / "checkpoint" / _CLIENT
-    client: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    client: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     steps = int(recorded["generated_ids"].size) if "generated_ids" in recorded else 1
     model = load_magma(
         str(folder / "checkpoint"), shrink=0, steps=steps, statistics=str(file) if "norm_stats" in client else None

@@ -33,13 +33,13 @@ class EvaluatedPi0(LerobotFlow):
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
         """Also of lerobot's older layout."""
-        values = json.loads((folder / CONFIG_FILE).read_text())
+        values = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
         if not is_old_layout(values):
             return super().parse_config(folder, evaluation)
         known = [field.name for field in fields(PI0Config)]
         current = current_config(values, known, str(folder / CONFIG_FILE), evaluation.unread)
         with tempfile.TemporaryDirectory() as place:
-            (Path(place) / CONFIG_FILE).write_text(json.dumps(current))
+            (Path(place) / CONFIG_FILE).write_text(json.dumps(current), encoding="utf-8")
             return super().parse_config(Path(place), evaluation)
 
     def further_settings(self) -> dict[str, str]:
@@ -99,7 +99,7 @@ class EvaluatedPi0(LerobotFlow):
             return self.evaluation.picture
         if self._statistics is not None:
             return "squashed"
-        values = json.loads((self.folder / CONFIG_FILE).read_text())
+        values = json.loads((self.folder / CONFIG_FILE).read_text(encoding="utf-8"))
         return "padded-top-left" if is_old_layout(values) else "padded"
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:

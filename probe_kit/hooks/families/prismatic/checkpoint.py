@@ -137,5 +137,5 @@ def _statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> dict[str,
     found = dict(config.statistics)
     for folder in reversed(folders):
         if (folder / STATISTICS_FILE).is_file():
-            found |= json.loads((folder / STATISTICS_FILE).read_text())
+            found |= json.loads((folder / STATISTICS_FILE).read_text(encoding="utf-8"))
     return found

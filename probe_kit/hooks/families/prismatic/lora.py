@@ -32,7 +32,7 @@ class Adapter:
     @classmethod
     def read(cls, folder: Path) -> "Adapter":
         """Raises CheckpointError if it is no LoRA adapter or has no weights."""
-        config = json.loads((folder / ADAPTER_CONFIG).read_text())
+        config = json.loads((folder / ADAPTER_CONFIG).read_text(encoding="utf-8"))
         if config.get("peft_type") != "LORA":
             raise CheckpointError(f"{folder} holds a {config.get('peft_type')} adapter; only LORA can be merged")
         if not config.get("base_model_name_or_path"):

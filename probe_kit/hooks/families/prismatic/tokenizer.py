@@ -72,7 +72,7 @@ class FileTokenizer:
     @cached_property
     def _config(self) -> dict[str, Any]:
         beside = self.file.with_name("tokenizer_config.json")
-        return dict(json.loads(beside.read_text())) if beside.is_file() else {}
+        return dict(json.loads(beside.read_text(encoding="utf-8"))) if beside.is_file() else {}
 
     @cached_property
     def special(self) -> frozenset[int]:

@@ -42,7 +42,9 @@ def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comp
             row["text"].removeprefix(frame.before).removesuffix(frame.behind),
             tuple(model.lead + letter for letter in LETTERS),
         )
-        for row, number in zip(json.loads(file.read_text())["rows"], recorded["in_rows_picture"], strict=True)
+        for row, number in zip(
+            json.loads(file.read_text(encoding="utf-8"))["rows"], recorded["in_rows_picture"], strict=True
+        )
     ]
     return compare_all(recorded, _Asked(model, questions, recorded).produced())
 

@@ -95,7 +95,7 @@ def _processor(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{file} is missing: it holds the action bins, statistics and cameras. Copy it from the model's page"
         )
-    return dict(json.loads(file.read_text()))
+    return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def _random(

@@ -51,9 +51,9 @@ def test_a_missing_and_a_truncated_object_are_found_by_size(damaged: Path) -> No
 
 def test_a_changed_outcome_is_found(damaged: Path) -> None:
     commit = damaged / "commits/00000002.json"
-    content = json.loads(commit.read_text())
+    content = json.loads(commit.read_text(encoding="utf-8"))
     content["outcome"]["outcome"] = "correct"
-    commit.write_text(json.dumps(content))
+    commit.write_text(json.dumps(content), encoding="utf-8")
     (problem,) = verify_run(damaged).problems
     assert "commits/00000002.json was changed after it was written" in problem
     with pytest.raises(RunDamagedError, match=r"commits/00000002\.json was changed"):
@@ -62,7 +62,7 @@ def test_a_changed_outcome_is_found(damaged: Path) -> None:
 
 def test_changed_settings_are_found(damaged: Path) -> None:
     card = damaged / "run.json"
-    card.write_text(card.read_text().replace('"seed": 0', '"seed": 1'))
+    card.write_text(card.read_text(encoding="utf-8").replace('"seed": 0', '"seed": 1'), encoding="utf-8")
     assert "hash" in verify_run(damaged).problems[0]
 
 
@@ -79,7 +79,7 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 def test_the_command_reports_and_exits_with_1(damaged: Path) -> None:
     flip_a_bit(an_object(damaged, "backbone/pooled", 0))
     command = [sys.executable, "-m", "probe_kit", "run", "verify", str(damaged), "--deep", "--json"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    answer = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
     assert answer.returncode == 1, answer.stderr
     assert json.loads(answer.stdout)["ok"] is False
     command = [*command[:-2]]

@@ -254,6 +254,6 @@ def test_without_statistics_it_says_so_and_refuses_to_act(
 def test_statistics_of_other_arms_are_refused(run: Path, tmp_path: Path, observation: Observation) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "copy"))
     two = {"both_arms": {"action": {"q01": [0.0] * 14, "q99": [1.0] * 14}}}
-    (copy / "dataset_statistics.json").write_text(json.dumps(two))
+    (copy / "dataset_statistics.json").write_text(json.dumps(two), encoding="utf-8")
     with pytest.raises(CheckpointError, match="14 dimensions"):
         load_internvla(str(copy)).act([observation], [0])

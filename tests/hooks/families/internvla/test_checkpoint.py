@@ -46,7 +46,7 @@ def test_of_several_weights_one_has_to_be_named(run: Path, tmp_path: Path) -> No
 def test_a_vision_language_model_can_be_named_and_has_to_be_one(run: Path, tmp_path: Path) -> None:
     other = write_vlm(tmp_path / "other")
     assert find_parts(str(run), str(other)).vlm == other
-    (other / "config.json").write_text(json.dumps({"model_type": "qwen3_vl"}))
+    (other / "config.json").write_text(json.dumps({"model_type": "qwen3_vl"}), encoding="utf-8")
     with pytest.raises(CheckpointError, match="qwen2_5_vl"):
         find_parts(str(run), str(other))
 
@@ -108,10 +108,14 @@ def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
 @pytest.mark.slow
 def test_the_converter_is_a_command(run: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "probe_kit.hooks.families.internvla.convert"]
-    done = subprocess.run([*command, str(run), str(tmp_path / "out")], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, str(run), str(tmp_path / "out")], capture_output=True, encoding="utf-8", check=False
+    )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.strip()) == 64
-    refused = subprocess.run([*command, str(tmp_path / "no"), "x"], capture_output=True, text=True, check=False)
+    refused = subprocess.run(
+        [*command, str(tmp_path / "no"), "x"], capture_output=True, encoding="utf-8", check=False
+    )
     assert refused.returncode != 0
     assert "does not exist" in refused.stderr
     assert "Traceback" not in refused.stderr

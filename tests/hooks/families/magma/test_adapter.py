@@ -170,7 +170,7 @@ def test_temperature_changes_actions_by_seed_alone(folder: Path) -> None:
 
 def test_statistics_of_other_than_seven_dimensions_do_not_act(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "six.json"
-    file.write_text('{"six": {"q01": [0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1]}}')
+    file.write_text('{"six": {"q01": [0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1]}}', encoding="utf-8")
     policy = load_magma(str(folder), statistics=str(file), unnorm_key="six")
     with pytest.raises(CheckpointError, match="6 dimensions"):
         policy.act(example_observations(INSTRUCTIONS[:1]), [0])
@@ -311,7 +311,7 @@ def test_a_reading_of_another_model_is_refused(unsteered: Magma) -> None:
 
 def test_every_option_reaches_the_card(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "more.json"
-    file.write_text('{"mine": {"q01": [0, 0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1, 1]}}')
+    file.write_text('{"mine": {"q01": [0, 0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1, 1]}}', encoding="utf-8")
     base = load_magma(str(folder)).card.settings
     for options in (
         {"statistics": str(file), "unnorm_key": "mine"},

@@ -39,11 +39,13 @@ def test_the_unread_head_may_be_missing_and_nothing_else(tmp_path: Path) -> None
 def test_the_index_may_leave_the_unread_head_out_and_nothing_else(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path)
     index = folder / "model.safetensors.index.json"
-    listed = json.loads(index.read_text())["weight_map"]
+    listed = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
     pruned = {name: file for name, file in listed.items() if name not in UNUSED_WEIGHTS}
-    index.write_text(json.dumps({"weight_map": pruned}))
+    index.write_text(json.dumps({"weight_map": pruned}), encoding="utf-8")
     load_magma(str(folder))
-    index.write_text(json.dumps({"weight_map": {n: f for n, f in pruned.items() if n != LAYER_SCALE}}))
+    index.write_text(
+        json.dumps({"weight_map": {n: f for n, f in pruned.items() if n != LAYER_SCALE}}), encoding="utf-8"
+    )
     with pytest.raises(WeightsError, match=LAYER_SCALE):
         load_magma(str(folder))
 
@@ -111,10 +113,12 @@ def test_statistics_come_from_us_the_checkpoint_or_a_file_the_later_the_stronger
     folder = write_checkpoint(tmp_path / "model")
     ours = load_magma(str(folder)).statistics
     assert ours.low.tolist() == shipped_statistics()["bridge_orig"]["action"]["q01"]
-    (folder / "dataset_statistics.json").write_text(json.dumps({"bridge_orig": {"action": entry(2)}}))
+    (folder / "dataset_statistics.json").write_text(
+        json.dumps({"bridge_orig": {"action": entry(2)}}), encoding="utf-8"
+    )
     assert load_magma(str(folder)).statistics.high[0] == 2
     file = tmp_path / "mine.json"
-    file.write_text(json.dumps({"norm_stats": {"bridge_orig": entry(3), "mine": entry(4)}}))
+    file.write_text(json.dumps({"norm_stats": {"bridge_orig": entry(3), "mine": entry(4)}}), encoding="utf-8")
     assert load_magma(str(folder), statistics=str(file)).statistics.high[0] == 3
     mine = load_magma(str(folder), statistics=str(file), unnorm_key="mine")
     assert (mine.statistics.key, mine.statistics.high[0]) == ("mine", 4)

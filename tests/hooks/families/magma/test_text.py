@@ -58,9 +58,9 @@ def test_the_order_of_turns_can_be_the_releases(folder: Path) -> None:
 
 def test_a_checkpoints_own_template_is_used(folder: Path) -> None:
     template = "{{ bos_token }}{% for m in messages %}[{{ m.role }}]{{ m.content }}{% endfor %}#"
-    (folder / "chat_template.jinja").write_text(template)
+    (folder / "chat_template.jinja").write_text(template, encoding="utf-8")
     assert text(folder).decode(text(folder).prompt("q?").ids[-2:]) == "?#"
-    (folder / "chat_template.jinja").write_text("{{ messages[1].content | upper }}")
+    (folder / "chat_template.jinja").write_text("{{ messages[1].content | upper }}", encoding="utf-8")
     with pytest.raises(CheckpointError, match="changes the words"):
         text(folder).prompt("where?")
 
@@ -101,5 +101,8 @@ def test_another_models_tokenizer_is_refused(folder: Path, tmp_path: Path) -> No
 
 def test_the_beginning_is_the_tokenizers_own(folder: Path) -> None:
     file = folder / "tokenizer_config.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "bos_token": {"content": "<|end_of_text|>"}}))
+    file.write_text(
+        json.dumps({**json.loads(file.read_text(encoding="utf-8")), "bos_token": {"content": "<|end_of_text|>"}}),
+        encoding="utf-8",
+    )
     assert text(folder).prompt("q?").ids[:2] == (IDS["<|begin_of_text|>"], IDS["<|end_of_text|>"])

@@ -81,7 +81,7 @@ def test_only_the_declared_keys_may_be_missing_here(golden_magma: Path, tmp_path
     file = tmp_path / "keys.json"
     entry = {"shape": [3], "dtype": "bfloat16"}
     for name in ("vision_tower.clip_vision_model.trunk.headless", "multi_modal_projector.row_separator"):
-        file.write_text(json.dumps({"keys": {**recorded["keys"], name: entry}}))
+        file.write_text(json.dumps({"keys": {**recorded["keys"], name: entry}}), encoding="utf-8")
         verification = verify_keys("magma", file)
         assert not verification.passed
         assert f"{name}: missing here" in verification.comparisons[0].note

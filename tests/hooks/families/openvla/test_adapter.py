@@ -189,7 +189,7 @@ def test_other_statistics_give_other_units_for_the_same_tokens(golden_openvla: P
 def test_statistics_that_fine_tuning_wrote_are_found_beside_the_weights(folder: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "tuned"))
     mine = {"my_arm": {"action": {"q01": [-1.0] * 7, "q99": [1.0] * 7}}}
-    (copy / STATISTICS_FILE).write_text(json.dumps(mine))
+    (copy / STATISTICS_FILE).write_text(json.dumps(mine), encoding="utf-8")
     assert load_openvla(str(copy)).statistics.key == "bridge_orig"
     assert load_openvla(str(copy), unnorm_key="my_arm").statistics.mask.all()
     with pytest.raises(UsageError, match="Did you mean my_arm"):

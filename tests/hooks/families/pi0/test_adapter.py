@@ -16,7 +16,7 @@ TOLERANCE = 1e-5
 def test_capture_reproduces_the_golden_streams_and_actions(golden_pi0: Path) -> None:
     """Backbone at every layer, expert at every layer and iteration, against lerobot's original outputs."""
     reference = np.load(golden_pi0 / "reference.npz")
-    cameras = json.loads((golden_pi0 / "dims.json").read_text())["cameras"]
+    cameras = json.loads((golden_pi0 / "dims.json").read_text(encoding="utf-8"))["cameras"]
     policy = load_pi0(str(golden_pi0 / "checkpoint"))
     batch = {
         "observation.state": torch.from_numpy(reference["in_state"]),

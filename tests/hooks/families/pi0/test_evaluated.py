@@ -149,7 +149,7 @@ def test_shipped_statistics_are_those_of_the_bridge_data() -> None:
 )
 def test_statistics_that_cannot_be_meant_are_refused(tmp_path: Path, content: str, complaint: str) -> None:
     file = tmp_path / "client.json"
-    file.write_text(content)
+    file.write_text(content, encoding="utf-8")
     with pytest.raises(CheckpointError, match=complaint):
         _ = StatisticsFile.read(str(file)).bounds("action", 7)
 
@@ -177,10 +177,10 @@ def test_a_checkpoint_of_other_actions_and_another_state_can_be_listened_to(
     folder: Path, tmp_path: Path, seen: Observation
 ) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "base"))
-    config = json.loads((copy / "config.json").read_text())
+    config = json.loads((copy / "config.json").read_text(encoding="utf-8"))
     config["input_features"]["observation.state"]["shape"] = [32]
     config["output_features"]["action"]["shape"] = [32]
-    (copy / "config.json").write_text(json.dumps(config))
+    (copy / "config.json").write_text(json.dumps(config), encoding="utf-8")
     policy = load_pi0(str(copy))
     assert "acts in 32 dimensions" in str(policy.misfit())
     assert policy.deaf_to() == ("state",)

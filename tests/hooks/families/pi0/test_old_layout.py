@@ -97,8 +97,10 @@ def test_statistics_given_to_a_checkpoint_that_has_its_own_are_refused(
 
 def test_a_setting_that_nobody_knows_is_an_error_until_it_is_accepted(golden: Path, tmp_path: Path) -> None:
     copy = old_copy(golden, tmp_path)
-    config = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps({**config, "flip_pictures": True, "num_views": 1}))
+    config = json.loads((copy / "config.json").read_text(encoding="utf-8"))
+    (copy / "config.json").write_text(
+        json.dumps({**config, "flip_pictures": True, "num_views": 1}), encoding="utf-8"
+    )
     with pytest.raises(CheckpointError, match="-M unread=flip_pictures,num_views"):
         load_pi0(str(copy))
     assert load_pi0(str(copy), unread="flip_pictures,num_views").config.num_inference_steps == 10

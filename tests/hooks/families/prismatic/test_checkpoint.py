@@ -42,7 +42,7 @@ def adapter(base: Path, tmp_path: Path) -> Path:
 
 def change(folder: Path, **fields: object) -> None:
     file = folder / "adapter_config.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+    file.write_text(json.dumps(json.loads(file.read_text(encoding="utf-8")) | fields), encoding="utf-8")
 
 
 def load(folder: Path) -> PrismaticNetwork:

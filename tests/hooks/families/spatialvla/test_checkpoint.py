@@ -63,7 +63,7 @@ def test_random_twins_are_named_by_their_seed(folder: Path) -> None:
 def test_weights_that_are_not_the_models_are_refused_by_name(folder: Path, tmp_path: Path, damage: str) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "damaged"))
     name = "position_embedding_3d.position_embedding_head.3.bias"
-    index = json.loads((copy / "model.safetensors.index.json").read_text())
+    index = json.loads((copy / "model.safetensors.index.json").read_text(encoding="utf-8"))
     shard = copy / index["weight_map"][name]
     tensors = load_file(shard)
     if damage == "missing":
@@ -77,7 +77,7 @@ def test_weights_that_are_not_the_models_are_refused_by_name(folder: Path, tmp_p
     else:
         tensors[name] = torch.full_like(tensors[name], np.nan)
     save_file(tensors, shard)
-    (copy / "model.safetensors.index.json").write_text(json.dumps(index))
+    (copy / "model.safetensors.index.json").write_text(json.dumps(index), encoding="utf-8")
     with pytest.raises(WeightsError, match=name):
         load(copy)
 
@@ -87,6 +87,6 @@ def test_files_that_are_missing_or_of_another_kind_are_named(folder: Path, tmp_p
     (copy / "processor_config.json").unlink()
     with pytest.raises(CheckpointError, match=r"processor_config\.json is missing: it holds the action bins"):
         load(copy)
-    (copy / "adapter_config.json").write_text("{}")
+    (copy / "adapter_config.json").write_text("{}", encoding="utf-8")
     with pytest.raises(CheckpointError, match="LoRA adapter"):
         load(copy)

@@ -137,7 +137,7 @@ def _record(checkpoint: Path, own_camera: bool) -> dict[str, NDArray[np.generic]
 def test_the_record_of_the_test_itself_is_in_the_layout_of_the_golden_one(golden_spatialvla: Path) -> None:
     """So that the sizes above differ, and nothing else."""
     ours = config_values()
-    theirs = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text())
+    theirs = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text(encoding="utf-8"))
     assert set(ours) - set(theirs) == set()
     for part in ("text_config", "vision_config", "vision_zoe_config"):
         assert set(ours[part]) - set(theirs[part]) == set()

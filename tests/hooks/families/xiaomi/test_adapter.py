@@ -185,7 +185,9 @@ def test_a_checkpoint_without_statistics_says_so_and_refuses_to_act(
 ) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     file = copy / "preprocessor_config.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "action_config": {}}))
+    file.write_text(
+        json.dumps({**json.loads(file.read_text(encoding="utf-8")), "action_config": {}}), encoding="utf-8"
+    )
     policy = load_xiaomi(str(copy))
     assert "cannot act" in policy.card.notes[0]
     assert policy.card.chunk == 30
@@ -224,10 +226,10 @@ def test_a_prompt_longer_than_the_model_reads_is_an_error(loaded: Xiaomi, observ
 
 def test_a_missing_tensor_is_refused_and_a_tied_one_may_be_left_out(folder: Path, tmp_path: Path) -> None:
     assert list(load_xiaomi(str(folder)).card.audit["allowed_missing"]) == ["vlm.lm_head.weight"]
-    values = json.loads((folder / "config.json").read_text())
+    values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     values["dit_config"]["num_hidden_layers"] = 3
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    (copy / "config.json").write_text(json.dumps(values))
+    (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
     with pytest.raises(WeightsError, match=r"missing.*dit\.layers\.2"):
         load_xiaomi(str(copy))
 

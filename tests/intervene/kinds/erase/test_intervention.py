@@ -67,7 +67,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(copy: Run, effects: E
     assert verify_run(copy.path, deep=True).ok
     assert effects.changes == effects.rows == []
     assert "says less than exchanging" in " ".join(effects.notes)
-    stored = (copy.path / "interventions" / effects.key / "effects.csv").read_text()
+    stored = (copy.path / "interventions" / effects.key / "effects.csv").read_text(encoding="utf-8")
     assert stored.splitlines()[0].split(",")[:4] == ["category", "place", "role", "direction"]
 
 

@@ -30,10 +30,12 @@ NAMES = ("cat", "dog", "fox", "owl", "twin")
 def write_set(folder: Path, box: float = 0.1452) -> Path:
     """Three questions about five tiles; `twin` shows the same picture as `fox` under another name."""
     folder.mkdir(parents=True)
-    (folder / "pairs.json").write_text(json.dumps(PAIRS))
+    (folder / "pairs.json").write_text(json.dumps(PAIRS), encoding="utf-8")
     half = [box / 2, box / 2, 0.003]
     record = {"bbox": {"min": [-value for value in half], "max": half}, "scales": [1], "density": 6368}
-    (folder / "model_db.json").write_text(json.dumps({name: {"name": name, **record} for name in NAMES}))
+    (folder / "model_db.json").write_text(
+        json.dumps({name: {"name": name, **record} for name in NAMES}), encoding="utf-8"
+    )
     for seed, name in enumerate(NAMES):
         write_tile(folder / "shapes" / name / "textured.glb", art(2 if name == "twin" else seed))
     return folder
@@ -72,9 +74,9 @@ def test_questions_that_share_a_picture_share_a_group_whatever_its_name(folder: 
     """`twin` is the picture of `fox`, and the cat lies in two questions: all three belong together."""
     suite = convert("act2answer", folder, tmp_path / "suite")
     assert len({item.group_id for item in suite.items}) == 1
-    other = json.loads((folder / "pairs.json").read_text())[:2]
+    other = json.loads((folder / "pairs.json").read_text(encoding="utf-8"))[:2]
     other[0]["right"] = "owl"
-    (folder / "pairs.json").write_text(json.dumps(other))
+    (folder / "pairs.json").write_text(json.dumps(other), encoding="utf-8")
     apart = convert("act2answer", folder, tmp_path / "apart")
     assert len({item.group_id for item in apart.items}) == 2
 
@@ -90,18 +92,18 @@ def test_the_same_set_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None
 
 def _change(place: int, **values: Any) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
-        pairs = json.loads((folder / "pairs.json").read_text())
+        pairs = json.loads((folder / "pairs.json").read_text(encoding="utf-8"))
         pairs[place].update(values)
-        (folder / "pairs.json").write_text(json.dumps(pairs))
+        (folder / "pairs.json").write_text(json.dumps(pairs), encoding="utf-8")
 
     return apply
 
 
 def _forget(name: str) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
-        records = json.loads((folder / "model_db.json").read_text())
+        records = json.loads((folder / "model_db.json").read_text(encoding="utf-8"))
         del records[name]
-        (folder / "model_db.json").write_text(json.dumps(records))
+        (folder / "model_db.json").write_text(json.dumps(records), encoding="utf-8")
 
     return apply
 
@@ -121,8 +123,14 @@ def _forget(name: str) -> Callable[[Path], None]:
         (_forget("dog"), "names the tile 'dog', which .* does not describe"),
         (lambda folder: (folder / "shapes/dog/textured.glb").unlink(), "dog/textured.glb not found"),
         (lambda folder: (folder / "pairs.json").unlink(), "pairs.json not found"),
-        (lambda folder: (folder / "pairs.json").write_text("[]"), "expected a list of questions"),
-        (lambda folder: (folder / "model_db.json").write_text("[]"), "expected an object by tile name"),
+        (
+            lambda folder: (folder / "pairs.json").write_text("[]", encoding="utf-8"),
+            "expected a list of questions",
+        ),
+        (
+            lambda folder: (folder / "model_db.json").write_text("[]", encoding="utf-8"),
+            "expected an object by tile name",
+        ),
     ],
 )
 def test_what_the_release_would_misread_is_refused(
@@ -138,7 +146,7 @@ def test_a_scored_box_unlike_the_mesh_is_said(tmp_path: Path) -> None:
     folder = write_set(tmp_path / "living_world", box=0.11)
     with pytest.warns(BoundingBoxWarning, match=r"cat is 0\.1452 m wide and scored as 0\.1100 m"):
         suite = convert("act2answer", folder, tmp_path / "suite")
-    notes = json.loads((suite.folder / "stats.json").read_text())["notes"]
+    notes = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))["notes"]
     assert "5 of 5 tiles" in notes[0]
 
 
@@ -170,7 +178,7 @@ def test_options_that_cannot_be_meant_are_refused(original: Path, tmp_path: Path
 def test_the_authors_own_set_with_generated_tiles(tmp_path: Path) -> None:
     """Their `pairs.json` and `model_db.json` byte for byte; their pictures could not be had."""
     folder = Path(shutil.copytree(REAL, tmp_path / "test_colors"))
-    for seed, name in enumerate(sorted(json.loads((folder / "model_db.json").read_text()))):
+    for seed, name in enumerate(sorted(json.loads((folder / "model_db.json").read_text(encoding="utf-8")))):
         write_tile(folder / "shapes" / name / "textured.glb", art(seed))
     with pytest.warns(BoundingBoxWarning, match="12 of 12 tiles"):
         suite = convert("act2answer", folder, tmp_path / "suite")

@@ -23,7 +23,9 @@ def test_pairs_are_kept_and_half_of_them_negated(compbench_root: Path, tmp_path:
 def test_the_answered_picture_is_the_target_and_the_other_one_if_negated(
     compbench_root: Path, tmp_path: Path
 ) -> None:
-    records = json.loads((compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json").read_text())
+    records = json.loads(
+        (compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json").read_text(encoding="utf-8")
+    )
     suite = convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["emotion"])
     for item in suite.items:
         record = records[int(item.source["source_id"].rpartition("/")[2])]
@@ -41,7 +43,7 @@ def test_split_files_are_united_and_types_sorted_into_state_and_attribute(
     compbench_root: Path, tmp_path: Path
 ) -> None:
     suite = convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["attribute", "state"])
-    stats = json.loads((suite.folder / "stats.json").read_text())
+    stats = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))
     assert stats["state"]["pool"] == stats["attribute"]["pool"] == 5
     assert stats["reasons"]["empty record"] == 1
     assert stats["attribute"]["needs_edit"] == 1
@@ -49,8 +51,8 @@ def test_split_files_are_united_and_types_sorted_into_state_and_attribute(
 
 
 def test_a_whole_file_is_preferred_to_its_parts(compbench_root: Path, tmp_path: Path) -> None:
-    whole = json.loads((compbench_root / f"{STATES}_test.json").read_text())[:2]
-    (compbench_root / f"{STATES}.json").write_text(json.dumps(whole))
+    whole = json.loads((compbench_root / f"{STATES}_test.json").read_text(encoding="utf-8"))[:2]
+    (compbench_root / f"{STATES}.json").write_text(json.dumps(whole), encoding="utf-8")
     suite = convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["attribute", "state"])
     assert sum(suite.card["counts"].values()) == 2
 
@@ -85,7 +87,9 @@ def test_a_missing_picture_is_named_with_its_record_what_was_tried_and_a_remedy(
     ],
 )
 def test_a_broken_annotation_file_is_named(compbench_root: Path, tmp_path: Path, text: str, message: str) -> None:
-    (compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json").write_text(text)
+    (compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json").write_text(
+        text, encoding="utf-8"
+    )
     with pytest.raises(SuiteError, match=message):
         convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["emotion"])
     assert not (tmp_path / "suite").exists()

@@ -17,7 +17,7 @@ def suite(iconqa_root: Path, tmp_path: Path) -> Suite:
 def test_only_self_contained_questions_become_items(suite: Suite) -> None:
     shapes = {item.source["source_id"]: item.instruction for item in suite.items if item.category == "shape"}
     assert shapes == {"1": "Put the cube on the triangle", "4": "Put the cube on the square"}, "4 has a blank stem"
-    stats = json.loads((suite.folder / "stats.json").read_text())
+    stats = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))
     assert stats["reasons"]["question refers to the stem"] == 1
 
 
@@ -62,9 +62,9 @@ def test_a_missing_choice_is_named_with_its_problem(iconqa_root: Path, tmp_path:
 
 def test_an_answer_beyond_the_choices_is_refused(iconqa_root: Path, tmp_path: Path) -> None:
     path = iconqa_root / "iconqa_data" / "problems.json"
-    problems = json.loads(path.read_text())
+    problems = json.loads(path.read_text(encoding="utf-8"))
     problems["1"]["answer"] = 2
-    path.write_text(json.dumps(problems))
+    path.write_text(json.dumps(problems), encoding="utf-8")
     with pytest.raises(SuiteError, match=r"problem 1 of problems\.json: answer 2 of 2 choices"):
         convert("iconqa", iconqa_root, tmp_path / "suite")
 

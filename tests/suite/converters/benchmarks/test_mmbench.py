@@ -30,7 +30,7 @@ def test_names_are_asked_for_with_other_names_beside_them(mmbench_root: Path, tm
 
 def test_circular_copies_and_other_questions_are_counted_and_left_out(mmbench_root: Path, tmp_path: Path) -> None:
     suite = convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
-    stats = json.loads((suite.folder / "stats.json").read_text())
+    stats = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))
     assert stats["celebrity"]["pool"] == 9
     assert stats["reasons"]["circular copy"] == stats["reasons"]["not an identity question"] == 1
     assert stats["celebrity"]["rule_selected"] == 7
@@ -57,14 +57,14 @@ def test_a_broken_file_is_refused_naming_the_row(
     path = mmbench_root / "MMBench_DEV_EN.tsv"
     text = path.read_bytes().decode().replace("\r\n", "\n")
     assert old in text
-    path.write_text(text.replace(old, new, 1))
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(SuiteError, match=message):
         convert("mmbench", mmbench_root, tmp_path / "suite", include_real_faces=True)
     assert not (tmp_path / "suite").exists()
 
 
 def test_a_test_file_is_refused_because_its_answers_are_secret(tmp_path: Path) -> None:
-    (tmp_path / "MMBench_TEST_EN.tsv").write_text("index\n")
+    (tmp_path / "MMBench_TEST_EN.tsv").write_text("index\n", encoding="utf-8")
     with pytest.raises(SuiteError, match=r"only a TEST file"):
         convert("mmbench", tmp_path, tmp_path / "suite", include_real_faces=True)
 

@@ -25,13 +25,13 @@ def test_boxes_rule_out_pictures_that_hold_the_answer_and_objects_too_small(
         "picture of cow",
         "picture of sheep",
     }
-    stats = json.loads((suite.folder / "stats.json").read_text())
+    stats = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))
     assert stats["reasons"]["object too small or not boxed"] == 1
 
 
 def test_the_raw_answer_people_agree_on_decides(okvqa_root: Path, coco_instances: Path, tmp_path: Path) -> None:
     suite = convert("ok-vqa", okvqa_root, tmp_path / "suite", instances=str(coco_instances))
-    reasons = json.loads((suite.folder / "stats.json").read_text())["reasons"]
+    reasons = json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))["reasons"]
     assert reasons["people do not agree on the answer"] == 1
     assert reasons["question asks for something else than a kind"] == 1
 
@@ -40,7 +40,7 @@ def test_only_plants_and_animals_count_into_the_pool(
     okvqa_root: Path, coco_instances: Path, tmp_path: Path
 ) -> None:
     suite = convert("ok-vqa", okvqa_root, tmp_path / "suite", instances=str(coco_instances))
-    assert json.loads((suite.folder / "stats.json").read_text())["living-world"]["pool"] == 8
+    assert json.loads((suite.folder / "stats.json").read_text(encoding="utf-8"))["living-world"]["pool"] == 8
     assert all(item.license == "LicenseRef-COCO-Flickr" and not item.redistributable for item in suite.items)
 
 
@@ -53,7 +53,7 @@ def test_a_missing_photograph_is_named(okvqa_root: Path, tmp_path: Path) -> None
 
 
 def test_annotations_of_another_release_are_refused(okvqa_root: Path, tmp_path: Path) -> None:
-    (okvqa_root / "OpenEnded_mscoco_train2014_questions.json").write_text('{"questions": []}')
+    (okvqa_root / "OpenEnded_mscoco_train2014_questions.json").write_text('{"questions": []}', encoding="utf-8")
     with pytest.raises(SuiteError, match=r"annotation 0 .*question 0 is not in OpenEnded"):
         convert("ok-vqa", okvqa_root, tmp_path / "suite")
 

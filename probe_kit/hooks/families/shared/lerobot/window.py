@@ -56,7 +56,7 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
     Raises CheckpointError if the step holds something else than lerobot writes.
     """
     path = folder / "policy_preprocessor.json"
-    steps = json.loads(path.read_text())["steps"] if path.is_file() else []
+    steps = json.loads(path.read_text(encoding="utf-8"))["steps"] if path.is_file() else []
     for step in steps:
         if step["registry_name"] == STEP:
             try:

@@ -55,7 +55,7 @@ def load_vlm(
     folder = checkpoint_folder(checkpoint)
     file = folder / CONFIG_FILE
     with _describing(file):
-        config = recipe.config(without_precision(json.loads(file.read_text())))
+        config = recipe.config(without_precision(json.loads(file.read_text(encoding="utf-8"))))
 
     def build(kind: torch.dtype, place: str) -> Any:
         with _describing(file):

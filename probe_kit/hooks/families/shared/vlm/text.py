@@ -176,6 +176,6 @@ def _read(file: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        return dict(json.loads(file.read_text()))
+        return dict(json.loads(file.read_text(encoding="utf-8")))
     except ValueError as error:
         raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error

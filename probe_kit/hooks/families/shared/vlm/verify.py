@@ -75,7 +75,7 @@ def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> 
     file = folder / DIMS_FILE
     if not file.is_file():
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
-    rows = json.loads(file.read_text())["rows"]
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
         Question(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))

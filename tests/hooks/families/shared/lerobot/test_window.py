@@ -14,7 +14,7 @@ CAMERA = "observation.images.base"
 
 def write_step(folder: Path, config: dict[str, object]) -> None:
     steps = [{"registry_name": STEP, "config": config}]
-    (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}), encoding="utf-8")
 
 
 def test_the_window_is_the_one_lerobots_own_step_cuts(tmp_path: Path) -> None:

@@ -80,19 +80,19 @@ def test_untied_output_weights_may_not_be_missing(tmp_path: Path) -> None:
 
 
 def test_the_layout_of_internvls_own_code_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text(json.dumps({"model_type": "internvl_chat"}))
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "internvl_chat"}), encoding="utf-8")
     with pytest.raises(CheckpointError, match="-HF"):
         load_model("internvl", str(tmp_path))
 
 
 def test_a_configuration_that_describes_no_network_is_refused(tmp_path: Path) -> None:
     folder = write_paligemma(tmp_path)
-    values = json.loads((folder / "config.json").read_text())
+    values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     for damaged in (
         {**values, "text_config": 3},
         {**values, "vision_config": {**values["vision_config"], "patch_size": 0}},
     ):
-        (folder / "config.json").write_text(json.dumps(damaged))
+        (folder / "config.json").write_text(json.dumps(damaged), encoding="utf-8")
         with pytest.raises(CheckpointError, match="describes no network"):
             load_model("paligemma", str(folder))
 
@@ -124,8 +124,8 @@ def test_two_pictures_of_different_size_go_together(tmp_path: Path) -> None:
 )
 def test_towers_that_no_released_ovis_has_are_refused(vision: dict[str, object], tmp_path: Path) -> None:
     folder = write_ovis2_5(tmp_path)
-    values = json.loads((folder / "config.json").read_text())
+    values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     values["vit_config"] |= vision
-    (folder / "config.json").write_text(json.dumps(values))
+    (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
     with pytest.raises(CheckpointError, match="the vision tower has"):
         load_model("ovis2.5", str(folder))

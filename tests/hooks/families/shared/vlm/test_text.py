@@ -60,7 +60,9 @@ def test_an_option_is_the_token_behind_the_prompt(tmp_path: Path) -> None:
 
 
 def test_what_is_said_ends_at_an_end(tmp_path: Path) -> None:
-    (tmp_path / "generation_config.json").write_text(json.dumps({"eos_token_id": [ID["<|endoftext|>"], 0]}))
+    (tmp_path / "generation_config.json").write_text(
+        json.dumps({"eos_token_id": [ID["<|endoftext|>"], 0]}), encoding="utf-8"
+    )
     text = _text(tmp_path)
     left = list(text.prompt("", "left").ids[-4:])
     assert text.decode([*left, ID["<|endoftext|>"], *left]) == "left"

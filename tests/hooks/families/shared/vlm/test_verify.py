@@ -105,7 +105,7 @@ def test_a_list_without_a_key_that_nothing_else_holds_is_refused(golden_vlm: Pat
     for name in gone:
         del content["keys"][name]
     file = tmp_path / "keys.json"
-    file.write_text(json.dumps(content))
+    file.write_text(json.dumps(content), encoding="utf-8")
     verification = verify_keys("internvl", file)
     assert not verification.passed
     assert all(f"{name}: not recorded" in verification.comparisons[0].note for name in gone)

@@ -1,0 +1,73 @@
+"""Tables as CSV whose text stays text: no cell is a formula to the spreadsheet that opens it."""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_FORMULA = re.compile(r"'*(?:[\t\r\n]|\s*[=+\-@＝＋－＠])")
+"""How a cell begins that spreadsheets compute or cut, or one that `escaped` made."""
+
+
+def escaped(cell: Any) -> Any:
+    """A text that a spreadsheet would compute with a `'` in front, which marks it as text; all else as it is.
+
+    Numbers stay numbers: only `str` is looked at. `unescaped` gives every text back.
+    """
+    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
+
+
+def unescaped(cell: str) -> str:
+    """The text that `escaped` was given."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+def csv_of_frame(frame: "pd.DataFrame") -> str:
+    """A frame as comma-separated values with a header, without its index; texts are `escaped`."""
+    import pandas as pd
+
+    safe = frame.rename(columns=escaped)
+    for place, (_, column) in enumerate(frame.items()):
+        if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column)):
+            cells = pd.Series([escaped(cell) for cell in column], index=column.index, dtype=object)
+            safe.isetitem(place, cells.array)
+    lines = _Lines()
+    safe.to_csv(lines, index=False, lineterminator=_Lines.END)
+    return lines.getvalue()
+
+
+def csv_of_rows(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Rows as comma-separated values with a header; texts are `escaped`, and `rows_of_csv` gives them back."""
+    lines = _Lines()
+    table = csv.DictWriter(lines, columns, lineterminator=_Lines.END)
+    table.writerow({name: escaped(name) for name in columns})
+    table.writerows({name: escaped(cell) for name, cell in row.items()} for row in rows)
+    return lines.getvalue()
+
+
+def rows_of_csv(text: str) -> list[dict[str, Any]]:
+    """The rows that `csv_of_rows` wrote, every cell as text.
+
+    As `csv.DictReader` has it, cells beyond the header are a list at the key None. Raises csv.Error.
+    """
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    reader.fieldnames = [unescaped(name) for name in reader.fieldnames or ()]
+    return [
+        {name: unescaped(cell) if isinstance(cell, str) else cell for name, cell in row.items()} for row in reader
+    ]
+
+
+class _Lines(io.StringIO):
+    """Ends lines in a newline whose writer ends them in `END`: only what ends its lines is quoted by Python's."""
+
+    END = "\r\n"
+
+    def __init__(self) -> None:
+        super().__init__(newline="")
+
+    def write(self, line: str) -> int:
+        return super().write(line.removesuffix(self.END) + "\n")

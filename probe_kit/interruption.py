@@ -1,0 +1,28 @@
+"""What Ctrl-C and SIGTERM do before a command has begun, and after."""
+
+import os
+import signal
+
+INTERRUPTED = 130
+"""The exit code of a command that Ctrl-C ended."""
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+def leave_at_once() -> None:
+    """Until `begun`, both end the process in one line: there is nothing yet that could be kept."""
+    for number in _ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell sets it in the background
+            signal.signal(number, _leave)
+
+
+def begun() -> None:
+    """From here on both are a KeyboardInterrupt, because work could be under way that is to be kept."""
+    for number in _ENDING:
+        if signal.getsignal(number) is _leave:
+            signal.signal(number, signal.default_int_handler)
+
+
+def _leave(*_: object) -> None:
+    """End the process from within any import: an exception would end in a traceback, or in the import's own."""
+    os.write(2, b"interrupted before anything was begun\n")
+    os._exit(INTERRUPTED)

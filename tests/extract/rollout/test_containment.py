@@ -1,0 +1,331 @@
+"""A policy that misbehaves costs its own episodes or nothing; other episodes keep every number."""
+
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit.env import SceneSpec
+from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, PolicyFailedError, UsageError
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+from probe_kit.extract.workers.worker_errors import WorkerLostWarning
+from probe_kit.hooks import Observation
+from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.containment import contained
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.suite import Suite, build_suite
+
+ACT = Pi0.act
+PROVED = 2
+"""Inferences of the first call: with hooks and without."""
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
+
+
+@pytest.fixture(scope="module")
+def settings(suite: Suite) -> ExtractSettings:
+    return ExtractSettings(
+        "pi0-tiny", random_weights=True, suite=suite.folder, scene=SceneSpec(max_steps=2), env_workers=0
+    )
+
+
+@pytest.fixture(scope="module")
+def plain(settings: ExtractSettings, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What a policy that behaves leaves."""
+    return numbers(extract_run(settings, tmp_path_factory.mktemp("plain") / "run"))
+
+
+def numbers(run: Run) -> dict[str, str]:
+    """A hash of everything stored that is read: outcomes, paths, pictures, activations."""
+    rows = range(len(run.episodes))
+    values: dict[str, list[Any]] = {
+        "trajectories": [run.trajectory(row).frames for row in rows],
+        "pictures": [np.frombuffer(path.read_bytes(), np.uint8) for path in sorted(run.path.glob("frames/*"))],
+        "activations": [run.rows(stream)[row] for stream in run.streams for row in rows],
+    }
+    assert all(values.values())
+    found = {name: [sha256(array.tobytes()).hexdigest() for array in arrays] for name, arrays in values.items()}
+    return {name: str(digests) for name, digests in found.items()} | {"episodes": run.episodes.to_csv()}
+
+
+def misbehave(monkeypatch: pytest.MonkeyPatch, spoil: Callable[[list[Observation], Any], Any]) -> None:
+    """Let the embedded policy do something else as well at every inference."""
+
+    def act(self: Pi0, seen: list[Observation], seeds: Any) -> Any:
+        return spoil(seen, ACT(self, seen, seeds))
+
+    monkeypatch.setattr(Pi0, "act", act)
+
+
+def reseed(_: Any, chunks: Any) -> Any:
+    torch.manual_seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    random.seed(1)
+    return chunks
+
+
+def scribble(seen: list[Observation], chunks: Any) -> Any:
+    for one in seen:
+        one.image[:] = 0
+        one.state[:] = np.nan
+    return chunks
+
+
+KEPT: list[Any] = []
+
+
+def change_later(_: Any, chunks: Any) -> Any:
+    for old in KEPT:
+        old[:] = np.nan
+    KEPT.append(chunks)
+    return chunks
+
+
+def move(_: Any, chunks: Any) -> Any:
+    os.chdir("/")
+    os.environ["HOME"] = "/nowhere"
+    os.environ["NEW"] = "1"
+    return chunks
+
+
+def coarsen(_: Any, chunks: Any) -> Any:
+    torch.set_default_dtype(torch.float64)
+    return chunks
+
+
+def deafen(_: Any, chunks: Any) -> Any:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return chunks
+
+
+def fork(_: Any, chunks: Any) -> Any:
+    os.fork()
+    return chunks
+
+
+@pytest.mark.parametrize("spoil", [reseed, scribble, change_later, move, deafen, fork])
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_what_a_policy_changes_around_itself_changes_no_number_and_is_put_back(
+    spoil: Any, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    misbehave(monkeypatch, spoil)
+    before = surroundings()
+    extract_run(settings, Path("run"))
+    assert surroundings() == before
+    assert numbers(open_run(tmp_path / "run")) == plain
+    KEPT.clear()
+
+
+def surroundings() -> dict[str, Any]:
+    return {
+        "folder": Path.cwd(),
+        "variables": dict(os.environ),
+        "ctrl-c": signal.getsignal(signal.SIGINT),
+        "streams": (sys.stdout, sys.stderr),
+    }
+
+
+def everything() -> dict[str, Any]:
+    return surroundings() | {
+        "python": random.getstate(),
+        "numpy": np.random.get_state()[1].tolist(),  # noqa: NPY002
+        "torch": torch.get_rng_state().tolist(),
+        "dtype": torch.get_default_dtype(),
+    }
+
+
+@pytest.mark.parametrize("spoil", [reseed, move, coarsen, deafen, fork])
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_all_is_as_it_was_after_a_call(spoil: Any) -> None:
+    before = everything()
+    with acting("mine", "here"):
+        spoil(None, None)
+    assert everything() == before
+    with suppress(PolicyFailedError), acting("mine", "here"):
+        raise spoil(None, ValueError("and then this"))
+    assert everything() == before
+
+
+class Wild:
+    """No array, and no number either."""
+
+    shape, dtype = (1, 2, 7), np.dtype(np.float32)
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise KeyError("no array")
+
+
+def press(_: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+def generator_exit(_: Any) -> Any:
+    raise GeneratorExit
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (press, "failed while it acted: KeyboardInterrupt"),
+        (generator_exit, "failed while it acted: GeneratorExit"),
+        (lambda _: Wild(), "the policy gave a Wild for 1 observations"),
+        (lambda chunks: chunks.tolist(), "the policy gave a list for 1 observations"),
+        (lambda chunks: torch.from_numpy(chunks), "the policy gave a Tensor for 1 observations"),
+        (lambda chunks: chunks.astype(np.float64), r"ndarray of shape \(1, \d+, 7\) and float64"),
+        (lambda chunks: chunks.astype(object), r"ndarray of shape \(1, \d+, 7\) and object"),
+        (lambda chunks: chunks[:, :0], r"ndarray of shape \(1, 0, 7\) and float32"),
+        (lambda chunks: chunks * np.inf, "is not finite"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_what_is_no_action_costs_its_own_episode_by_name_and_no_other(
+    spoil: Any, words: str, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    seen: list[Any] = []
+
+    def once(_: Any, chunks: Any) -> Any:
+        """The third inference of all; its episode is tried again, and is the last one then."""
+        seen.append(None)
+        return spoil(chunks) if len(seen) == PROVED + 1 else chunks
+
+    misbehave(monkeypatch, once)
+    extract_run(settings, tmp_path / "once")
+    assert numbers(open_run(tmp_path / "once")) == plain
+    misbehave(monkeypatch, lambda _, chunks: spoil(chunks))
+    with pytest.raises((EpisodesFailedError, PolicyFailedError)) as caught:
+        extract_run(settings, tmp_path / "always")
+    notes = getattr(caught.value, "__notes__", [str(caught.value)])
+    assert all(re.search(words, note) for note in notes), notes
+
+
+def test_a_policy_that_draws_from_global_numbers_is_refused(
+    settings: ExtractSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    misbehave(monkeypatch, lambda _, chunks: chunks + np.float32(np.random.rand()))  # noqa: NPY002
+    with pytest.raises(CaptureChangedActionError, match="not deterministic"):
+        extract_run(settings, tmp_path / "run")
+
+
+def test_what_a_policy_prints_is_text_on_stderr(
+    settings: ExtractSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def shout(_: Any, chunks: Any) -> Any:
+        print("\x1b[31mred\x1b]0;title\x07 \u202e")
+        sys.stderr.write("\x1b[2J")
+        return chunks
+
+    misbehave(monkeypatch, shout)
+    extract_run(settings, tmp_path / "run")
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "␛[31mred␛]0;title␇ \ufffd\n␛[2J" in shown.err
+    assert not UNSAFE.search(shown.err)
+
+
+def press_ctrl_c() -> None:
+    with acting("mine", "here"):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+
+def press_nothing() -> None:
+    with acting("mine", "here"):
+        raise KeyboardInterrupt
+
+
+def test_only_a_real_ctrl_c_in_a_policy_is_one() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        press_ctrl_c()
+    with pytest.raises(PolicyFailedError, match="mine failed while it acted: KeyboardInterrupt"):
+        press_nothing()
+
+
+HANGING = f"""
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
+from probe_kit.hooks.contract.family import Family
+
+FAMILY = Family("theirs", "a family of others that hangs", None, "their_policy:load")
+
+class Hanging(Pi0):
+    calls = 0
+
+    def act(self, seen, seeds):
+        self.calls += 1
+        while self.calls == {PROVED + 1}:
+            pass
+        return super().act(seen, seeds)
+
+def load(*arguments, **options):
+    policy = load_pi0_tiny(*arguments, **options)
+    policy.__class__ = Hanging
+    return policy
+"""
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A package with the entry point, installed here and in every worker; the name of its family."""
+    folder = tmp_path / "site"
+    about = folder / "their_policy-1.0.dist-info"
+    about.mkdir(parents=True)
+    (folder / "their_policy.py").write_text(HANGING, encoding="utf-8")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-policy\nVersion: 1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text("[probe_kit.policies]\nx = their_policy:FAMILY\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(folder)
+    return "theirs"
+
+
+@pytest.mark.slow
+def test_a_model_that_hangs_in_a_worker_is_ended_and_its_episodes_are_played_again(
+    installed: str, settings: ExtractSettings, tmp_path: Path
+) -> None:
+    """The third call of every worker hangs: the first episode of each is kept, and the last ones are named."""
+    hurried = replace(settings, model=installed, workers=1, inference_limit=15.0)
+    said = r"worker 0 was ended, because a call of its model took longer than --inference-limit 15 s"
+    with pytest.warns(WorkerLostWarning, match=said), suppress(EpisodesFailedError):
+        extract_run(hurried, tmp_path / "run")
+    assert len(open_run(tmp_path / "run", allow_partial=True).episodes) >= 2
+
+
+def test_a_limit_without_a_process_that_can_be_ended_is_wrong_usage(settings: ExtractSettings) -> None:
+    with pytest.raises(UsageError, match="add --workers 1"):
+        replace(settings, inference_limit=5.0)
+    for limit in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(UsageError, match="inference_limit is"):
+            replace(settings, workers=1, inference_limit=limit)
+
+
+def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
+    assert replace(settings, workers=1, inference_limit=5.0).choices() == settings.choices()
+
+
+def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
+    code = "from probe_kit.hooks.containment import contained\nwith contained(0.2):\n  sum(range(10**12))"
+    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
+    assert done.returncode == -signal.SIGALRM
+
+
+def test_a_call_within_its_limit_is_not_ended_later() -> None:
+    with contained(0.2):
+        pass
+    time.sleep(0.3)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -1,0 +1,126 @@
+"""No cell of a CSV that probe_kit writes is a formula to a spreadsheet, and every text comes back."""
+
+import ast
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probe_kit.csv_text import csv_of_frame, csv_of_rows, escaped, rows_of_csv, unescaped
+from probe_kit.errors import SuiteError
+from probe_kit.suite import Suite
+from probe_kit.suite.converters.curation import read_curation
+from probe_kit.suite.manifest import save_suite
+
+ROOT = Path(__file__).parents[1]
+FORMULAS = [
+    "=1+1",
+    "+1",
+    "-1",
+    "@SUM(A1)",
+    "\t=1",
+    "\r=1",
+    "\n=1",
+    " =1",
+    "=cmd|' /C calc'!A0",
+    "'=1",
+    "''@x",
+    "＝1",
+]
+texts = st.text(st.sampled_from("=+-@'\t\r\n ,\"aé＝0"), max_size=6)
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_a_text_that_would_be_computed_gets_a_mark_in_front(text: str) -> None:
+    assert escaped(text) == f"'{text}"
+    assert unescaped(escaped(text)) == text
+
+
+@pytest.mark.parametrize("cell", [-0.5, -3, float("nan"), None, True, "", "a=b", "x-1", "'quoted'", "5 − 2"])
+def test_numbers_and_plain_texts_stay_as_they_are(cell: object) -> None:
+    assert escaped(cell) is cell
+
+
+@given(texts)
+def test_every_text_comes_back(text: str) -> None:
+    assert unescaped(escaped(text)) == text
+    assert not escaped(text).lstrip().startswith(("=", "+", "-", "@"))
+
+
+@given(st.lists(st.tuples(texts, texts), max_size=4))
+def test_rows_come_back_from_csv(rows: list[tuple[str, str]]) -> None:
+    written = [dict(zip(("=a", "b"), row, strict=True)) for row in rows]
+    assert rows_of_csv(csv_of_rows(("=a", "b"), written)) == written
+
+
+def test_a_frame_keeps_its_numbers_and_marks_its_texts() -> None:
+    frame = pd.DataFrame(
+        {
+            "@name": ["=1+1", "plain", None],
+            "share": [-0.5, np.nan, 1e-9],
+            "count": [-1, 2, 3],
+            "mixed": ["-x", -1, None],
+            "kind": pd.Categorical(["+a", "b", "+a"]),
+        }
+    )
+    before = frame.copy(deep=True)
+    header, *rows = csv.reader(io.StringIO(csv_of_frame(frame)))
+    assert header == ["'@name", "share", "count", "mixed", "kind"]
+    assert rows == [
+        ["'=1+1", "-0.5", "-1", "'-x", "'+a"],
+        ["plain", "", "2", "-1", "b"],
+        ["", "1e-09", "3", "", "'+a"],
+    ]
+    pd.testing.assert_frame_equal(frame, before)
+
+
+def test_a_frame_without_such_texts_is_written_as_pandas_writes_it() -> None:
+    frame = pd.DataFrame({"a": [None, 1], "b": ["x", "y, z"], "c": [True, False], "d": [[1], [2]]}, dtype=object)
+    assert csv_of_frame(frame) == frame.to_csv(index=False)
+
+
+def test_every_csv_of_the_package_goes_through_one_function() -> None:
+    others = [
+        f"{path.relative_to(ROOT)}:{call.lineno}"
+        for path in sorted((ROOT / "probe_kit").rglob("*.py"))
+        if path.name != "csv_text.py"
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Attribute)
+        and (
+            call.func.attr in ("DictWriter", "savetxt")
+            or (call.func.attr == "writer" and getattr(call.func.value, "id", "") == "csv")
+            or (call.func.attr == "to_csv" and call.keywords)
+        )
+    ]
+    assert others == []
+
+
+def test_the_attribution_of_a_suite_is_no_formula(small_suite: Suite, tmp_path: Path) -> None:
+    items = tuple(replace(item, attribution="=HYPERLINK(0)") for item in small_suite.items)
+    pictures = {
+        item.file_name(side): item.picture(side).read_bytes()
+        for item in small_suite.items
+        for side in ("left", "right")
+    }
+    made = save_suite(replace(small_suite, items=items), pictures, {}, tmp_path / "suite")
+    rows = list(csv.DictReader((made.folder / "ATTRIBUTION.csv").open(encoding="utf-8", newline="")))
+    assert {row["attribution"] for row in rows} == {"'=HYPERLINK(0)"}
+
+
+def test_a_curation_file_that_is_no_csv_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "review.csv"
+    path.write_text('candidate_id\n"' + "x" * 200_000, encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"review\.csv: not valid CSV \(field larger"):
+        read_curation(path)
+
+
+def test_a_carriage_return_in_a_cell_is_no_end_of_a_row() -> None:
+    text = csv_of_frame(pd.DataFrame({"a": ["x\ry", "x\r\ny"], "b": [1, 2]}))
+    assert text == 'a,b\n"x\ry",1\n"x\r\ny",2\n'
