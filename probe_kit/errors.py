@@ -60,6 +60,10 @@ class SuiteError(ProbeKitError):
     """The suite is invalid: a picture is missing or changed, a field is wrong, the hash differs."""
 
 
+class SuiteNotFoundError(UsageError):
+    """The pictures of a run's suite are needed, no folder was given, and they cannot be drawn again."""
+
+
 class SceneError(ProbeKitError):
     """The scene cannot be built as described, such as overlapping outcome zones."""
 

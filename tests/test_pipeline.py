@@ -34,7 +34,7 @@ def planted_run(recorded_run: Run, tmp_path: Path) -> Run:
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> None:
-    scores = train_probes(planted_run, ["shape"], permutations=20, jobs=1).scores.set_index("site")
+    scores = train_probes(planted_run, ["shape"], permutations=20, controls=(), jobs=1).scores.set_index("site")
     best = scores["accuracy"].idxmax()
     assert best == str(PLANTED)
     assert scores.loc[best, "accuracy"] == 1.0
@@ -49,5 +49,5 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_with_shuffled_labels_nothing_is_significant(planted_run: Run) -> None:
-    results = train_probes(planted_run, ["color"], permutations=20, target="shuffled", jobs=1)
+    results = train_probes(planted_run, ["color"], permutations=20, target="shuffled", controls=(), jobs=1)
     assert (results.scores["p_fwe"] >= 0.05).all()

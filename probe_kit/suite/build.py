@@ -22,12 +22,14 @@ from probe_kit.suite.manifest import load_suite, refuse_foreign_folder, save_sui
 from probe_kit.suite.suite import Suite
 
 Progress = Callable[[int, int], None]
+ITEMS = 150
+"""Items per category, unless another number is asked for."""
 
 
 def build_suite(
     folder: Path | str,
     categories: Sequence[str] | None = None,
-    items_per_category: int = 150,
+    items_per_category: int = ITEMS,
     seed: int = 0,
     progress: Progress | None = None,
     version: int = DEFAULT_VERSION,
@@ -60,7 +62,7 @@ def build_suite(
 
 def default_suite(
     categories: Sequence[str] | None = None,
-    items_per_category: int = 150,
+    items_per_category: int = ITEMS,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Suite:
@@ -74,10 +76,17 @@ def default_suite(
     return build_suite(folder, categories, items_per_category, seed, progress)
 
 
-def default_folder(categories: Sequence[str] | None = None, items_per_category: int = 150, seed: int = 0) -> Path:
+def default_folder(
+    categories: Sequence[str] | None = None, items_per_category: int = ITEMS, seed: int = 0
+) -> Path:
     """Where `default_suite` keeps the suite of these arguments, whether it was built yet or not."""
     key = _cache_key(_options(categories, items_per_category, seed))
-    return _cache_folder() / "suites" / f"{SUITE_NAME}-{SUITE_VERSIONS[DEFAULT_VERSION]}-{key}"
+    return _cache_folder() / "suites" / f"{default_identity().replace('@', '-')}-{key}"
+
+
+def default_identity() -> str:
+    """`name@version` of what `default_suite` draws."""
+    return f"{SUITE_NAME}@{SUITE_VERSIONS[DEFAULT_VERSION]}"
 
 
 def _options(categories: Sequence[str] | None, items_per_category: int, seed: int) -> dict[str, Any]:

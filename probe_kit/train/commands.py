@@ -9,7 +9,7 @@ from rich.text import Text
 
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
-from probe_kit.errors import UsageError
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,19 +45,22 @@ def train(
     controls: Annotated[
         str | None,
         typer.Option(
-            help="Comma-separated: position, instruction, pixels, binding, or none. Default binding, if the "
-            "suite is at hand: --suite, or the embedded one."
+            help="Comma-separated: position, instruction, pixels, binding, or none. Default binding; without the "
+            "suite's pictures it is left out, with a warning."
         ),
     ] = None,
-    suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels and binding.")] = None,
+    suite: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the run's suite, for pixels and binding; default the embedded one."),
+    ] = None,
     twin: Annotated[
         str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
     call: Annotated[
         str,
         typer.Option(
-            help="Captured inferences to probe, counted from 0 and comma-separated, or all; see extract "
-            "--captured-calls."
+            help="Captured inferences to probe, counted from 0 and comma-separated, or all that enough episodes "
+            "reached; see extract --captured-calls."
         ),
     ] = "0",
     wording: Annotated[
@@ -80,38 +83,45 @@ def train(
     """
     from probe_kit.extract import open_run
     from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes
-    from probe_kit.train.controls.baselines import embedded_suite_of
 
     asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
     units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
     rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     beside = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
-    pictures = suite or embedded_suite_of(opened)
+    left_out: dict[int, Exception] = {}
     for number in _calls(call, opened):
-        with progress() as bar:
-            results = train_probes(
-                opened,
-                split(categories),
-                split(views) or (),
-                permutations=permutations,
-                token_permutations=token_permutations,
-                target=asked,
-                call=number,
-                folds=units,
-                incomplete=rest,
-                controls=baselines if baselines is not None else _default_controls(pictures),
-                suite=pictures,
-                twin=beside,
-                seed=seed,
-                jobs=jobs,
-                device=device,
-                ray=ray,
-                progress=counter(bar, f"sites, call {number}" if number else "sites"),
-            )
+        try:
+            with progress() as bar:
+                results = train_probes(
+                    opened,
+                    split(categories),
+                    split(views) or (),
+                    permutations=permutations,
+                    token_permutations=token_permutations,
+                    target=asked,
+                    call=number,
+                    folds=units,
+                    incomplete=rest,
+                    controls=baselines,
+                    suite=suite,
+                    twin=beside,
+                    seed=seed,
+                    jobs=jobs,
+                    device=device,
+                    ray=ray,
+                    progress=counter(bar, f"sites, call {number}" if number else "sites"),
+                )
+        except (TooFewGroupsError, UnbalancedEpisodesError) as error:
+            if call != "all" or number == 0:
+                raise
+            left_out[number] = error
+            continue
         _print_peaks(results, opened.random_weights)
+    for number, reason in left_out.items():
+        say(marked("[yellow]left out:[/] call {}: {}", number, reason))
     if not results.controls.excess:
-        say("signal is judged against chance only: give --suite, or a --twin by random weights")
+        say("signal is judged against chance only: add the control binding, or a --twin by random weights")
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
@@ -196,10 +206,6 @@ def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":
     if names == "none":
         return ()
     return tuple(cast("Baseline", _one_of("control", name, BASELINES)) for name in split(names) or ())
-
-
-def _default_controls(suite: Path | None) -> "tuple[Baseline, ...]":
-    return () if suite is None else ("binding",)
 
 
 def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:

@@ -41,7 +41,7 @@ def train_probes(
     call: int = 0,
     folds: FoldUnit = "groups",
     incomplete: Incomplete = "keep",
-    controls: Sequence[Baseline] = (),
+    controls: Sequence[Baseline] | None = None,
     suite: Path | None = None,
     twin: RunReader | None = None,
     seed: int = 0,
@@ -58,8 +58,10 @@ def train_probes(
     `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
     out. folds: `concepts` also keeps items about the same two concepts together.
     incomplete: `drop` leaves out items of which an episode is missing.
-    controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`,
-    which need the `suite`'s folder. twin: a run of the same episodes, usually by random weights, to subtract.
+    controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`, which
+    need pictures; () for none. By default `binding`; where the pictures cannot be found a warning says that it was
+    left out. suite: folder of the run's suite; the embedded one is found or drawn again without it.
+    twin: a run of the same episodes, usually by random weights, to subtract.
     What is no better than `binding` and the twin is no signal, whatever its p-value.
     jobs: processes that probe, this one alone by default; with more than one, a script needs
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
@@ -73,12 +75,14 @@ def train_probes(
     stored before all of it is fitted: where this raises, `load_results` finds what it found before.
     Raises RunIncompleteError for a run without episodes, NoProbesError for one without activations,
     UnknownCategoryError, UnknownSiteError for a view no stream has, TooFewGroupsError, UnbalancedEpisodesError,
-    ProbeNotConvergedError, UsageError, and SuiteError for another suite.
+    ProbeNotConvergedError, UsageError, SuiteError for another suite, and SuiteNotFoundError for a control that was
+    asked for and whose pictures cannot be found.
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
     crew = CrewSettings(jobs, device, ray)
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
+    categories = _categories(run, categories)
     run = at_call(run, call)
     asked = _settings(
         run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
@@ -159,9 +163,18 @@ class _Sweep:
         return load_results(self.run, self.settings.key)
 
 
+def _categories(run: RunReader, asked: Sequence[str] | None) -> Sequence[str]:
+    """What was asked, or all of the run, whichever of its episodes got as far as the call that is probed."""
+    known = list(dict.fromkeys(run.episodes["category"]))
+    for category in asked or ():
+        if category not in (*known, POOLED):
+            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
+    return asked or known
+
+
 def _settings(
     run: RunReader,
-    categories: Sequence[str] | None,
+    categories: Sequence[str],
     views: Sequence[str],
     target: Target,
     folds: FoldUnit,
@@ -173,10 +186,6 @@ def _settings(
 ) -> ProbeSettings:
     if not run.streams:
         raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
-    known = list(dict.fromkeys(run.episodes["category"]))
-    for category in categories or ():
-        if category not in (*known, POOLED):
-            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
     return ProbeSettings(
         model=run.label,
         random_weights=run.random_weights,
@@ -184,7 +193,7 @@ def _settings(
         suite=run.suite,
         run_settings=run.settings_sha256,
         episodes=episodes_sha256(run),
-        categories=tuple(categories or known),
+        categories=tuple(categories),
         views=tuple(views),
         target=target,
         permutations=permutations,

@@ -24,7 +24,7 @@ def probed(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple
     """Probes of a copy of the recorded run, so that other tests find theirs the newest."""
     copy = shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("probed") / "run")
     run = open_run(copy)
-    return run, train_probes(run, ["color"], permutations=20)
+    return run, train_probes(run, ["color"], permutations=20, controls=())
 
 
 def run_cells(sources: list[str], folder: Path) -> list[NotebookNode]:
@@ -46,7 +46,7 @@ FIGURES = {
     "layer_curve, after pyplot came in": "pk.layer_curve(results)",
 }
 OBJECTS = ("run", "results", "table")
-FITTING = "fitted = pk.train_probes(run, ['shape'], permutations=0, seed=11)"
+FITTING = "fitted = pk.train_probes(run, ['shape'], permutations=0, seed=11, controls=())"
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UnknownSiteError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, seal, verify_run
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
@@ -154,3 +156,79 @@ def test_more_inferences_than_an_episode_can_have_are_refused(small_suite: Suite
     )
     with pytest.raises(UsageError, match="have at most 2"):
         prepare(settings)
+
+
+@pytest.fixture(scope="module")
+def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Captured at six inferences at most: two categories, of which few reach the fourth and none the sixth.
+
+    All episodes have three. Of Color, four of one layout have a fourth; of Shape, all; one episode has a fifth.
+    """
+    settings = {
+        "captured_calls": 6, "tokens": "pooled", "codec": "zstd", "model": "synthetic", "random_weights": False,
+        "weights_sha256": None, "suite": {"identity": small_suite.identity},
+    }  # fmt: skip
+    plan = make_plan(small_suite, [STREAM], 0, 6, False)
+    writer = RunWriter(locate(tmp_path_factory.mktemp("early") / "run"), plan, settings)
+    left: list[int] = [e.index for e in plan.episodes if e.episode.item.category == "color"
+                       and e.episode.side_correct == "left"][:4]  # fmt: skip
+    for planned in plan.episodes:
+        fourth = planned.index in left or planned.episode.item.category == "shape"
+        draw = np.random.default_rng(planned.index)
+        buffers = EpisodeBuffers([STREAM], 6, False, pinned=False)
+        for call in range(3 + fourth + (planned.index == left[0])):
+            buffers.pooled["backbone"][call] = draw.normal(size=(2, 3, 8))
+            buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
+        outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
+        writer.write(Rollout(planned, outcome, buffers, []).record)
+    seal(writer.location)
+    return open_run(writer.location)
+
+
+def fit(run: Run, *options: str) -> tuple[int, str]:
+    asked = ["train", str(run.location), "--permutations", "0", "--controls", "none", *options]
+    answer = CliRunner().invoke(app, asked)
+    return answer.exit_code, " ".join(answer.stderr.split())
+
+
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
+def test_all_inferences_are_those_that_enough_episodes_reached_and_the_others_are_named(early: Run) -> None:
+    code, said = fit(early, "--call", "all")
+    assert code == 0, said
+    assert "left out: call 3: category 'color': classes are not balanced, chance is 1.000" in said
+    assert "left out: call 4: category 'color': " in said
+    assert "left out: call 5: category 'color': no episode got as far as captured inference 5" in said
+    assert said.count("left out") == 3
+    assert list(load_calls(early, load_results(early))) == [0, 1, 2]
+    assert (
+        fit(early, "--call", "all", "--categories", "shape")[1].count("left out") == 2
+    )  # of Shape all had the fourth
+
+
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
+@pytest.mark.parametrize("call", [3, 4, 5])
+@pytest.mark.parametrize("target", ["correct", "shuffled"])
+def test_of_an_inference_that_few_episodes_reached_nothing_is_said_to_be_missing(
+    early: Run, call: int, target: str
+) -> None:
+    code, said = fit(early, "--call", str(call), "--target", target)
+    assert code in (1, 3)
+    number = {3: "only 4 episodes", 4: "only 1 episode", 5: "no episode"}[call]
+    assert f"{number} got as far as captured inference {call}, counted from 0" in said
+    assert "xtract" not in said
+    assert "missing" not in said
+    assert "defect" not in said
+
+
+@pytest.mark.parametrize("call", [3, 5])
+def test_a_category_that_ended_before_an_inference_is_still_one_of_the_run(early: Run, call: int) -> None:
+    for categories in (None, ["color"], ["shape", "color"]):
+        with pytest.raises((TooFewGroupsError, UnbalancedEpisodesError), match=r"'color'|'shape'"):
+            train_probes(early, categories, permutations=0, call=call, controls=())
+
+
+def test_a_twin_whose_episodes_ended_at_other_times_is_not_said_to_be_of_another_suite(
+    early: Run, run: Run
+) -> None:
+    with pytest.raises(UsageError, match="captured inference 1: leave --call or --twin out"):
+        train_probes(run, ["color"], permutations=0, call=1, controls=(), twin=early, incomplete="drop")

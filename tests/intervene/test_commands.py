@@ -80,7 +80,7 @@ def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
         (("--categories", "colour"), 2, "color, shape"),
         (("--items", "0"), 2, "at least 1"),
         (("--wording", "named"), 2, "no wording"),
-        (("--items", "3"), 2, "--suite"),
+        (("--items", "3", "--suite", "nowhere"), 2, "is not a suite"),
     ],
 )
 def test_what_cannot_be_is_refused(run: Run, options: tuple[str, ...], code: int, words: str) -> None:
@@ -121,7 +121,7 @@ def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
         (("--roles", "image"), "go with --sites"),
         (("--doses", "1"), "--doses means nothing to --kind closed-loop"),
         (("--sites", "backbone.02", "--direction", "none", "--controls", "1"), "--controls 0"),
-        (("--sites", "backbone.02"), "--suite"),
+        (("--sites", "backbone.02", "--suite", "nowhere"), "is not a suite"),
     ):
         code, _, said = ask(run, "--kind", "closed-loop", *options)
         assert code == 2

@@ -22,7 +22,7 @@ from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.intervene import Effects, Follow, Source, intervene_on, load_effects, stored_interventions
 from probe_kit.intervene.replay.rollout import planned_of
-from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.session import Bench, open_bench
 from probe_kit.retention import retention
 
 if TYPE_CHECKING:
@@ -215,10 +215,23 @@ def test_another_policy_another_suite_another_category_are_refused(
         intervene_on(copy, Follow(items=1), Source(other.folder), load=lambda *_: twin)
     with pytest.raises(UnknownCategoryError, match="color, shape"):
         intervene_on(copy, Follow(categories=("colour",)), source, load=lambda *_: twin)
-    with pytest.raises(UsageError, match="--suite"):
-        intervene_on(copy, Follow(items=1), load=lambda *_: twin)
     with pytest.raises(UsageError, match="at least 1"):
         Follow(items=0)
+
+
+@pytest.mark.parametrize("where", ["drawn again", "found among more items"])
+def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
+    where: str, copy: Run, twin: "Policy", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from probe_kit.suite import build_suite
+    from probe_kit.suite.build import default_folder
+
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
+    if where == "found among more items":
+        build_suite(default_folder(["color", "shape"]), ["color", "shape"], 14)
+    with open_bench(copy, Source(), lambda *_: twin) as bench:  # the first frames are the run's, or this raises
+        assert len(bench.questions(str(copy.episodes["item_id"].iloc[0]))) == 2
+    assert len(list((tmp_path / "suites").iterdir())) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Reading a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from copy import copy
 from functools import cached_property
 from pathlib import Path
@@ -242,6 +242,11 @@ class Run:
     def planned(self) -> int:
         """Episodes the plan has, committed or not."""
         return len(self._plan)
+
+    @cached_property
+    def planned_items(self) -> Mapping[str, str]:
+        """Category of every item of the plan by its id, in whatever wording it was asked."""
+        return {str(one["item_id"]): str(one["category"]) for one in self.root.plan}
 
     @cached_property
     def _plan(self) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ from probe_kit.errors import (
     NoTrajectoryError,
     OtherFramesError,
     SettingsMismatchError,
-    UsageError,
 )
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL
@@ -29,7 +28,7 @@ from probe_kit.hooks.containment import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.counterparts import twins_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
-from probe_kit.train.controls.baselines import embedded_suite_of, suite_of
+from probe_kit.train.run_suite import suite_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -50,8 +49,8 @@ class Progress(Protocol):
 class Source:
     """Where a run's policy, pictures and files are found again; what is found must have the run's hashes.
 
-    suite: folder; None for the embedded suite. checkpoint, options, weights_seed, device: as for `probe-kit
-    extract`. files: of the scene, by field, such as `background`.
+    suite: folder; None for the embedded suite, which is drawn again if need be. checkpoint, options, weights_seed,
+    device: as for `probe-kit extract`. files: of the scene, by field, such as `background`.
     """
 
     suite: Path | None = None
@@ -206,23 +205,14 @@ def open_bench(run: Run, source: Source, load: "Callable[[Run, Source], Policy] 
     """Load the run's policy and set up its scene.
 
     load: how the policy is found, if not by its name. Raises SettingsMismatchError if it is another one,
-    SuiteError for another suite, SceneError for a scene that needs a file which is not given.
+    SuiteError for another suite, SuiteNotFoundError for one that is neither given nor can be drawn again,
+    SceneError for a scene that needs a file which is not given.
     """
     scene = SceneSpec.from_json(run.settings["scene"], source.files)
-    suite = suite_of(run.whole, source.suite or _embedded(run))
+    suite = suite_of(run, source.suite)
     policy = (load or load_policy_of)(run, source)
     _check_policy(run, policy)
     return Bench(run, policy, scene, {item.item_id: item for item in suite.items})
-
-
-def _embedded(run: Run) -> Path:
-    folder = embedded_suite_of(run)
-    if folder is None:
-        raise UsageError(
-            f"{run.location} was extracted from {run.suite}, whose pictures are needed again: give its folder as "
-            "--suite"
-        )
-    return folder
 
 
 def load_policy_of(run: Run, source: Source) -> "Policy":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import SuiteError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -21,64 +21,28 @@ BASELINES: dict[str, str] = {
     "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
     "binding": "random nonlinear features of pictures and words together, as wide as the site; needs the suite",
 }
+PICTURED: frozenset[Baseline] = frozenset({"pixels", "binding"})
+"""Those that need the pictures of the run's suite."""
+DEFAULT: tuple[Baseline, ...] = ("binding",)
+"""Those that are run unless others, or none, are asked for."""
 THUMBNAIL = 32
 
 Features = NDArray[np.float32]
 
 
-def baseline_features(run: RunReader, name: Baseline, suite: Path | None) -> Features:
+def baseline_features(run: RunReader, name: Baseline, suite: "Suite | None") -> Features:
     """(E, D) features of a baseline but `binding`, rows in the order of the run's episodes.
 
-    Raises UsageError for an unknown name, a missing column or a missing suite, SuiteError for another suite.
+    suite: the run's, for `pixels`. Raises UsageError for an unknown name or a missing column.
     """
     if name == "position":
         return _layout(run.episodes)
     if name == "instruction":
         return _words(run)
     if name == "pixels":
-        return tile_pixels(run.episodes, suite_of(run, needed(suite, name)), THUMBNAIL)
+        assert suite is not None, "what needs pictures is given them"
+        return tile_pixels(run.episodes, suite, THUMBNAIL)
     raise UsageError(f"unknown control {name!r}; expected one of {', '.join(BASELINES)}")
-
-
-def needed(suite: Path | None, name: Baseline) -> Path:
-    """`suite`, for a baseline that needs it. Raises UsageError without one."""
-    if suite is None:
-        raise UsageError(f"the control {name!r} needs the pictures: give the folder of the run's suite as `suite`")
-    return suite
-
-
-def suite_of(run: RunReader, folder: Path) -> "Suite":
-    """The suite in `folder`, if it is the run's, or holds the run's items as part of it.
-
-    Raises SuiteError if neither hash is the one the run was extracted with.
-    """
-    from probe_kit.suite import load_suite
-    from probe_kit.suite.suite import content_sha256
-
-    suite, ids = load_suite(folder), set(run.episodes["item_id"])
-    expected = run.suite.rpartition("#")[2]
-    part = content_sha256(item for item in suite.items if item.item_id in ids)
-    if not (suite.content_sha256.startswith(expected) or part.startswith(expected)):
-        raise SuiteError(
-            f"{folder} holds {suite.identity}, and its items that {run.location} has hash to {part[:12]}; the run "
-            f"was extracted from {run.suite}. Give that suite's folder, and a run with all its episodes."
-        )
-    return suite
-
-
-def embedded_suite_of(run: RunReader) -> Path | None:
-    """Folder of the embedded suite, if it was built here and the run's pictures come from it."""
-    from probe_kit.suite.build import default_folder
-    from probe_kit.suite.generators.couples import SUITE_NAME
-
-    folder = default_folder()
-    if not run.suite.startswith(f"{SUITE_NAME}@") or not folder.is_dir():
-        return None
-    try:
-        suite_of(run, folder)
-    except SuiteError:  # drawn with another seed or version
-        return None
-    return folder
 
 
 def _layout(episodes: "pd.DataFrame") -> Features:

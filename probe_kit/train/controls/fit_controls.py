@@ -1,5 +1,6 @@
 """Fitting the controls of probe results: what can be wrong with them is found before anything is fitted."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.label_permutations import site_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
-from probe_kit.train.controls.baselines import Baseline, baseline_features, needed
+from probe_kit.train.controls.baselines import DEFAULT, PICTURED, Baseline, baseline_features
 from probe_kit.train.controls.random_features import BindingInputs, binding_scores
 from probe_kit.train.crossval.category_problem import POOLED, category_problem
 from probe_kit.train.crossval.metrics import chance_level, correctness
@@ -22,6 +23,7 @@ from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, Excess, TwinScore
 from probe_kit.train.results.probe_curve import Curve
 from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.run_suite import suite_of
 from probe_kit.train.settings import ProbeSettings
 
 
@@ -34,17 +36,35 @@ class Prepared:
 
 
 def prepare_baselines(
-    run: RunReader, names: Sequence[Baseline], suite: Path | None, stored: ProbeResults | None
+    run: RunReader, names: Sequence[Baseline] | None, folder: Path | None, stored: ProbeResults | None
 ) -> Prepared:
     """Features of the baselines `names` that `stored` does not have yet.
 
-    Before anything is probed, so that what is wrong with them is said first. Raises what `baseline_features`
-    raises.
+    names: None for `DEFAULT`, which is left out, with a warning, where its pictures cannot be found. folder: of
+    the run's suite, see `suite_of`. Before anything is probed, so that what is wrong with them is said first.
+    Raises what `baseline_features` and `suite_of` raise.
     """
-    missing = [name for name in names if stored is None or not _has(stored, name)]
+    missing = [name for name in (DEFAULT if names is None else names) if stored is None or not _has(stored, name)]
+    suite = None
+    if PICTURED.intersection(missing):
+        try:
+            suite = suite_of(run, folder)
+        except SuiteNotFoundError as error:
+            if names is not None:
+                raise
+            _warn_of_no_control(missing, error)
+            missing = []
     features = {name: baseline_features(run, name, suite) for name in missing if name != BINDING}
-    binding = BindingInputs.of(run, needed(suite, BINDING)) if BINDING in missing else None
+    binding = BindingInputs.of(run, suite) if suite is not None and BINDING in missing else None
     return Prepared(features, binding)
+
+
+def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError) -> None:
+    warnings.warn(
+        f"the control {', '.join(left_out)} is on by default and was NOT run, so that a signal is judged against "
+        f"chance only: {reason}; or say that you want none (--controls none, controls=())",
+        stacklevel=4,
+    )
 
 
 def add_baselines(results: ProbeResults, run: RunReader, prepared: Prepared) -> ProbeResults:
@@ -90,9 +110,13 @@ def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None
         raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
     here, there = (_labels_by_episode(one, settings) for one in (run, twin))
     if here != there:
+        mend = "Extract both from the same suite"
+        if settings.call > 0:
+            reached = f"Not the same episodes got as far as captured inference {settings.call}"
+            mend = f"{reached}: leave --call or --twin out"
         raise UsageError(
             f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
-            "are not the same. Extract both from the same suite."
+            f"are not the same. {mend}."
         )
     if run.settings_sha256 == twin.settings_sha256:
         raise UsageError(

@@ -7,7 +7,7 @@ site it is compared with, on the tiles and the words alone; a model that knows m
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,16 @@ from numpy.typing import NDArray
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
 from probe_kit.statistics.paired_bootstrap import better_than_reference
-from probe_kit.train.controls.baselines import Features, suite_of, tile_pixels, word_counts
+from probe_kit.train.controls.baselines import Features, tile_pixels, word_counts
 from probe_kit.train.crossval.category_problem import CategoryProblem, category_problem
 from probe_kit.train.crossval.metrics import chance_level, correctness
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.control_scores import BINDING, BaselineScore, Excess
 from probe_kit.train.results.probe_results import ProbeResults
+
+if TYPE_CHECKING:
+    from probe_kit.suite import Suite
 
 SIDE = 12
 """Pixels along a tile: enough for colours and coarse shapes."""
@@ -37,9 +40,9 @@ class BindingInputs:
     words: Features
 
     @classmethod
-    def of(cls, run: RunReader, suite: Path) -> "BindingInputs":
-        """From the run's suite. Raises SuiteError for another one, UsageError without instructions."""
-        return cls(tile_pixels(run.episodes, suite_of(run, suite), SIDE), word_counts(run))
+    def of(cls, run: RunReader, suite: "Suite") -> "BindingInputs":
+        """From the run's suite. Raises UsageError without instructions."""
+        return cls(tile_pixels(run.episodes, suite, SIDE), word_counts(run))
 
     def layer(self, rows: NDArray[np.intp], width: int, seed: int) -> Features:
         """(N, width) outputs of a random tanh layer, to which pictures and words give equal shares."""

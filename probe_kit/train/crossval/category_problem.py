@@ -68,11 +68,16 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
     rows = np.flatnonzero(chosen & (defined >= 0))
     table, labels = episodes.iloc[rows], defined[rows] == 1
     groups = fold_units(table, settings.folds)
+    if settings.call > 0 and groups.size == 0:
+        raise TooFewGroupsError(f"category {category!r}: {_reached(0, settings.call)}")
     if settings.target != "chosen":
-        _check_balance(labels, category)
+        _check_balance(labels, category, settings.call)
     try:
         folds = nested_folds(labels, groups, derive_seed("folds", settings.seed, category))
     except TooFewGroupsError as error:
+        if settings.call > 0:
+            seen = f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
+            raise TooFewGroupsError(f"category {category!r}: {seen}, too few for folds") from error
         raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
     relabellings = _relabel(table, labels, groups, category, settings, folds)
     _check_power(relabellings.shape[1], category, settings)
@@ -95,21 +100,29 @@ def _complete(episodes: "pd.DataFrame") -> NDArray[np.bool_]:
     return complete
 
 
-def _check_balance(labels: NDArray[np.bool_], category: str) -> None:
+def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
     """Warn of sides that are not equally often correct; raise UnbalancedEpisodesError if one nearly always is."""
     share = chance_level(labels) if labels.size else 0.5
     if share == 0.5:
         return
+    why = "Episodes are missing from the run" if call == 0 else _reached(labels.size, call)
     seen = (
         f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
-        "of every item. Episodes are missing from the run."
+        f"of every item. {why}."
     )
+    pair = "leave out the other layout of their items (--incomplete drop, incomplete='drop')."
     if share > MOST_OF_ONE_SIDE:
+        instead = "Extract the missing episodes again" if call == 0 else "Probe an earlier inference (--call)"
         raise UnbalancedEpisodesError(
-            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. Extract the missing episodes again, or "
-            "leave out the other layout of their items (--incomplete drop, incomplete='drop')."
+            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. {instead}, or {pair}"
         )
     warnings.warn(f"{seen} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
+
+
+def _reached(episodes: int, call: int) -> str:
+    """Why there are no more of them at a later inference."""
+    number = {0: "no episode", 1: "only 1 episode"}.get(episodes, f"only {episodes} episodes")
+    return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
 
 
 def _check_power(relabellings: int, category: str, settings: ProbeSettings) -> None:

@@ -1,17 +1,15 @@
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
 
-from probe_kit.errors import SuiteError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.suite import Suite, build_suite, load_picture
-from probe_kit.suite.build import default_folder
 from probe_kit.train import ArrayRun
-from probe_kit.train.controls.baselines import baseline_features, embedded_suite_of, suite_of
+from probe_kit.train.controls.baselines import baseline_features
 
 
 @pytest.fixture(scope="module")
@@ -31,24 +29,11 @@ def run_of(suite: Suite, path: Path) -> ArrayRun:
 
 
 def test_pixels_are_the_left_and_the_right_picture_of_the_layout(suite: Suite, tmp_path: Path) -> None:
-    features = baseline_features(run_of(suite, tmp_path), "pixels", suite.folder)
+    features = baseline_features(run_of(suite, tmp_path), "pixels", suite)
     left, right = features[:, :3072], features[:, 3072:]
     np.testing.assert_array_equal(left[0::2], right[1::2])  # swapping the layout swaps the pictures
     small = load_picture(suite.items[0].picture("left")).resize((32, 32), Image.Resampling.BOX)
     np.testing.assert_allclose(left[0].reshape(32, 32, 3) * 255, np.asarray(small), atol=1e-3)
-
-
-def test_part_of_a_suite_is_found_in_the_whole(suite: Suite, tmp_path: Path) -> None:
-    assert suite_of(run_of(suite.select(None, 4), tmp_path), suite.folder) == suite
-
-
-def test_another_suite_is_refused(suite: Suite, tmp_path: Path) -> None:
-    run = run_of(suite, tmp_path)
-    other = ArrayRun(run.path, "m", "color@1#000000000000", run.episodes, {})
-    with pytest.raises(SuiteError, match="#000000000000"):
-        baseline_features(other, "pixels", suite.folder)
-    with pytest.raises(UsageError, match="as `suite`"):
-        baseline_features(run, "pixels", None)
 
 
 def test_words_are_counted_alone_and_with_the_sign_of_the_layout(planted_run: Callable[..., ArrayRun]) -> None:
@@ -67,14 +52,3 @@ def test_a_control_that_does_not_exist_lists_those_that_do(planted_run: Callable
     silent = ArrayRun(Path("R"), "m", "s@1#0", planted_run().episodes.drop(columns="instruction"), {})
     with pytest.raises(UsageError, match="no column 'instruction'"):
         baseline_features(silent, "instruction", None)
-
-
-def test_the_embedded_suite_is_used_only_where_it_was_built(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Drawing 1,650 items would be a surprise in the middle of fitting probes."""
-    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
-    run = SimpleNamespace(suite="a2a-embedded@1.0.0#0123456789ab")
-    assert embedded_suite_of(run) is None  # type: ignore[arg-type]
-    assert not default_folder().exists()
-    assert embedded_suite_of(SimpleNamespace(suite="mine@1#0")) is None  # type: ignore[arg-type]

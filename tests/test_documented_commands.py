@@ -1,0 +1,349 @@
+"""Every command of the README and of `docs/` exists as it is typed; the slow ones below run them, page by page."""
+
+import ast
+import contextlib
+import importlib
+import inspect
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from probe_kit.cli import app, commands_of
+from probe_kit.errors import UsageError
+from tests.support.documented import (
+    NOT_COMMANDS,
+    PAGES,
+    ROOT,
+    SHELLS,
+    Block,
+    Command,
+    blocks,
+    commands,
+    mentioned,
+    name_of,
+)
+
+TYPED = [command for page in PAGES for command in commands(page)]
+OURS = [command for command in TYPED if command.ours]
+GROUP = typer.main.get_command(app)
+LEAVES = dict(commands_of(GROUP, None))
+ANYWHERE = {
+    option for leaf in LEAVES.values() for one in leaf.params for option in (*one.opts, *one.secondary_opts)
+}
+
+OTHER_PROGRAMS = {
+    "git": "fetches this very checkout",
+    "pytest": "is what runs this",
+    ".": "activates the environment that this runs in",
+    "pip": "installs an extra; which ones there are is checked",
+    "export": "names the keys of an object store",
+    "python": "runs a file or a module of this checkout; that it is there is checked",
+}
+"""Programs that are not ours, and why their lines are not typed by this test."""
+
+OF_OTHERS = {"--help": "every program's", "--gpus": "docker's", "--length": "b2sum's"}
+"""Options in the text that are no command's of ours, and no benchmark's."""
+OF_BENCHMARKS = {
+    option
+    for script in (ROOT / "benchmarks").glob("*.py")
+    for option in re.findall(r'"(--[a-z-]+)"', script.read_text(encoding="utf-8"))
+}
+
+
+def leaf_of(words: list[str]) -> tuple[Any, list[str]]:
+    """The command that `words` name, and the words behind its name. Fails for a command that does not exist."""
+    for size in (2, 1):
+        if (path := " ".join(words[:size])) in LEAVES:
+            return LEAVES[path], words[size:]
+    raise AssertionError(f"there is no command `probe-kit {' '.join(words[:2])}`")
+
+
+def options_of(leaf: Any) -> set[str]:
+    return {option for one in leaf.params for option in (*one.opts, *one.secondary_opts)} | {"--help", "-h"}
+
+
+def test_every_block_is_commands_or_python_or_listed_as_something_else() -> None:
+    found = [block for page in PAGES for block in blocks(page)]
+    assert len(found) > 40
+    strange = [f"{b.page}:{b.line}" for b in found if b.language not in ("", "python", *SHELLS)]
+    assert strange == []
+    assert {block.listed for block in found if block.listed} == NOT_COMMANDS.keys()
+
+
+def test_every_line_is_one_of_ours_or_of_a_program_that_is_named_with_the_reason() -> None:
+    assert len(OURS) > 50
+    others = {command.words[0] for command in TYPED if not command.ours}
+    assert others == OTHER_PROGRAMS.keys()
+
+
+@pytest.mark.parametrize("command", [c for c in TYPED if re.search(r"[*?\[]", c.text)], ids=str)
+def test_no_shell_expands_a_line(command: Command) -> None:
+    """Outside of quotes zsh refuses a pattern that no file matches; every shell replaces one that some match."""
+    assert not re.search(r"[*?\[]", re.sub(r"'[^']*'", "", command.text))
+
+
+def test_what_other_programs_are_given_is_there() -> None:
+    """Files and modules of this checkout, and extras of this package."""
+    extras = re.search(r"(?ms)^\[project\.optional-dependencies\]$(.*?)^\[", (ROOT / "pyproject.toml").read_text())
+    assert extras is not None
+    known = set(re.findall(r"(?m)^([\w-]+) = \[", extras[1]))
+    for command in TYPED:
+        program, *rest = command.words
+        if program == "pip":
+            assert set(re.findall(r"probe-kit\[([\w-]+)\]", command.text)) <= known, command
+        elif program == "python":
+            place = ROOT / (rest[1].replace(".", "/") + ".py" if rest[0] == "-m" else rest[0])
+            assert place.is_file(), command
+            options = [word for word in rest[1:] if word.startswith("--")]
+            assert [option for option in options if f'"{option}"' not in place.read_text()] == [], command
+
+
+@pytest.mark.parametrize("command", OURS, ids=str)
+def test_a_command_is_accepted_as_it_is_typed(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Name, arguments, options and their values: it ends only where it looks for a run, a suite or a model."""
+    leaf, rest = leaf_of(command.words[1:])
+    leaf.make_context(leaf.name, list(rest))
+    if leaf.name in ("demo", "doctor", "models"):
+        return
+    monkeypatch.setattr("probe_kit.extract.prepare", _stop_with, raising=False)
+    monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _: _stop_with(*wanted))
+    with contextlib.chdir(tmp_path):
+        answer = CliRunner().invoke(app, command.words[1:])
+    said = " ".join(answer.stderr.split())
+    assert answer.exit_code in (2, 3), said
+    assert re.search(LOOKED_FOR[leaf.name], said), said
+    assert list(tmp_path.iterdir()) == []
+
+
+LOOKED_FOR = {
+    "extract": "accepted so far",
+    "ask": "accepted so far",
+    "train": "Make one with|AWS_ACCESS_KEY_ID",
+    "intervene": "Make one with",
+    "retention": "Make one with",
+    "join": "Make one with",
+    "from-csv": "questions.csv",
+    "convert": "no such|is no folder|not a folder|does not exist|holds no|missing",
+}
+"""What a command complains of in an empty folder, when nothing is wrong with the command itself."""
+
+
+def _stop_with(*asked: Any) -> Any:
+    """In place of loading a model: what can be wrong with the settings before."""
+    from probe_kit.extract.prepared import as_protocol
+    from probe_kit.extract.rollout.controllers import SCRIPTED
+    from probe_kit.extract.rollout.settings_checks import refuse_meaningless
+    from probe_kit.hooks.contract.options import check_options
+    from probe_kit.hooks.registry import find_family
+
+    for settings in (as_protocol(one) for one in asked if not isinstance(one, str | None)):
+        if settings.model not in SCRIPTED:
+            family = find_family(settings.model, tuple(SCRIPTED))
+            check_options(family.name, family.options, settings.options)
+            assert family.acts != hasattr(settings, "prompt")
+        refuse_meaningless(settings)
+    raise UsageError("accepted so far")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_and_options_that_the_text_mentions_exist(page: Path) -> None:
+    for found in mentioned(page):
+        if re.match(r"(\./with-uv )?probe-kit [a-z]", found.text):
+            words = [word.partition("|")[0] for word in found.words[1:]]
+            if words[0] in ("suite", "run") and len(words) == 1:
+                continue
+            leaf, rest = leaf_of(words)
+            assert {word for word in rest if word.startswith("-")} <= options_of(leaf), found
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", found.text):
+            assert option in ANYWHERE | OF_BENCHMARKS | OF_OTHERS.keys(), found
+
+
+EXAMPLES = [block for page in PAGES for block in blocks(page) if block.language == "python"]
+
+
+@pytest.mark.parametrize("block", EXAMPLES, ids=lambda block: f"{block.page}:{block.line}")
+def test_an_example_in_python_imports_what_exists_and_names_options_that_exist(block: Block) -> None:
+    """Of what is imported from probe_kit: the name, and every keyword that it is called with."""
+    tree = ast.parse("\n".join(block.lines))
+    known: dict[str, Any] = {"pk": importlib.import_module("probe_kit")}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("probe_kit"):
+            module = importlib.import_module(str(node.module))
+            known |= {name.asname or name.name: getattr(module, name.name) for name in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "pk":
+            assert hasattr(known["pk"], node.attr), node.attr
+        if isinstance(node, ast.Call) and (called := _called(node.func, known)) is not None:
+            parameters = inspect.signature(called).parameters.values()
+            if all(one.kind is not one.VAR_KEYWORD for one in parameters):
+                assert {one.arg for one in node.keywords} <= {one.name for one in parameters}, ast.unparse(node)
+
+
+def _called(function: ast.expr, known: dict[str, Any]) -> Any:
+    """What is called, None if it is nothing of probe_kit's that the example imports."""
+    if isinstance(function, ast.Name):
+        return known.get(function.id)
+    if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) and function.value.id in known:
+        return getattr(known[function.value.id], function.attr)
+    return None
+
+
+# -- typed for real ------------------------------------------------------------------------------------------
+
+RUNS = {
+    "docs/causal.md": ("RUN",),
+    "docs/magma.md": ("RUN_MAGMA", "RUN_PI0"),
+    "docs/openvla.md": ("RUN_OPENVLA", "RUN_PI0"),
+    "docs/protocols.md": ("runs/pi0",),
+    "docs/qwen-vla.md": ("RUN_XIAOMI", "RUN_INTERNVLA", "RUN_PI0"),
+    "docs/report.md": ("runs/a", "runs/b"),
+    "docs/spatialvla.md": ("RUN_SPATIALVLA", "RUN_OPENVLA", "RUN_PI0"),
+    "docs/success-rate.md": ("RUN",),
+}
+"""Runs that a page takes for granted, made of the embedded policy."""
+
+SHORT = " --categories color --items 12 --max-steps 12"
+STAND_INS = {
+    "README.md": {
+        r"--model pi0 --checkpoint FOLDER": "--model pi0-tiny --items 12 --max-steps 12",
+        r"intervene runs/mine --checkpoint FOLDER": "intervene runs/mine",
+        r"train runs/mine": "train runs/mine --permutations 20",
+    },
+    "docs/asking.md": {
+        r"--model qwen3-vl": "--model vlm-tiny --categories color --items 12",
+        r"--model xiaomi-r0": "--model pi0-tiny --categories color --items 12 --max-steps 12",
+        r"train runs/xiaomi": "train runs/xiaomi --permutations 20",
+    },
+    "docs/causal.md": {r"^(probe-kit intervene RUN)(?! --kind interchange)": r"\1 --items 2"},
+    "docs/embedded.md": {
+        r"--items 40": "--categories color,shape --items 12",
+        r"--model pi0-tiny": "--model pi0-tiny --max-steps 12",
+        r"train runs/pi0-tiny": "train runs/pi0-tiny --permutations 20",
+    },
+    "docs/protocols.md": {
+        r"--model pi0 --checkpoint lerobot/pi0_base": "--model pi0-tiny --categories color --items 12",
+        r"train runs/pi0-base": "train runs/pi0-base --permutations 20",
+    },
+    "docs/suite.md": {r"(--model pi0-tiny)": r"\1 --max-steps 4"},
+}
+"""By page, patterns of what is shortened or replaced by the embedded models; all else is typed as it stands."""
+
+NOT_TYPED = {
+    r"git clone": "fetches this very checkout",
+    r"^\. \.venv": "this runs in that environment",
+    r"^pip install": "the extras are installed here",
+    r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
+    r"with-uv pytest": "is what runs this",
+    r"^python benchmarks/intervention_acceptance": "hours",
+    r"^python -m probe_kit.hooks.families.internvla.convert RUN OUT": "RUN is a training of InternVLA's",
+    r"^export AWS_|s3://": "needs keys of an object store; tests/extract/test_remote.py has a server of its own",
+    r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
+    r"suite convert vl-think --root BlindVLA|train runs/pi0 --twin|retention runs/pi0 runs/pi0-random":
+        "of files that this repository may not pass on, and of runs on them (docs/paper.md)",
+    r"suite convert act2answer --root": "of files that this repository may not pass on",
+}  # fmt: skip
+"""Patterns of lines that are not typed, after the stand-ins, and why."""
+
+
+def why_not(text: str) -> str | None:
+    """Why a line is not typed; None if it is."""
+    return next((reason for pattern, reason in NOT_TYPED.items() if re.search(pattern, text)), None)
+
+
+def with_stand_ins(command: Command) -> str:
+    text = command.text
+    for pattern, short in STAND_INS.get(command.page, {}).items():
+        text = re.sub(pattern, short, text)
+    return text
+
+
+TO_TYPE = {
+    name_of(page): typed
+    for page in PAGES
+    if (typed := [command for command in commands(page) if why_not(with_stand_ins(command)) is None])
+}
+
+
+def test_what_is_shortened_replaced_or_left_out_is_still_on_the_pages() -> None:
+    for page, patterns in STAND_INS.items():
+        texts = [command.text for command in TYPED if command.page == page]
+        assert [p for p in patterns if not any(re.search(p, text) for text in texts)] == []
+    shortened = [with_stand_ins(command) for command in TYPED]
+    assert [p for p in NOT_TYPED if not any(re.search(p, text) for text in shortened)] == []
+    assert RUNS.keys() <= TO_TYPE.keys()
+    assert sum(map(len, TO_TYPE.values())) > 30
+
+
+class Terminal:
+    """A folder and an environment with an empty cache, in which lines are typed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self.environment = os.environ | {
+            "PATH": programs, "PROBE_KIT_CACHE": str(folder / "cache"), "HF_HUB_OFFLINE": "1", "HOME": str(folder),
+        }  # fmt: skip
+
+    def type(self, text: str) -> str:
+        """Everything that the line prints. Fails if it does not end well."""
+        ended = subprocess.run(
+            ["bash", "-c", text],
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=1800,
+        )
+        assert ended.returncode == 0, f"{text}\n{ended.stdout}{ended.stderr}"
+        assert "NOT run" not in ended.stderr or "suites/mine" in text, f"{text}\n{ended.stderr}"
+        return ended.stdout + ended.stderr
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with its probes; the cache in which its suite was drawn is not the pages'."""
+    terminal = Terminal(tmp_path_factory.mktemp("made"))
+    terminal.type(f"probe-kit extract --model pi0-tiny{SHORT} --out RUN")
+    terminal.type("probe-kit train RUN --permutations 20")
+    return terminal.folder / "RUN"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TO_TYPE)
+def test_the_commands_of_a_page_run_in_their_order_with_an_empty_cache(
+    page: str, made: Path, tmp_path: Path
+) -> None:
+    terminal = Terminal(tmp_path)
+    for name in RUNS.get(page, ()):
+        shutil.copytree(made, tmp_path / name)
+    if page == "docs/suite.md":
+        _write_questions(tmp_path)
+    for command in TO_TYPE[page]:
+        terminal.type(with_stand_ins(command))
+
+
+KNOWN = "Put the cube on the blue shape"
+
+
+def _write_questions(folder: Path) -> None:
+    """The page's table in words that the embedded policy knows, and a plain picture for each that it names."""
+    from PIL import Image
+
+    (block,) = [b for b in blocks(ROOT / "docs/suite.md") if b.listed]
+    table = "\n".join(block.lines) + "\n"
+    table = table.replace("ripe banana", "red shape").replace('"Put the cube on the apple, not the pear"', KNOWN)
+    (folder / "questions.csv").write_text(table, encoding="utf-8")
+    names = re.findall(r"[\w-]+\.(?:jpg|png)", "\n".join(block.lines))
+    for number, name in enumerate(names):
+        Image.new("RGB", (64, 64), (40 * number, 200 - 40 * number, 90)).save(folder / name)
