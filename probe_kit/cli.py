@@ -14,6 +14,7 @@ import typer.core
 
 from probe_kit._terminal.console import marked, out, say
 from probe_kit._terminal.error_reporting import tell
+from probe_kit._terminal.interruption import begun
 from probe_kit._terminal.plain_text import visible
 from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
@@ -23,7 +24,6 @@ from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
-from probe_kit.interruption import begun
 from probe_kit.intervene.commands import intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention

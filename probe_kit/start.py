@@ -1,6 +1,6 @@
 """Where the `probe-kit` command begins."""
 
-from probe_kit.interruption import leave_at_once
+from probe_kit._terminal.interruption import leave_at_once
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ import traceback
 from pathlib import Path
 
 from probe_kit._terminal.console import complain, marked, say
+from probe_kit._terminal.interruption import INTERRUPTED
 from probe_kit.errors import DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
-from probe_kit.interruption import INTERRUPTED
 
 UNFORESEEN = 1
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from probe_kit.places import without_places
+from probe_kit._terminal.local_paths import without_places
 
 PROGRESS_MARK = "probe-kit-progress"
 """Class of a progress bar's element, so that whoever keeps a notebook can leave the bars out."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from probe_kit.csv_text import csv_of_frame
+from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError

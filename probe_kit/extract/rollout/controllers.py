@@ -15,8 +15,8 @@ from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
 from probe_kit.hooks.checkpoints.third_party import acting
-from probe_kit.hooks.containment import begin_randomness, copied
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:

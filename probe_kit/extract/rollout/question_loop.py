@@ -8,8 +8,8 @@ from probe_kit.extract.rollout.answer_controller import AskController, AskTurn
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
+from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import acting
-from probe_kit.hooks.containment import copied
 
 
 class _Chair:

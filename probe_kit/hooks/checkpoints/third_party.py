@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
-from probe_kit.hooks.containment import contained
+from probe_kit.hooks.checkpoints.containment import contained
 
 _LONGEST = 300
 

@@ -23,12 +23,12 @@ from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import acting
-from probe_kit.hooks.containment import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.counterparts import twins_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
-from probe_kit.train.run_suite import suite_of
+from probe_kit.train.data.run_suite import suite_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

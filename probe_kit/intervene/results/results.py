@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit.csv_text import csv_of_frame
+from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.kinds.attention.attention_mass import Weighed
 from probe_kit.intervene.kinds.closed_loop.effects import CarriedOut, carried_out

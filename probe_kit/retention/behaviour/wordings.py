@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probe_kit.retention.behaviour.success_rate import units_of
-from probe_kit.retention.correction import corrected
 from probe_kit.statistics.mcnemar import grouped_sign_p, sign_p
+from probe_kit.statistics.multiple_testing import corrected
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,8 +17,8 @@ from probe_kit.retention.columns.text import (
     success_interval,
     with_limits,
 )
+from probe_kit.retention.compare.source_weights import Relation
 from probe_kit.retention.compare.vlm_vla import VlmGap
-from probe_kit.retention.grown_from import Relation
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 ANSWERS = "Answers"

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
-from probe_kit.retention.correction import corrected
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Estimates, Limits, average
 from probe_kit.retention.rows.build import Drawn
 from probe_kit.retention.rows.category_mean import average_estimates
 from probe_kit.retention.rows.row import MEAN
+from probe_kit.statistics.multiple_testing import corrected
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,9 +17,9 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.correction import corrected
 from probe_kit.retention.estimators.cross_fit import random_halves
 from probe_kit.retention.estimators.retention import best_site
+from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
     fisher_p,

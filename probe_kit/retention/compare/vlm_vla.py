@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.correction import corrected
+from probe_kit.retention.compare.source_weights import Relation, grew_from
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits, average, sr_estimate
-from probe_kit.retention.grown_from import Relation, grew_from
 from probe_kit.retention.rows.row import MEAN
+from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import flip_p
 from probe_kit.train.data.run_reader import RunReader
 

@@ -6,13 +6,13 @@ from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
 from probe_kit.retention.displays.base.display import Shown
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.retention.displays.base.style import axes_for, caption
 from probe_kit.retention.formats.heat import HEAT, heat_colour
-from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.base.display import Shown
 from probe_kit.retention.displays.base.label_placement import place_labels
@@ -18,7 +19,6 @@ from probe_kit.retention.displays.base.style import (
     series,
     significance_handles,
 )
-from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell

@@ -11,6 +11,7 @@ from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.attention.attention_mass import stored_attention
 from probe_kit.intervene.results.site_maps import stored_steering
+from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.known_used import KnownUsed
@@ -38,7 +39,6 @@ from probe_kit.retention.displays.side_by_side import curves_side_by_side, has_m
 from probe_kit.retention.estimators.by_call import CallCurves, event_calls
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader

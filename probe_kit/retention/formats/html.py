@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from probe_kit.retention.behaviour.modes import RATE, heading, kind_of
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.lines import (
@@ -42,7 +43,6 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import PlainTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import heat_colour
-from probe_kit.retention.kinds import RATE, heading, kind_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.conditions import rule_sentences
 from probe_kit.retention.columns.lines import Line, cell_of, compared, difference_legend
 from probe_kit.retention.columns.text import (
@@ -33,7 +34,6 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import PlainTable, is_asked
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import HEAT
-from probe_kit.retention.kinds import RATE, Kind, kind_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {

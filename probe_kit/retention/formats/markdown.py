@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from probe_kit.retention.behaviour.modes import RATE, heading, kind_of
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.lines import (
@@ -44,7 +45,6 @@ from probe_kit.retention.columns.text import (
 )
 from probe_kit.retention.columns.text_table import PlainTable
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.kinds import RATE, heading, kind_of
 from probe_kit.retention.rows.row import RetentionRow
 
 

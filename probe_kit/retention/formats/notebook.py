@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from probe_kit.places import without_places
+from probe_kit._terminal.local_paths import without_places
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.html import (

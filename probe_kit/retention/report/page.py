@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
-from probe_kit.places import without_places
+from probe_kit.retention.behaviour.modes import Kind, heading, kind_of
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.known_used_table import join_tables
@@ -22,7 +23,6 @@ from probe_kit.retention.formats.html import (
     retention_table,
 )
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.kinds import Kind, heading, kind_of
 from probe_kit.retention.report.category_summary import stories
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.pictures import data_uri

@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit.csv_text import csv_of_rows, rows_of_csv
+from probe_kit._system.csv_text import csv_of_rows, rows_of_csv
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal

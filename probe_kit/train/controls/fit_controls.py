@@ -19,11 +19,11 @@ from probe_kit.train.crossval.category_problem import POOLED, category_problem
 from probe_kit.train.crossval.metrics import chance_level, correctness
 from probe_kit.train.data.labels import target_labels
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, Excess, TwinScore
 from probe_kit.train.results.probe_curve import Curve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.run_suite import suite_of
 from probe_kit.train.settings import ProbeSettings
 
 

@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from probe_kit.csv_text import csv_of_frame
+from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle

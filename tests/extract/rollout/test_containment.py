@@ -24,8 +24,8 @@ from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, Pol
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.hooks import Observation
+from probe_kit.hooks.checkpoints.containment import contained
 from probe_kit.hooks.checkpoints.third_party import acting
-from probe_kit.hooks.containment import contained
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
 
@@ -319,7 +319,9 @@ def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
 
 
 def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
-    code = "from probe_kit.hooks.containment import contained\nwith contained(0.2):\n  sum(range(10**12))"
+    code = (
+        "from probe_kit.hooks.checkpoints.containment import contained\nwith contained(0.2):\n  sum(range(10**12))"
+    )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert done.returncode == -signal.SIGALRM
 

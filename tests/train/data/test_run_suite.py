@@ -24,7 +24,7 @@ from probe_kit.suite.build import default_folder
 from probe_kit.suite.ladder import Wording
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.data.captured_call import at_call
-from probe_kit.train.run_suite import suite_of
+from probe_kit.train.data.run_suite import suite_of
 from tests.support.little_run import STREAMS, certify, episode, little_settings
 
 SHORT = SceneSpec(max_steps=2)

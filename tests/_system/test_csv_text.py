@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probe_kit.csv_text import csv_of_frame, csv_of_rows, escaped, rows_of_csv, unescaped
+from probe_kit._system.csv_text import csv_of_frame, csv_of_rows, escaped, rows_of_csv, unescaped
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite
 from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.manifest import save_suite
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FORMULAS = [
     "=1+1",
     "+1",

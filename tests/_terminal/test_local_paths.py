@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probe_kit._terminal.local_paths import without_places
 from probe_kit._terminal.notebook import facts_html, rows_html
 from probe_kit.hooks import load_model
 from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.places import without_places
 from probe_kit.retention import retention
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked

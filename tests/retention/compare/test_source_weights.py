@@ -15,8 +15,8 @@ from probe_kit.hooks import Card, known_families, load_model
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.retention import retention
+from probe_kit.retention.compare.source_weights import grew_from
 from probe_kit.retention.compare.vlm_vla import vlm_gaps
-from probe_kit.retention.grown_from import grew_from
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 
