@@ -8,6 +8,7 @@ from rich.text import Text
 
 from probe_kit._terminal.console import marked
 from probe_kit.demo.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
+from probe_kit.drafts import write_whole
 from probe_kit.extract import Run
 from probe_kit.extract.run_layout import VIDEOS
 from probe_kit.retention import RetentionTable, retention
@@ -72,7 +73,7 @@ def run_demo(folder: Path, stage: NamedProgress) -> Demo:
     run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
     table = retention([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
-    (folder / "table.md").write_text(table.to_markdown(), encoding="utf-8")
+    write_whole(folder / "table.md", table.to_markdown())
     write_report([asked, run], folder / "report.html", table)
     film = next((run.path / VIDEOS).glob("*.gif"))
     shutil.copyfile(film, folder / "episode.gif")

@@ -13,11 +13,11 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from probe_kit._system.bounded_json import MOST_BYTES
 from probe_kit._system.csv_text import csv_of_rows
+from probe_kit.drafts import draft_of
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
@@ -44,9 +44,7 @@ def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, 
     Raises SuiteError if the folder holds anything else.
     """
     if not _is_taken(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as aside:
-            draft = Path(aside) / "suite"
+        with draft_of(folder) as draft:
             _write(suite, pictures, stats, draft)
             _rename_unless_taken(draft, folder)
     return _load_same(suite, folder)

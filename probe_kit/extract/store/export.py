@@ -6,7 +6,6 @@ on the way, and the sha256 of the file is written beside it in the form `sha256s
 
 import hashlib
 import json
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -14,6 +13,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 
 from probe_kit._system.optional_dependencies import require
+from probe_kit.drafts import draft_of, write_whole
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.store.format.rows import Rows
@@ -36,15 +36,12 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
     run = open_run(path, allow_partial)
     if not run.streams:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        aside = Path(folder) / out.name
-        _WRITERS[style](run, aside)
-        with aside.open("rb") as file:
+    with draft_of(out) as draft:
+        _WRITERS[style](run, draft)
+        with draft.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        aside.rename(out)
-    out.with_name(f"{out.name}.sha256").write_text(f"{digest}  {out.name}\n", encoding="utf-8")
-    return out
+        write_whole(out.with_name(f"{out.name}.sha256"), f"{digest}  {out.name}\n")
+        return draft.rename(out)  # last: the file never lies there without its hash
 
 
 def check_format(style: str) -> None:

@@ -1,5 +1,6 @@
 """Sealing: pooled rows turned into one block per site and view, and roles into a column."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.extract.run_layout import COLUMNS, SEALED
 from probe_kit.extract.store.format.arrays import codecs
-from probe_kit.extract.store.format.columns import write_seal
+from probe_kit.extract.store.format.columns import STAMP_DIGITS, seal_key, write_seal
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -18,6 +19,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hooks.contract.views import PADDING
 
 EPISODES_PER_CHUNK = 1024
+_SEAL = re.compile(rf"{SEALED}/[0-9a-f]{{{STAMP_DIGITS}}}\.json")
 # What is held in memory at a time; all rows are read once more for every further slab.
 SLAB_BYTES = 1 << 30
 
@@ -34,7 +36,10 @@ def seal(path: Path | str | Location) -> bool:
 
 
 def _seal(run: Run) -> bool:
-    if not run.streams or run.episodes.empty or run.sealed:
+    if not run.streams or run.episodes.empty:
+        return False
+    if run.sealed:
+        _remove_former_seals(run)
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
     with run.location.rebuilding(COLUMNS, run.stamp) as place:
@@ -49,6 +54,13 @@ def _seal(run: Run) -> bool:
     if run.protected:
         write_seal(run.root, run.stamp, store.sums)  # what makes them count, so last
     return True
+
+
+def _remove_former_seals(run: Run) -> None:
+    """Of other commits: an object store may have listed them too late to be removed when this one was made."""
+    for key in run.location.keys(SEALED):
+        if _SEAL.fullmatch(key) and key != seal_key(run.stamp):
+            run.location.delete(key)
 
 
 def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:

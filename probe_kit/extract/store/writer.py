@@ -16,12 +16,19 @@ from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.extract.plan import Plan, PlannedEpisode
-from probe_kit.extract.run_layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
+from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
 from probe_kit.extract.settings import refuse_other_plan, refuse_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import create_arrays
-from probe_kit.extract.store.format.commits import read_commits, write_commit, write_failure
-from probe_kit.extract.store.format.hashes import Sum, as_json
+from probe_kit.extract.store.format.commits import (
+    Commit,
+    commit_key,
+    read_commit,
+    read_commits,
+    write_commit,
+    write_failure,
+)
+from probe_kit.extract.store.format.hashes import Sum, as_json, as_record
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.format.root import Root, new_root, read_root
 from probe_kit.extract.store.format.trajectories import create_trajectories, has_trajectories, write_trajectory
@@ -157,9 +164,33 @@ class RunWriter:
         return [episode.index for episode in self.plan.episodes if episode.index not in done]
 
     def write(self, episode: EpisodeRecord) -> None:
-        """Store one episode: first its arrays, then the commit that makes it count."""
+        """Store one episode: first its arrays, then the commit that makes it count.
+
+        An episode that another process has committed meanwhile stays as it is.
+        """
+        number = episode.planned.index
+        if self.location.exists(commit_key(number)):
+            return
         self._say_who_plays()  # before any commit names it
         self.write_certificate({})
+        commit = self._write_objects(episode)
+        if not write_commit(self.location, number, commit):
+            self._settle(episode, commit)
+
+    def _settle(self, episode: EpisodeRecord, commit: Commit) -> None:
+        """Make objects and commit those of one process, where two have written the same episode at once.
+
+        Equal numbers are equal bytes, and the first commit stays. Numbers of other batches or processors differ by
+        rounding: some objects then are ours although the commit is not. All of them become ours, with the commit.
+        """
+        key = commit_key(episode.planned.index)
+        with self.location.tended(COMMITS):
+            theirs = read_commit(self.root, episode.planned.index, key, self.location.read(key))
+            if any(theirs[part] != commit[part] for part in ("objects", "pictures")):
+                self.location.write_record(key, as_record(self._write_objects(episode)))
+
+    def _write_objects(self, episode: EpisodeRecord) -> Commit:
+        """Everything of an episode but its commit, which is returned."""
         planned = episode.planned
         store = RecordingStore(self.location.store(DATA))
         for kind, by_stream in episode.arrays.items():
@@ -177,7 +208,7 @@ class RunWriter:
         pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
         written = {**{f"{DATA}/{key}": one for key, one in store.sums.items()}, **pictures}
         self.location.confirm({key: one.length for key, one in written.items()})
-        commit = {
+        return {
             "run": self.root.identity,
             "episode": planned.index,
             "episode_id": planned.episode.episode_id,
@@ -188,7 +219,6 @@ class RunWriter:
             "objects": {key: one.to_json() for key, one in store.sums.items()},
             "pictures": {key: one.to_json() for key, one in pictures.items()},
         }
-        write_commit(self.location, planned.index, commit)
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
         """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""

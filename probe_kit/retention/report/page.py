@@ -1,12 +1,12 @@
 """Putting the page together: one HTML file with everything in it."""
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from probe_kit._terminal.local_paths import without_places
+from probe_kit.drafts import write_whole
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.modes import Kind, heading, kind_of
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
@@ -62,12 +62,8 @@ def write_report(
     """
     path = Path(path)
     page = report_html(runs, table, pictures=pictures)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as draft:
-        draft.write(page)
-    aside = Path(draft.name)
-    aside.chmod(0o644)
-    return aside.replace(path)
+    write_whole(path, page)
+    return path
 
 
 def report_html(

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from probe_kit.drafts import write_whole
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.folds import assign_folds
@@ -94,7 +95,7 @@ def save_baselines(suite: Suite, baselines: Sequence[Baseline]) -> Path:
         "sides": {category: dict(sides) for category, sides in side_counts(suite.items).items()},
         "roles": roles,
     }
-    path.write_text(json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
     return path
 
 

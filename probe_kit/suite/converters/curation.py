@@ -12,6 +12,7 @@ from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._system.csv_text import csv_of_rows, rows_of_csv
+from probe_kit.drafts import write_whole
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
@@ -32,8 +33,10 @@ Render = Callable[[SourcePicture], Image.Image]
 def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> Path:
     """The file at `path`, previews in a folder beside it, and an HTML page, whose path is returned.
 
-    In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines.
+    In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines. Raises SuiteError
+    if the file is there and a person has reviewed any row of it.
     """
+    _refuse_reviewed(path)
     previews = path.with_name(f"{path.stem}-previews")
     previews.mkdir(parents=True, exist_ok=True)
     rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
@@ -42,10 +45,22 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
         if path.suffix == ".csv"
         else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     )
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     page = path.with_suffix(".html")
-    page.write_text(_page(rows), encoding="utf-8")
+    write_whole(page, _page(rows))
     return page
+
+
+def _refuse_reviewed(path: Path) -> None:
+    try:
+        reviewed = sum(row["status"] != STATUSES[0] for row in read_curation(path))
+    except SuiteError:  # no such file, or no curation
+        return
+    if reviewed:
+        raise SuiteError(
+            f"{path} holds the review of {reviewed} pairs, and would be written anew without it. Give it as "
+            "curation (--curation), or another file as emit_curation (--emit-curation)"
+        )
 
 
 def read_curation(path: Path) -> list[dict[str, Any]]:

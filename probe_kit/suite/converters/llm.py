@@ -7,6 +7,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from probe_kit.drafts import write_whole
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.converters.candidates import Candidate, Wording
@@ -36,8 +37,7 @@ def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | 
     kept = Path(options.llm_cache) / f"{key}.json"
     if not kept.is_file():
         reply = _ask(options.llm_base, options.llm_model, json.dumps(asked, ensure_ascii=False))
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_text(reply, encoding="utf-8")
+        write_whole(kept, reply)
     return _usable(kept.read_text(encoding="utf-8"), options.llm_model)
 
 

@@ -119,6 +119,18 @@ def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_r
     assert len(suite.items) == len(rows) == 6
 
 
+@pytest.mark.parametrize("name", ["review.jsonl", "review.csv"])
+def test_a_review_is_not_written_over(name: str, compbench_root: Path, tmp_path: Path) -> None:
+    path = tmp_path / name
+    for _ in range(2):  # nobody has looked so far
+        convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
+    reviewed = path.read_text().replace("pending", "accept", 1)
+    path.write_text(reviewed)
+    with pytest.raises(SuiteError, match=r"holds the review of 1 pairs.*--curation"):
+        convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
+    assert path.read_text() == reviewed
+
+
 def test_a_missing_curation_file_is_named(compbench_root: Path, tmp_path: Path) -> None:
     with pytest.raises(SuiteError, match=r"curation file .*no\.jsonl not found"):
         convert("mllm-compbench", compbench_root, tmp_path / "suite", curation=tmp_path / "no.jsonl")

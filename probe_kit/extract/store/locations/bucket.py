@@ -195,40 +195,56 @@ class Bucket(Location):
             return BufferedReader(_Ranges(self._asked(lambda objects: obstore.open_reader(objects, key)), self))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """A listing, then many requests side by side."""
+        """A listing, then many requests side by side. What was listed and is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
+
+        def read(name: str) -> bytes | None:
+            try:
+                return self.read(f"{folder}/{name}")
+            except FileNotFoundError:
+                return None
+
         with ThreadPoolExecutor(READERS) as readers:
-            return dict(zip(names, readers.map(lambda name: self.read(f"{folder}/{name}"), names), strict=True))
+            contents = zip(names, readers.map(read, names), strict=True)
+            return {name: content for name, content in contents if content is not None}
 
     def keys(self, folder: str) -> list[str]:
         """From a listing."""
         return sorted(self._listing(folder))
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """From a listing of all that is there."""
-        there = self._listing(folder)
-        return {key: there[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in there}
+        """From a listing of all that is there; the store is asked for what is not in it, which may be stale."""
+        there, wanted = self._listing(folder), {key: f"{folder}/{key}" for key in keys}
+        there |= self._lengths([full for full in wanted.values() if full not in there])
+        return {key: there[full] for key, full in wanted.items() if full in there}
 
     def confirm(self, lengths: Mapping[str, int]) -> None:
         """A request for the head of each, side by side."""
+        there = self._lengths(lengths)
+        for key, length in lengths.items():
+            if (found := there.get(key, 0)) != length:
+                raise StoreError(
+                    f"{self} took {length:,} bytes of {key}, said that all was well, and holds {found:,}. "
+                    "Nothing was committed that needs it. See what is wrong with the store; then the same command "
+                    "continues"
+                )
+
+    def _lengths(self, keys: Iterable[str]) -> dict[str, int]:
+        """Bytes of those that are there, of a request for the head of each."""
         import obstore
 
-        def length(key: str) -> int:
+        def length(key: str) -> int | None:
             try:
                 with self.in_words():
                     return int(self._asked(lambda objects: obstore.head(objects, key))["size"])
             except FileNotFoundError:
-                return 0
+                return None
 
+        asked = list(keys)
         with ThreadPoolExecutor(READERS) as readers:
-            for key, found in zip(lengths, readers.map(length, lengths), strict=True):
-                if found != lengths[key]:
-                    raise StoreError(
-                        f"{self} took {lengths[key]:,} bytes of {key}, said that all was well, and holds "
-                        f"{found:,}. Nothing was committed that needs it. See what is wrong with the store; then "
-                        "the same command continues"
-                    )
+            found = zip(asked, readers.map(length, asked), strict=True)
+            return {key: size for key, size in found if size is not None}
 
     def _listing(self, folder: str) -> dict[str, int]:
         import obstore

@@ -13,6 +13,7 @@ from typing import IO, BinaryIO
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
+from probe_kit.drafts import draft_of
 from probe_kit.errors import DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.extract.run_layout import (
     CERTIFICATES,
@@ -27,7 +28,7 @@ from probe_kit.extract.run_layout import (
     SEALED,
     VIDEOS,
 )
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.locations.location import TRIES, Location
 
 # What a killed process leaves: objects and columns that never got their final name.
 _WRITTEN_ASIDE = (COMMITS, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
@@ -102,8 +103,12 @@ class Folder(Location):
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """One file after another."""
-        found = sorted((self._path / folder).glob(f"*{suffix}"))
-        return {path.name: path.read_bytes() for path in found if path.is_file()}
+        there = {}
+        for path in sorted((self._path / folder).glob(f"*{suffix}")):
+            if path.is_file():
+                with suppress(FileNotFoundError):  # another process has removed it since
+                    there[path.name] = path.read_bytes()
+        return there
 
     def keys(self, folder: str) -> list[str]:
         """Every file."""
@@ -132,9 +137,15 @@ class Folder(Location):
     def write(self, key: str, content: bytes) -> None:
         """Written aside, then renamed."""
         path = self._place(key)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _written_aside(path, content, flush=False) as aside:
-            aside.replace(path)
+        for left in reversed(range(TRIES)):
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with _written_aside(path, content, flush=False) as aside:
+                    aside.replace(path)
+                return
+            except (FileNotFoundError, FileExistsError):
+                if not left:  # before: another process was done with the same work, and removed the folder
+                    raise
 
     def delete(self, key: str) -> None:
         """The file."""
@@ -150,22 +161,18 @@ class Folder(Location):
 
     def found(self, objects: Mapping[str, bytes], last: str) -> None:
         """The folder is made aside and renamed, so that it appears whole or not at all."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(dir=self._path.parent, prefix=f".{self._path.name}.", suffix=".tmp"))
-        aside.chmod(0o755)
-        try:
-            for key, content in objects.items():
-                (aside / key).parent.mkdir(parents=True, exist_ok=True)
-                with _written_aside(aside / key, content, flush=True) as file:
-                    file.rename(aside / key)
-            aside.rename(self._path)
-        except OSError as error:
-            if not self.exists(last):
-                if not self._path.exists():
-                    raise
-                raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
+        with draft_of(self._path) as draft:
+            try:
+                for key, content in objects.items():
+                    (draft / key).parent.mkdir(parents=True, exist_ok=True)
+                    with _written_aside(draft / key, content, flush=True) as file:
+                        file.rename(draft / key)
+                draft.rename(self._path)
+            except OSError as error:
+                if not self.exists(last):
+                    if not self._path.exists():
+                        raise
+                    raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
 
     @contextmanager
     def held(self, clear: Callable[[], None]) -> Iterator[None]:

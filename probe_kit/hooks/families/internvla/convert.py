@@ -12,10 +12,11 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
+from probe_kit.drafts import draft_of
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
-from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, read_weights
-from probe_kit.hooks.families.internvla.checkpoint import STATISTICS_FILE, find_parts
+from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, Weights, read_weights
+from probe_kit.hooks.families.internvla.checkpoint import STATISTICS_FILE, Parts, find_parts
 from probe_kit.models.internvla.config import DIMS_FILE, RUN_FILE
 
 PROVENANCE = "converted.json"
@@ -34,25 +35,28 @@ def convert(checkpoint: str, out: Path, vlm: str | None = None) -> str:
     parts = find_parts(checkpoint, vlm)
     weights = parts.read()
     sha256 = weights.sha256()
-    aside = out.with_name(f"{out.name}.writing")
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
+    with draft_of(out) as draft:
+        draft.mkdir()
+        _write(parts, weights, draft)
+        written = read_weights(draft).sha256()
+        if written != sha256:
+            raise CheckpointError(
+                f"{draft} held weights {written}, {parts.weights} {sha256}; check the disk and try again"
+            )
+        source = {"weights": parts.weights.name, "weights_sha256": sha256}
+        (draft / PROVENANCE).write_text(json.dumps(source, indent=2) + "\n", encoding="utf-8")
+        draft.rename(out)
+    return sha256
+
+
+def _write(parts: Parts, weights: Weights, folder: Path) -> None:
     # Tied tensors share their memory in a pickle, which safetensors does not allow.
-    save_file({name: value.clone().contiguous() for name, value in weights.tensors.items()}, aside / SINGLE_FILE)
+    save_file({name: value.clone().contiguous() for name, value in weights.tensors.items()}, folder / SINGLE_FILE)
     for name, file in side_files(parts.vlm).items():
-        shutil.copyfile(file, aside / name)
+        shutil.copyfile(file, folder / name)
     for name in _RUN_FILES:
         if (parts.place / name).is_file():
-            shutil.copyfile(parts.place / name, aside / name)
-    written = read_weights(aside).sha256()
-    if written != sha256:
-        raise CheckpointError(
-            f"{aside} holds weights {written}, {parts.weights} {sha256}; check the disk and try again"
-        )
-    source = {"weights": parts.weights.name, "weights_sha256": sha256}
-    (aside / PROVENANCE).write_text(json.dumps(source, indent=2) + "\n", encoding="utf-8")
-    aside.rename(out)
-    return sha256
+            shutil.copyfile(parts.place / name, folder / name)
 
 
 def main(arguments: list[str]) -> int:

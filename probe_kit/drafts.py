@@ -1,0 +1,68 @@
+"""Drafts: files and folders that are made beside their place and get their name when they are whole."""
+
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_SUFFIX = ".tmp"
+
+
+@contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """Where to make the file or folder `path`, which the body renames when it is whole; gone afterwards.
+
+    A draft lies in a hidden folder beside `path`, `.<name>.<letters>.tmp`, which is locked as long as its process
+    lives. Those that killed processes left for the same `path` are removed first.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_abandoned(path)
+    with _own_folder(path) as folder:
+        yield folder / path.name
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text in UTF-8, over whatever is there: readers find the former text or all of this one."""
+    with draft_of(path) as draft:
+        draft.write_text(text, encoding="utf-8", newline="\n")
+        draft.replace(path)
+
+
+@contextmanager
+def _own_folder(path: Path) -> Iterator[Path]:
+    while True:
+        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=_prefix(path), suffix=_SUFFIX))
+        handle = os.open(folder, os.O_RDONLY)
+        with suppress(OSError):  # some network file systems lock no folder; there nothing is removed either
+            fcntl.flock(handle, fcntl.LOCK_SH)
+        if folder.exists():
+            break
+        os.close(handle)  # another process took it for an abandoned one before it was locked
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(handle)
+
+
+def _remove_abandoned(path: Path) -> None:
+    for folder in path.parent.iterdir():
+        if folder.name.startswith(_prefix(path)) and folder.name.endswith(_SUFFIX):
+            with suppress(OSError):  # in use, gone meanwhile, or not ours to remove
+                _remove_unlocked(folder)
+
+
+def _remove_unlocked(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(handle)
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name}."

@@ -1,0 +1,174 @@
+"""Object stores whose listings lag behind, and torn objects of killed processes: right, or an error by name."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract import Run, open_run, seal, verify_run
+from probe_kit.extract.run_layout import COLUMNS
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.hooks import Site
+from probe_kit.intervene.store.answers import find_stored
+from probe_kit.suite import Suite
+from probe_kit.train import load_results, train_probes
+from tests.extract.contents import objects
+from tests.support.little_run import episode, little_plan, little_writer
+from tests.support.s3_server import BadServer
+
+EPISODES = 3
+SITE = Site("expert", 0, iteration=1)
+
+
+@pytest.fixture(scope="module")
+def suite(small_suite: Suite) -> Suite:
+    return small_suite.select(["color"])
+
+
+def write(run: Path | str, suite: Suite) -> Run:
+    """What an extraction does, after an attempt in which an episode was given up."""
+    plan = little_plan(suite, episodes=EPISODES)
+    writer = little_writer(locate(run), plan)
+    with writer.owned():
+        for number in writer.remaining():
+            writer.write(episode(plan, number))
+        seal(run)
+    return open_run(run)
+
+
+def give_up_one(run: str, suite: Suite) -> None:
+    """Leave the record of a failure, which the next attempt removes."""
+    little_writer(locate(run), little_plan(suite, episodes=EPISODES)).give_up(1, "it fell")
+
+
+@pytest.fixture(scope="module")
+def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return objects(write(tmp_path_factory.mktemp("whole") / "run", suite).path)
+
+
+def stale(server: BadServer, lag: int) -> None:
+    """From now on every listing misses so many of the newest keys, and shows deleted ones."""
+    server.day.lag, server.day.ail = lag, lambda *_: "stale"
+
+
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
+@pytest.mark.parametrize("lag", [0, 1, *(pytest.param(lag, marks=pytest.mark.slow) for lag in (2, 7, 30))])
+def test_an_extraction_with_stale_listings_is_complete_or_says_what_is_missing(
+    lag: int, suite: Suite, whole: dict[str, bytes], bad_server: BadServer
+) -> None:
+    run = f"{bad_server.url}/run"
+    give_up_one(run, suite)
+    stale(bad_server, lag)
+    for ask in (write, write, lambda run, _: open_run(run, allow_partial=True).failed):
+        with suppress(ProbeKitError):
+            ask(run, suite)
+    assert bad_server.day.seen["stale"] > 0
+    bad_server.day.ail = lambda *_: None
+    assert verify_run(run, deep=True).problems == ()
+    write(run, suite)
+    assert objects(run) == whole
+
+
+@pytest.fixture
+def kept(little_runs: Path, bad_server: BadServer) -> Run:
+    """A run with probes and an intervention, its commits and results newest."""
+    here, there = locate(little_runs / "run"), locate(f"{bad_server.url}/run")
+    stamp = open_run(here).stamp
+    for key in sorted(here.keys(""), key=lambda key: ("columns", "data", "commits", "probes").index(_kind(key))):
+        there.write(key.replace(COLUMNS, there.derived(COLUMNS, stamp)), here.read(key))
+    return open_run(there)
+
+
+def _kind(key: str) -> str:
+    top = key.partition("/")[0].partition(".")[0]
+    return {"commits": "commits", "probes": "probes", "columns": "columns"}.get(top, "data")
+
+
+def told(run: Run) -> tuple[Callable[[], Any], ...]:
+    """What is read of a run, each by itself and anew."""
+    again = partial(open_run, run.location)
+    return (
+        lambda: again().column(SITE, "mean").tobytes(),
+        lambda: again().rows("expert", "tokens")[1].tobytes(),
+        lambda: again().episodes.to_csv(),
+        lambda: load_results(again()).scores.to_csv(),
+        lambda: find_stored(again()).answers().to_bytes(),
+    )
+
+
+@pytest.mark.filterwarnings("ignore:.*is not sealed")
+@pytest.mark.parametrize("lag", [1, 4, 10, 40])
+def test_reading_with_stale_listings_gives_the_same_or_an_error_by_name(
+    lag: int, kept: Run, bad_server: BadServer
+) -> None:
+    expected = [ask() for ask in told(kept)]
+    stale(bad_server, lag)
+    for ask, right in zip(told(kept), expected, strict=True):
+        with suppress(ProbeKitError):
+            assert ask() == right
+
+
+def test_nothing_is_called_damaged_because_a_listing_misses_it(suite: Suite, bad_server: BadServer) -> None:
+    run = f"{bad_server.url}/run"
+    write(run, suite)
+    data = [key for key in locate(run).keys("") if key.startswith("data.zarr/") and "/c/" in key]
+    for key in data[:3]:
+        locate(run).write(key, locate(run).read(key))  # now they are the newest
+    stale(bad_server, 3)
+    assert verify_run(run).problems == ()
+    assert len(open_run(run).episodes) == EPISODES
+
+
+def test_probes_and_interventions_are_the_same_although_a_store_keeps_parts_and_fails(
+    little_runs: Path, kept: Run, bad_server: BadServer
+) -> None:
+    """Of every object one upload is kept in half; every ninth request is refused."""
+    before = train_probes(open_run(little_runs / "run"), permutations=3).scores
+    seen, count = set[str](), 0
+
+    def ail(method: str, path: str) -> str | None:
+        nonlocal count
+        count += 1
+        if method == "PUT" and path not in seen:
+            seen.add(path)
+            return "half"
+        return "busy" if count % 9 == 0 else None
+
+    bad_server.day.ail = ail
+    for _ in range(30):
+        try:
+            found = train_probes(kept, permutations=3)
+            break
+        except ProbeKitError:
+            continue
+    bad_server.day.ail = lambda *_: None
+    assert bad_server.day.seen["half"] > 5
+    assert found.scores.to_csv() == before.to_csv()
+    assert verify_run(kept.location, deep=True).problems == ()
+
+
+def test_every_object_that_a_killed_process_left_torn_is_named_or_made_again(
+    suite: Suite, whole: dict[str, bytes], bucket: str
+) -> None:
+    """It took half of an object, said that all was well, and the process was killed before it asked again."""
+    run = locate(f"{bucket}/run")
+    write(str(run), suite)
+    named = 0
+    for key in [key for key in run.keys("") if "/c/" not in key or key.endswith(("/c/1/0/0/0", "/c/1/0/0"))]:
+        content = run.read(key)
+        run.write(key, content[: len(content) // 2])
+        told = f"{key} is as it was"
+        try:
+            write(str(run), suite)
+            if objects(run) != whole:
+                told = " ".join(verify_run(run, deep=True).problems)
+        except ProbeKitError as error:
+            told = str(error)
+        assert key in told, told
+        named += run.read(key) != content
+        run.write(key, content)
+    assert named > 5

@@ -1,0 +1,193 @@
+"""Kills of every command that writes: nothing finished is lost, and the same command ends with the same bytes."""
+
+import shutil
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from probe_kit.env import SceneSpec
+from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.suite import Suite, build_suite
+from tests.suite.converters.conftest import picture, save, write_json
+from tests.support.killed_commands import (
+    KilledCommand,
+    begun,
+    committed,
+    files_of,
+    kill_often,
+    leftovers,
+    run_files,
+    run_problems,
+    run_together,
+)
+
+KILLS = 20
+CATEGORIES = ("--categories", "color")
+
+
+@pytest.fixture(scope="session")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    """Six Color items in three groups."""
+    return build_suite(tmp_path_factory.mktemp("suite") / "six", ["color"], 6)
+
+
+@pytest.fixture(scope="session")
+def acted(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of twelve Color items whose policy acted twice per episode, with all tokens."""
+    suite = small_suite.select(["color"])
+    settings = ExtractSettings(
+        "pi0-tiny", suite=suite.folder, categories=("color",), scene=SceneSpec(max_steps=2), tokens="all"
+    )
+    return extract_run(settings, tmp_path_factory.mktemp("acted") / "run").path
+
+
+def _comparisons(root: Path) -> None:
+    """Sixteen pairs of a benchmark, with pictures of our own."""
+    rows = []
+    for number in range(16):
+        names = [f"fer-2013/test/happy/im{number}_{side}.png" for side in "ab"]
+        for offset, name in enumerate(names):
+            save(picture(2 * number + offset, (48, 48)), root / name)
+        question = "Based on these images, which person is more smiling?"
+        rows.append({"image_1": names[0], "image_2": names[1], "question": question, "answer": "Left"})
+    write_json(rows, root / "Labeled_data" / "fer2013_label" / "fer2013_0_720_rebalanced.json")
+
+
+def _on_a_copy(of: Path, place: Path) -> None:
+    shutil.copytree(of, place / "run")
+
+
+def _unsealed(of: Path, place: Path) -> None:
+    _on_a_copy(of, place)
+    for folder in ("columns.zarr", "sealed"):
+        shutil.rmtree(place / "run" / folder)
+
+
+def _of_run(name: str, begin: object, *arguments: str) -> KilledCommand:
+    """A command on the run that lies in `run`."""
+    first = arguments[: 2 if arguments[0] == "run" else 1]
+    rest = arguments[len(first) :]
+    assert callable(begin)
+    return KilledCommand(
+        name,
+        begin,
+        lambda place: [*first, str(place / "run"), *rest],
+        lambda place: run_files(place / "run"),
+        lambda place: committed(place / "run"),
+        lambda place: run_problems(place / "run"),
+    )
+
+
+def _of_extract(name: str, *arguments: str) -> KilledCommand:
+    return KilledCommand(
+        name,
+        lambda _: None,
+        lambda place: [*arguments, "--out", str(place / "run")],
+        lambda place: run_files(place / "run"),
+        lambda place: committed(place / "run"),
+        lambda place: run_problems(place / "run"),
+    )
+
+
+def _of_ask(suite: Suite) -> KilledCommand:
+    def runs(place: Path) -> list[Path]:
+        return [place / "asked" / "p1-224x224", place / "asked" / "seen-224x224"]
+
+    return KilledCommand(
+        "ask",
+        lambda _: None,
+        lambda place: [
+            *("ask", "--model", "vlm-tiny", "--prompt", "p1,seen", "--suite", str(suite.folder)),
+            *("--out", str(place / "asked")),
+        ],
+        lambda place: {f"{run.name}/{key}": own for run in runs(place) for key, own in run_files(run).items()},
+        lambda place: committed(*runs(place)),
+        lambda place: run_problems(*runs(place)),
+    )
+
+
+def _of_suite(name: str, begin: object, *arguments: str) -> KilledCommand:
+    """A command that makes the folder `suite`; its arguments may name `{place}`."""
+    assert callable(begin)
+    return KilledCommand(
+        name,
+        begin,
+        lambda place: [one.format(place=place) for one in arguments],
+        lambda place: files_of(place / "suite"),
+        lambda place: set(files_of(place / "suite")) if (place / "suite").is_dir() else set(),
+    )
+
+
+def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
+    match name:
+        case "suite build":
+            return _of_suite(name, lambda _: None, "suite", "build", "{place}/suite", *CATEGORIES, "--n", "12")
+        case "suite convert":
+            options = ("--root", "{place}/root", "--out", "{place}/suite", "--emit-curation", "{place}/review.csv")
+            return _of_suite(
+                name, lambda place: _comparisons(place / "root"), "suite", "convert", "mllm-compbench", *options
+            )
+        case "ask":
+            return _of_ask(request.getfixturevalue("six"))
+        case "extract":
+            suite: Suite = request.getfixturevalue("six")
+            given = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--listen", "--tokens", "all")
+            return _of_extract(name, "extract", *given, "--workers", "2")
+        case "run seal":
+            return _of_run(name, partial(_unsealed, request.getfixturevalue("little_runs") / "run"), "run", "seal")
+    acted, folder = request.getfixturevalue("acted"), str(request.getfixturevalue("small_suite").folder)
+    match name:
+        case "train":
+            options = ("--views", "mean,tokens", "--permutations", "2", "--token-permutations", "2")
+            return _of_run(name, partial(_on_a_copy, acted), "train", *options, "--suite", folder)
+        case "intervene":
+            return _of_run(name, partial(_on_a_copy, acted), "intervene", "--suite", folder)
+    raise LookupError(name)
+
+
+ALL = ("suite build", "suite convert", "run seal", "train", "intervene", "ask", "extract")
+
+
+@pytest.mark.parametrize("name", ["suite build", "run seal"])
+def test_a_kill_loses_nothing_and_changes_no_byte(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    print(kill_often(_command(name, request), tmp_path, 1, seed=1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALL)
+def test_twenty_kills_lose_nothing_and_change_no_byte(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    print(kill_often(_command(name, request), tmp_path, KILLS, seed=ALL.index(name)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["suite build", "train", "intervene", "ask", "extract"])
+def test_the_same_command_twice_at_once_makes_the_same(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    command = _command(name, request)
+    alone, together = begun(command, tmp_path / "alone"), begun(command, tmp_path / "together")
+    assert run_together([command.arguments(alone)], alone, lambda: True) == []
+    assert run_together([command.arguments(together)] * 2, together, lambda: True) == []
+    assert command.made(together) == command.made(alone)
+    assert command.problems(together) == ()
+    assert leftovers(together) == []
+
+
+@pytest.mark.slow
+def test_sealing_while_another_process_extracts_changes_no_byte(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    command = _command("extract", request)
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    run_together([command.arguments(alone)], alone, lambda: True)
+    seal = ["run", "seal", str(together / "run")]
+    commands = [command.arguments(together), seal, seal]
+    assert run_together(commands, together, lambda: any(together.glob("run/commits/*.json"))) == []
+    assert command.made(together) == command.made(alone)
+    assert command.problems(together) == ()
+    assert leftovers(together) == []
