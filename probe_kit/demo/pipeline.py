@@ -6,9 +6,9 @@ from pathlib import Path
 
 from rich.text import Text
 
+from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.console import marked
 from probe_kit.demo.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
-from probe_kit.drafts import write_whole
 from probe_kit.extract import Run
 from probe_kit.extract.run_layout import VIDEOS
 from probe_kit.retention import RetentionTable, retention

@@ -7,7 +7,7 @@ import typer
 from probe_kit._terminal.console import marked, out, print_json
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.contract.family import Family
+    from probe_kit.hooks.family import Family
 
 
 def models(

@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow, as_text
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.contract.family import Family
+    from probe_kit.hooks.family import Family
 
 SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
 """Scene preset by protocol."""

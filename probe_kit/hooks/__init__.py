@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
 from probe_kit.hooks.contract.card import Card
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.family import Family
 from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UnknownModelError, UsageError
-from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.family import Family
 
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.model import Model, Policy

@@ -37,12 +37,12 @@ from probe_kit.errors import (
     WeightsError,
 )
 from probe_kit.hooks.capturing.capture_context import capture, edit
-from probe_kit.hooks.contract.family import SIZE, Family
 from probe_kit.hooks.contract.model import Model, Policy, Question, Reader, Reading
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles, pool
 from probe_kit.hooks.contract.sites import PARTS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING, plays, view_names
+from probe_kit.hooks.family import SIZE, Family
 from probe_kit.hooks.intervention_contract import InterventionContract
 from probe_kit.hooks.registry import find_family
 

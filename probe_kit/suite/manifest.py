@@ -17,7 +17,7 @@ from typing import Any
 
 from probe_kit._system.bounded_json import MOST_BYTES
 from probe_kit._system.csv_text import csv_of_rows
-from probe_kit.drafts import draft_of
+from probe_kit._system.drafts import draft_of
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite

@@ -112,7 +112,7 @@ def test_a_mistake_that_needs_no_weights_is_named_before_anything_heavy_is_loade
 def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     import huggingface_hub
 
-    from probe_kit.hooks.contract import family
+    from probe_kit.hooks import family
     from probe_kit.hooks.registry import known_families
 
     monkeypatch.setattr(family, "find_spec", lambda name: None if name == "timm" else name)
@@ -138,7 +138,7 @@ def test_a_cached_config_without_weights_is_no_checkpoint(tmp_path: Path, monkey
 
 def test_a_family_without_its_extra_is_refused_with_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     from probe_kit.errors import MissingExtraError
-    from probe_kit.hooks.contract import family
+    from probe_kit.hooks import family
     from probe_kit.hooks.registry import known_families as families
 
     monkeypatch.setattr(family, "find_spec", lambda _: None)

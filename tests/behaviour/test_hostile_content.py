@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.cli import app
 from probe_kit.hooks import registry
-from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.family import Family
 from probe_kit.suite import Suite
 
 NAME = "[bold]x[red] [no-end] \x1b[31m\u202e\x9b2J"

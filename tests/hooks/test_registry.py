@@ -59,7 +59,7 @@ def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatc
         ("xiaomi-r0", ("XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",)),
     ):
         assert known[name].missing() == f"download of {', '.join(needed)}"
-    monkeypatch.setattr("probe_kit.hooks.contract.family.find_spec", lambda _: None)
+    monkeypatch.setattr("probe_kit.hooks.family.find_spec", lambda _: None)
     assert known["prismatic"].missing() == "extra openvla and a checkpoint of yours (--checkpoint)"
     assert known["magma"].missing() == "extra magma and download of microsoft/Magma-8B"
     there = ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml")

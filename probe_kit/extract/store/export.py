@@ -12,8 +12,8 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
+from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit._system.optional_dependencies import require
-from probe_kit.drafts import draft_of, write_whole
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.store.format.rows import Rows

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from probe_kit.retention.behaviour.modes import Kind
+from probe_kit.retention.columns.modes import Kind
 
 GLOSSARY = MappingProxyType(
     {

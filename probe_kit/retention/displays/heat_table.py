@@ -6,8 +6,8 @@ from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
 from probe_kit.retention.displays.base.display import Shown
 from probe_kit.retention.displays.base.provenance_line import Certificate

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
+from probe_kit.retention.columns.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.base.display import Shown
 from probe_kit.retention.displays.base.label_placement import place_labels

@@ -11,8 +11,8 @@ from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.attention.attention_mass import stored_attention
 from probe_kit.intervene.results.site_maps import stored_steering
-from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.columns.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.known_used import KnownUsed
 from probe_kit.retention.displays.attention import attention_curve

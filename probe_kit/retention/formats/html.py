@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from probe_kit.retention.behaviour.modes import RATE, heading, kind_of
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.lines import (
@@ -15,6 +14,7 @@ from probe_kit.retention.columns.lines import (
     difference_name,
     probe_lines,
 )
+from probe_kit.retention.columns.modes import RATE, heading, kind_of
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,

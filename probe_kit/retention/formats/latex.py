@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
-from probe_kit.retention.behaviour.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.conditions import rule_sentences
 from probe_kit.retention.columns.lines import Line, cell_of, compared, difference_legend
+from probe_kit.retention.columns.modes import RATE, Kind, kind_of
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-from probe_kit.retention.behaviour.modes import RATE, heading, kind_of
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.lines import (
@@ -13,6 +12,7 @@ from probe_kit.retention.columns.lines import (
     difference_legend,
     probe_lines,
 )
+from probe_kit.retention.columns.modes import RATE, heading, kind_of
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.local_paths import without_places
-from probe_kit.drafts import write_whole
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.modes import Kind, heading, kind_of
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.glossary import glossary_of
 from probe_kit.retention.columns.known_used_table import join_tables
+from probe_kit.retention.columns.modes import Kind, heading, kind_of
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.report_figures import Exhibit, gallery
 from probe_kit.retention.formats.heat import heat_key

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from probe_kit.retention.behaviour.modes import RATE, kind_of
 from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.modes import RATE, kind_of
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, percent
 from probe_kit.retention.columns.text_table import is_asked
 from probe_kit.retention.rows.row import MEAN, RetentionRow

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from probe_kit.drafts import write_whole
+from probe_kit._system.drafts import write_whole
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.folds import assign_folds

@@ -12,7 +12,7 @@ from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._system.csv_text import csv_of_rows, rows_of_csv
-from probe_kit.drafts import write_whole
+from probe_kit._system.drafts import write_whole
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal

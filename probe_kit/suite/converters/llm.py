@@ -7,7 +7,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-from probe_kit.drafts import write_whole
+from probe_kit._system.drafts import write_whole
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.converters.candidates import Candidate, Wording

@@ -261,7 +261,7 @@ def test_only_a_real_ctrl_c_in_a_policy_is_one() -> None:
 
 HANGING = f"""
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
-from probe_kit.hooks.contract.family import Family
+from probe_kit.hooks.family import Family
 
 FAMILY = Family("theirs", "a family of others that hangs", None, "their_policy:load")
 

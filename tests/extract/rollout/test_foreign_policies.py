@@ -10,8 +10,8 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, EpisodesFailedError, PolicyFailedError
 from probe_kit.extract import ExtractSettings, extract_run, open_run
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.family import Family
 from probe_kit.suite import Suite, build_suite
 
 CALLS_BEFORE = 2

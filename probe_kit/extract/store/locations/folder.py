@@ -13,7 +13,7 @@ from typing import IO, BinaryIO
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
-from probe_kit.drafts import draft_of
+from probe_kit._system.drafts import draft_of
 from probe_kit.errors import DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.extract.run_layout import (
     CERTIFICATES,

@@ -1,12 +1,12 @@
 """InternVLA-M1, native."""
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.family import Family
 
 _BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from probe_kit.drafts import draft_of
+from probe_kit._system.drafts import draft_of
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, Weights, read_weights

@@ -1,9 +1,9 @@
 """Magma, native."""
 
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.shared.capabilities import MAPS
+from probe_kit.hooks.family import Family
 
 FAMILIES = (
     Family(

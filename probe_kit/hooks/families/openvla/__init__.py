@@ -1,10 +1,10 @@
 """OpenVLA, native."""
 
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.family import Family
 
 FAMILIES = (
     Family(

@@ -1,8 +1,8 @@
 """PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.61 million parameters."""
 
 from probe_kit.hooks.contract.default_scene import RELEASED
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.family import Family
 
 FAMILIES = (
     Family(

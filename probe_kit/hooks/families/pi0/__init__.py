@@ -2,12 +2,12 @@
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.default_scene import RELEASED
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
+from probe_kit.hooks.family import Family
 
 _TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
 _VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"

@@ -1,7 +1,7 @@
 """Prismatic vision-language models, native."""
 
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.family import Family
 
 TOKENIZER = Option(
     "tokenizer", str, "Folder of another tokenizer; bytes: for development checkpoints.", "the checkpoint's"

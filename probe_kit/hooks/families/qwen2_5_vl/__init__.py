@@ -1,7 +1,7 @@
 """Qwen2.5-VL, on transformers' own network."""
 
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.family import Family
 
 FAMILIES = (
     Family(

@@ -1,7 +1,7 @@
 """SmolVLA through lerobot."""
 
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.family import Family
 
 FAMILIES = (
     Family(

@@ -1,13 +1,13 @@
 """Xiaomi-Robotics-R0, native."""
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.family import Family
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": ("residual", "attention", "middle", "mlp")},

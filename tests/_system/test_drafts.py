@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.drafts import draft_of, write_whole
+from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit.extract import open_run
 from probe_kit.extract.store.export import export_run
 from probe_kit.extract.store.locations.locate import locate
@@ -17,7 +17,7 @@ from probe_kit.suite import build_suite
 DYING = """
 import os, signal, sys
 from pathlib import Path
-from probe_kit.drafts import draft_of
+from probe_kit._system.drafts import draft_of
 with draft_of(Path(sys.argv[1])) as draft:
     draft.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -25,7 +25,7 @@ with draft_of(Path(sys.argv[1])) as draft:
 LIVING = """
 import sys
 from pathlib import Path
-from probe_kit.drafts import draft_of
+from probe_kit._system.drafts import draft_of
 with draft_of(Path(sys.argv[1])) as draft:
     draft.write_text("theirs")
     print("ready", flush=True)
