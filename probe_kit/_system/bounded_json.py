@@ -2,6 +2,8 @@
 
 import json
 import re
+from codecs import BOM_UTF8
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,40 @@ def parse_json(content: bytes | str) -> Any:
         raise ValueError("it nests too deeply") from None
     except UnicodeEncodeError:
         raise ValueError("it holds half a surrogate pair, which is no character") from None
+    return value
+
+
+def parse_strict_json(content: bytes) -> Any:
+    """The value of JSON that probe_kit wrote itself.
+
+    Raises ValueError for what `parse_json` refuses, for a byte order mark, for a key that an object names twice,
+    and for a number that is not finite.
+    """
+    if content.startswith(BOM_UTF8):
+        raise ValueError("it begins with a byte order mark")
+    try:
+        value = json.loads(
+            content.decode(), object_pairs_hook=_distinct, parse_constant=_finite, parse_float=_finite
+        )
+    except RecursionError:
+        raise ValueError("it nests too deeply") from None
+    if _HALF.search(content.decode()):
+        parse_json(content)
+    return value
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it names {next(name for name in names if names.count(name) > 1)!r} twice")
+    return content
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    if not isfinite(value):
+        raise ValueError(f"it holds {number[:20]}, which is no finite number")
     return value
 
 

@@ -199,7 +199,15 @@ class Bucket(Location):
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
         with ThreadPoolExecutor(READERS) as readers:
-            return dict(zip(names, readers.map(lambda name: self.read(f"{folder}/{name}"), names), strict=True))
+            contents = readers.map(lambda name: self._read_if_there(f"{folder}/{name}"), names)
+            return {name: raw for name, raw in zip(names, contents, strict=True) if raw is not None}
+
+    def _read_if_there(self, key: str) -> bytes | None:
+        """None for what was removed since it was listed: seals and failures come and go."""
+        try:
+            return self.read(key)
+        except FileNotFoundError:
+            return None
 
     def keys(self, folder: str) -> list[str]:
         """From a listing."""
