@@ -5,6 +5,15 @@ Each message says what was seen, what was expected, and what to do.
 Exit codes: 1 the result is not what was asked, 2 wrong usage, 3 refused.
 """
 
+import errno
+
+FULL_DISK = {
+    errno.ENOSPC: "is full",
+    errno.EDQUOT: "has no quota left for you",
+    errno.EFBIG: "or a limit of this process (ulimit -f) takes no file so large",
+}
+"""What the system says of a disk that takes no more, in words."""
+
 
 class ProbeKitError(Exception):
     """Base of all errors below; catch it to catch them all."""

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections import Counter
+from codecs import BOM_UTF8
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ MOST_BYTES = 256 << 20
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
-def parse_json(content: bytes | str) -> Any:
-    """The value.
+def parse_json(content: bytes | str, **further: Any) -> Any:
+    """The value. further: hooks of `json.loads`.
 
     Raises ValueError for what is no UTF-8 or no JSON, nests too deeply, has half characters, or names a key twice.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
-        value = json.loads(text, object_pairs_hook=_object)
+        value = json.loads(text, object_pairs_hook=_distinct, **further)
         (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
     except RecursionError:
         raise ValueError("it nests too deeply") from None
@@ -29,13 +30,29 @@ def parse_json(content: bytes | str) -> Any:
     return value
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Of a key that is named twice, parsers keep the one or the other."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
-        raise ValueError(f"it names the key {twice!r} twice")
-    return found
+def parse_strict_json(content: bytes) -> Any:
+    """The value of JSON that probe_kit wrote itself.
+
+    Raises ValueError for what `parse_json` refuses, for a byte order mark, and for a number that is not finite.
+    """
+    if content.startswith(BOM_UTF8):
+        raise ValueError("it begins with a byte order mark")
+    return parse_json(content, parse_constant=_finite, parse_float=_finite)
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it names the key {next(name for name in names if names.count(name) > 1)!r} twice")
+    return content
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    if not isfinite(value):
+        raise ValueError(f"it holds {number[:20]}, which is no finite number")
+    return value
 
 
 def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:

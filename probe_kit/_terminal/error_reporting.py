@@ -9,11 +9,11 @@ from pathlib import Path
 
 from probe_kit._terminal.console import complain, marked, say
 from probe_kit._terminal.interruption import INTERRUPTED
-from probe_kit.errors import DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
+from probe_kit.errors import FULL_DISK, DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
 
 UNFORESEEN = 1
 
-_FULL = {errno.ENOSPC: "is full", errno.EDQUOT: "has no quota left for you", errno.EROFS: "is read-only"}
+_FULL = {**FULL_DISK, errno.EROFS: "is read-only"}
 _UNUSABLE = {
     errno.EACCES, errno.EBUSY, errno.EEXIST, errno.EINVAL, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG,
     errno.ENODEV, errno.ENOENT, errno.ENOTDIR, errno.ENOTEMPTY, errno.ENXIO, errno.EPERM, errno.ETXTBSY,

@@ -20,18 +20,21 @@ def verify(
 ) -> None:
     """Compare a run with what it says of itself; exit 1 if anything is missing or changed."""
     from probe_kit.extract import verify_run
-    from probe_kit.extract.store.locations.summary import NOT_PROTECTED
 
     found = verify_run(run, deep)
     if as_json:
-        print_json({**asdict(found), "ok": found.ok})
+        print_json({**asdict(found), "ok": found.ok, "finished": found.finished})
     else:
         checked = "every byte" if deep else "structure and sizes"
         sealed = "sealed" if found.sealed else "not sealed"
         failed = f", {found.failed} failed" if found.failed else ""
         out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
-        if not found.protected:
-            out.print(NOT_PROTECTED, soft_wrap=True)
+        if found.ok and not found.finished:
+            out.print(
+                "whole, but not finished: if it was finished before, this is an older state of it. The same "
+                "`probe-kit extract` continues it",
+                soft_wrap=True,
+            )
         for stray in found.strays:
             out.print(f"belongs to no part of the run: {stray}", highlight=False, markup=False, soft_wrap=True)
         for problem in found.problems:

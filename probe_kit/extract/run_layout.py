@@ -17,7 +17,7 @@ RUN/
 Every object is bound to the root by hashes, see `hashes`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -26,20 +26,51 @@ import numpy as np
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
 SCHEMA_VERSION = 3
-READABLE = (1, 2, 3)
-"""Schemas that can be read; only runs of the last one are continued."""
-PROTECTED_SINCE = 3
-"""From this schema on hashes bind everything to the root."""
+"""The only one that is read: in runs of former ones no hash bound everything to the root."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 INTERVENTIONS = "interventions"
+TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
+"""The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """Pictures for people, which a run can do without."""
 CODECS = ("zstd", "fast", "none")
 LISTENED = "listened"
 """Outcome of an episode in which the model was heard and did not act: there is no success rate."""
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value > 0
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _are_names(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value)) and len(set(value)) == len(value)
+
+
+_STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
+    "name": _is_text,
+    "layers": _is_count,
+    "width": _is_count,
+    "iterations": lambda value: value is None or _is_count(value),
+    "tokens": _is_count,
+    "views": _are_names,
+    "part": lambda value: value is None or _is_text(value),
+    "label": _is_text,
+    "quantities": _are_names,
+    "probed": _is_flag,
+    "sums": _is_flag,
+}
+"""What a stream is stored as, and how each part of it can be told from damage."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +99,13 @@ class StoredStream:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":
-        """Read back what `to_json` wrote, in this version or before streams declared their part."""
+        """Read back what `to_json` wrote, in this version or before streams declared their part.
+
+        Raises TypeError or KeyError for values of another kind.
+        """
+        for name, value in values.items():
+            if not _STREAM_PARTS[name](value):
+                raise TypeError(f"{name} is {value!r}")
         lists = {name: tuple(values[name]) for name in ("views", "quantities") if name in values}
         return cls(**{**values, **lists})
 
@@ -113,6 +150,12 @@ class StoredStream:
     def at(self, site: Site) -> tuple[int, ...]:
         """Index of `site` in the lead axes."""
         return (site.layer,) if site.iteration is None else (site.iteration, site.layer)
+
+    def arrays(self, with_tokens: bool) -> dict[str, int]:
+        """Number of axes of every array in `data.zarr` that holds this stream."""
+        axes = 2 + len(self.lead) + 2  # episode and call before, token or view and feature behind
+        kinds = ("pooled", "tokens") if with_tokens else ("pooled",)
+        return {f"{self.name}/{kind}": axes for kind in kinds}
 
     def raw_bytes(self, with_tokens: bool) -> int:
         """Uncompressed bytes of one captured inference."""

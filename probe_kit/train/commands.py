@@ -129,8 +129,6 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
     """A run and what is stored with it. further: lines below, by name."""
     from rich.table import Table
 
-    from probe_kit.extract.store.locations.summary import NOT_PROTECTED
-
     missing = found.planned - found.episodes
     outcomes = ", ".join(f"{name} {count}" for name, count in found.outcomes.items())
     facts = {
@@ -142,7 +140,6 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
         "episodes": f"{found.episodes} of {found.planned}" * (missing > 0) or str(found.episodes),
         "wordings": ", ".join(f"{name} {count}" for name, count in found.wordings.items()),
         "failed": str(found.failed or ""),
-        "integrity": "" if found.protected else NOT_PROTECTED,
         "outcomes": outcomes,
         "categories": ", ".join(found.categories),
         **found.streams,

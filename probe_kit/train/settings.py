@@ -1,6 +1,8 @@
 """What decides the numbers of a sweep."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
@@ -33,7 +35,15 @@ class ProbeSettings:
     @property
     def key(self) -> str:
         """First 12 hex digits of the settings' sha256: the name of the results' folder."""
-        settings = asdict(self)
-        if self.call == 0:  # as before inferences could be chosen, so that older results keep their name
-            del settings["call"]
-        return sha256_json(settings)[:12]
+        return key_of(asdict(self))
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """The same of settings as they are stored, those of other formats included.
+
+    The first inference is left out, as before inferences could be chosen, so that older results keep their name.
+    """
+    first = (
+        settings.get("call") == 0
+    )  # left out, as before inferences could be chosen: older results keep their name
+    return sha256_json({name: value for name, value in settings.items() if not (first and name == "call")})[:12]

@@ -38,6 +38,7 @@ def ended(error: BaseException) -> tuple[int, str]:
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 3, "is full"),
         (OSError(errno.EROFS, os.strerror(errno.EROFS), "run"), 3, "the disk of run is read-only"),
         (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), "run"), 3, "quota"),
+        (OSError(errno.EFBIG, os.strerror(errno.EFBIG), "run"), 3, "no file so large"),
         (
             PermissionError(errno.EACCES, "Permission denied", "there"),
             2,

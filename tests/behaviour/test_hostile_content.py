@@ -1,7 +1,6 @@
 """Names that others chose reach the terminal as text, in every command that shows them."""
 
 import shutil
-import tarfile
 from pathlib import Path
 
 import pytest
@@ -12,21 +11,18 @@ from probe_kit.cli import app
 from probe_kit.hooks import registry
 from probe_kit.hooks.family import Family
 from probe_kit.suite import Suite
+from tests.support.little_run import write_little_run
 
 NAME = "[bold]x[red] [no-end] \x1b[31m\u202e\x9b2J"
 SHOWN = "[bold]x[red] [no-end] ␛[31m\ufffd\ufffd2J"
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
-GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in a folder of that name."""
-    place = tmp_path_factory.mktemp("hostile")
-    with tarfile.open(GOLDEN / "run-schema-1" / "runs.tar.xz") as packed:
-        packed.extractall(place / "runs", filter="data")
-    there = next(place.glob("runs/**/run.json")).parent
-    return there.rename(place / NAME)
+    place = tmp_path_factory.mktemp("hostile") / NAME
+    return write_little_run(place, small_suite.select(["color"]), episodes=8).path
 
 
 def said(*words: object) -> str:

@@ -1,7 +1,6 @@
 """Whatever stands on the command line: a message and an exit code of the contract, never a traceback."""
 
 import os
-import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,9 @@ from typer.testing import CliRunner
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.cli import app, commands_of
 from probe_kit.suite import Suite
+from tests.support.little_run import write_little_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
-GOLDEN = Path(__file__).parents[1] / "golden"
 HOSTILE = (
     "", " ", "-", "--", "-1", "0", "1", "3", "1.5", "nan", "inf", "-inf", "1e309", "9" * 40, "9" * 5000, "²", "٣",
     "a,b,,a", "=", "a=", "=b", "a=b", "x=x=x", "a=[[[", "color", "color,color", "mean", "tokens:x", "all",
@@ -54,10 +53,8 @@ def places(tmp_path_factory: pytest.TempPathFactory, small_suite: Suite) -> Iter
     place = tmp_path_factory.mktemp("fuzzed")
     (place / "a-file").write_bytes(b"\x00\xff[[[")
     (place / "a-folder").mkdir()
-    with tarfile.open(GOLDEN / "run-schema-1" / "runs.tar.xz") as packed:
-        packed.extractall(place / "runs", filter="data")
-    run = next(place.glob("runs/**/run.json")).parent
-    (place / "a-run").symlink_to(run)
+    write_little_run(place / "runs" / "little", small_suite.select(["color"]), episodes=8)
+    (place / "a-run").symlink_to(place / "runs" / "little")
     (place / "damaged").mkdir()
     (place / "damaged" / "run.json").write_bytes(b"[" * 99_999)
     (place / "SUITE").symlink_to(small_suite.folder)

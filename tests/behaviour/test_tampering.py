@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError, RunIncompleteError
-from probe_kit.extract import open_run, verify_run
+from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.store.format.commits import write_failure
 from probe_kit.extract.store.format.hashes import Sum, as_record
 from probe_kit.extract.store.integrity.orphans import known_keys
@@ -25,7 +27,7 @@ from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.resume import Unfinished
 from tests.support.faults import Stored
-from tests.support.little_run import write_little_run
+from tests.support.little_run import episode, little_plan, little_writer, write_little_run
 from tests.support.reading import readings
 from tests.support.rehashing import rehash, write_record
 
@@ -97,11 +99,46 @@ def test_a_changed_plan_is_found(run: Path, change: Callable[[Any], object]) -> 
         retention([open_run(run)])
 
 
-def test_episodes_that_are_dropped_with_their_commits_are_missed(run: Path) -> None:
-    for commit in sorted((run / "commits").glob("*.json"))[20:]:
+@pytest.mark.parametrize("left", [0, 20, 23])
+def test_episodes_that_a_sealed_run_lost_are_missed(run: Path, left: int) -> None:
+    for commit in sorted((run / "commits").glob("*.json"))[left:]:
         commit.unlink()
+    if not left:
+        (run / "commits").rmdir()
+    assert_found(run, f"commits/{left:08d}.json is missing")
+    with pytest.raises(RunDamagedError, match=f"{24 - left} are gone"):
+        open_run(run, allow_partial=True)
+
+
+def test_an_older_state_of_a_run_is_told_from_a_finished_one(small_suite: Suite, tmp_path: Path) -> None:
+    """As a copy made in the middle of the work would be: whole, and less than was planned."""
+    plan = little_plan(small_suite.select(["color"]))
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    for number in writer.remaining()[:20]:
+        writer.write(episode(plan, number))
+    older = verify_run(tmp_path / "run", deep=True)
+    assert (older.ok, older.finished, older.committed, older.planned) == (True, False, 20, 24)
+    said = CliRunner().invoke(app, ["run", "verify", str(tmp_path / "run")])
+    assert (said.exit_code, "not finished" in said.output) == (0, True)
     with pytest.raises(RunIncompleteError, match="20 of 24"):
-        open_run(run)
+        open_run(tmp_path / "run")
+
+
+def test_a_seal_of_fewer_episodes_is_no_damage_and_is_not_used(small_suite: Suite, tmp_path: Path) -> None:
+    """A run that was sealed, continued and killed before it was sealed again."""
+    plan = little_plan(small_suite.select(["color"]))
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    first, *rest = writer.remaining()
+    writer.write(episode(plan, first))
+    seal(tmp_path / "run")
+    for number in rest:
+        writer.write(episode(plan, number))
+    found = verify_run(tmp_path / "run", deep=True)
+    assert (found.ok, found.finished, found.sealed) == (True, True, False)
+    assert not open_run(tmp_path / "run").sealed
+    (tmp_path / "run/commits/00000000.json").unlink()
+    with pytest.raises(RunDamagedError, match=r"commits/00000000\.json is missing"):
+        open_run(tmp_path / "run", allow_partial=True)
 
 
 # -- run.json ----------------------------------------------------------------------------------------------
@@ -205,8 +242,6 @@ def test_chunks_of_another_seed_are_found(
 
 
 def test_seal_makes_no_columns_of_exchanged_rows(equal_sizes: Path) -> None:
-    from probe_kit.extract import seal
-
     shutil.rmtree(equal_sizes / "columns.zarr")
     swap(chunk(equal_sizes, "backbone/pooled", 2), chunk(equal_sizes, "backbone/pooled", 9))
     with pytest.raises(RunDamagedError, match=r"backbone/pooled/c/(2|9)"):
@@ -252,15 +287,22 @@ def test_columns_of_another_run_are_found(run: Path, other: Path) -> None:
     assert_found(run, "columns.zarr", deep=True)
 
 
-def test_columns_of_another_run_with_their_hashes_are_not_used(run: Path, other: Path, little_runs: Path) -> None:
-    """The numbers then come from the rows, and are the same."""
+def test_columns_of_another_run_with_their_hashes_are_found(run: Path, other: Path) -> None:
+    stamp = open_run(run).stamp
     for folder in ("columns.zarr", "sealed"):
         shutil.rmtree(run / folder)
         shutil.copytree(other / folder, run / folder)
-    assert not open_run(run).sealed
-    assert readings(run) == readings(little_runs / "run")
-    shutil.move(next((run / "sealed").iterdir()), run / "sealed" / f"{open_run(run).stamp[:16]}.json")
     assert_found(run, "sealed")
+    shutil.move(next((run / "sealed").iterdir()), run / "sealed" / f"{stamp[:16]}.json")
+    assert_found(run, "sealed")
+
+
+def test_the_metadata_of_columns_are_missed_alone_and_not_with_all_of_them(run: Path) -> None:
+    (run / "columns.zarr/zarr.json").unlink()
+    assert_found(run, "columns.zarr/zarr.json is missing")
+    shutil.rmtree(run / "columns.zarr")
+    assert verify_run(run, deep=True).ok
+    assert not open_run(run).sealed
 
 
 def test_exchanged_columns_are_found(equal_sizes: Path) -> None:
@@ -305,13 +347,14 @@ def test_what_was_said_of_a_run_is_protected(run: Path, other: Path, kind: str, 
 def test_reasons_of_failures_are_protected(run: Path) -> None:
     opened = open_run(run)
     (run / "commits/00000003.json").unlink()
+    shutil.rmtree(run / "sealed")
     write_failure(opened.root, 3, "the gripper broke")
     assert list(open_run(run, allow_partial=True).failed.values()) == ["the gripper broke"]
     assert verify_run(run).failed == 1
     edit(run / "failed/00000003.json", lambda failure: failure.update(episode_id="another"))
     assert "failed/00000003.json" in verify_run(run).problems[0]
     with pytest.raises(RunDamagedError, match=r"failed/00000003\.json"):
-        _ = open_run(run, allow_partial=True).failed
+        open_run(run, allow_partial=True)
 
 
 # -- pictures ----------------------------------------------------------------------------------------------
@@ -365,22 +408,19 @@ def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run
 def stored_probes(run: Path) -> list[Path]:
     """Oldest first: without controls, then with them."""
     folders = [path for path in (run / "probes").iterdir() if not path.name.startswith(".")]
-    return sorted(
-        folders, key=lambda path: json.loads((path / "settings.json").read_text(encoding="utf-8"))["created"]
-    )
+    return sorted(folders, key=lambda path: json.loads((path / "times.json").read_text())["created"])
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        lambda head: head.update(asked="2999-01-01T00:00:00+00:00"),
         lambda head: head["settings"].update(permutations=2000),
         lambda head: head["settings"].update(format=1),
         lambda head: head["files"].pop("controls.json", None) or head["files"].pop("scores.csv"),
         lambda head: head.pop("blake2b"),
         lambda head: head.update(stamp=""),
     ],
-    ids=["asked in the future", "more relabellings", "another format", "a file less", "no hash", "no stamp"],
+    ids=["more relabellings", "another format", "a file less", "no hash", "no stamp"],
 )
 @pytest.mark.parametrize("which", [0, 1])
 def test_changed_settings_of_probes_are_found(run: Path, change: Edit, which: int) -> None:
@@ -490,12 +530,11 @@ def stored_intervention(run: Path) -> Path:
 @pytest.mark.parametrize(
     "change",
     [
-        lambda head: head.update(created="2999-01-01T00:00:00+00:00"),
         lambda head: head["settings"].update(stamp="0" * 64),
         lambda head: head["files"].pop("certificate.json"),
         lambda head: head.pop("blake2b"),
     ],
-    ids=["made in the future", "of other episodes", "a file less", "no hash"],
+    ids=["of other episodes", "a file less", "no hash"],
 )
 def test_changed_settings_of_interventions_are_found(run: Path, change: Edit) -> None:
     edit(stored_intervention(run) / "settings.json", change)
@@ -544,7 +583,7 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
     commit["objects"][key] = Sum.of(outside.read_bytes()).to_json()
     write_record(path, commit)
     found = verify_run(run, deep=True)
-    assert any("outside" in problem and "missing" in problem for problem in found.problems)
+    assert any("outside" in problem and "no object of this episode" in problem for problem in found.problems)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")

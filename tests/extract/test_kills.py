@@ -66,14 +66,14 @@ def nursery(suite: Suite) -> Iterator[Nursery]:
 def objects(run: Path | str) -> dict[str, bytes]:
     """Every object by key, columns by their name in a folder.
 
-    Of probes, what does not tell the time.
+    Of probes, all but the record that tells the time.
     """
     location = locate(run)
     stamped = f"{location.derived(COLUMNS, open_run(run, allow_partial=True).stamp)}/"
     return {
         key.replace(stamped, f"{COLUMNS}/"): location.read(key)
         for key in location.keys("")
-        if not (key.startswith("probes/") and key.endswith("settings.json"))
+        if not (key.startswith("probes/") and key.endswith("/times.json"))
     }
 
 

@@ -72,6 +72,9 @@ def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: py
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_columns_of_other_commits_are_not_used_until_sealed_again(copy: Path) -> None:
     (copy / "commits/00000005.json").unlink()
+    with pytest.raises(RunDamagedError, match=r"commits/00000005\.json is missing.*delete sealed"):
+        seal(copy)
+    shutil.rmtree(copy / "sealed")
     run = open_run(copy, allow_partial=True)
     with pytest.warns(NotSealedWarning, match="probe-kit run seal"):
         assert run.column(SITES[0]).shape == (47, 96)

@@ -177,6 +177,7 @@ def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: Effects,
 
 def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     (mine.path / "commits/00000003.json").unlink()
+    shutil.rmtree(mine.path / "sealed")  # else it is a run that lost an episode
     fewer = open_run(mine.path, allow_partial=True)
     assert stored_interventions(fewer) == []
     with pytest.raises(NoInterventionsError, match="probe-kit intervene"):

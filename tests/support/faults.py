@@ -85,7 +85,7 @@ class Stored:
 
 
 def _summary(audit: Audit) -> tuple[object, ...]:
-    return audit.committed, audit.planned, audit.failed, audit.sealed, audit.protected, audit.strays
+    return audit.committed, audit.planned, audit.failed, audit.sealed, audit.strays
 
 
 @contextmanager

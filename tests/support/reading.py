@@ -35,7 +35,7 @@ def _of_run(run: Run) -> Readings:
     names = (run.model, run.label, run.weights_sha256, run.random_weights, run.suite, run.settings_sha256)
     rows = range(len(run.episodes))
     asked: Readings = {
-        "names": lambda: (*names, run.protected),
+        "names": lambda: names,
         "episodes": lambda: run.episodes.to_csv(),
         "failed": lambda: run.failed,
         "provenance": lambda: run.provenances,

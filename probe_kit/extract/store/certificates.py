@@ -6,13 +6,13 @@ certificates/<digits>.json     a record per process, named by its sha256
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import CERTIFICATE_FILE, CERTIFICATES
 from probe_kit.extract.store.format.commits import create_once
-from probe_kit.extract.store.format.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.format.hashes import HASH, expect, read_record
 from probe_kit.extract.store.format.root import RESTORE, Root
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import Provenance, name_of
@@ -32,25 +32,36 @@ def write_certificate(root: Root, found: Mapping[str, Any], provenance: Provenan
 
 
 def read_certificate(root: Root) -> tuple[Record, list[Record]]:
-    """What the first process wrote, and the records of all; a run of schema 1 has no records.
+    """What the first process wrote, and the records of all.
 
     Raises RunDamagedError if one is missing, was changed, or is another run's.
     """
     try:
-        first = _reader(root)(CERTIFICATE_FILE, root.location.read(CERTIFICATE_FILE))
+        first = _read(root, CERTIFICATE_FILE, root.location.read(CERTIFICATE_FILE))
     except FileNotFoundError:
         raise RunDamagedError(f"{root.location}/{CERTIFICATE_FILE} is missing. {RESTORE}") from None
     records = []
     for name, raw in root.location.read_all(CERTIFICATES, ".json").items():
         if not _NAMED.fullmatch(name):
             continue  # nobody's, such as a copy that somebody made
-        record = _reader(root)(f"{CERTIFICATES}/{name}", raw)
-        if root.protected and sha256_json(record)[:DIGITS] != name.removesuffix(".json"):
+        record = _read(root, f"{CERTIFICATES}/{name}", raw)
+        if sha256_json(record)[:DIGITS] != name.removesuffix(".json"):
             raise RunDamagedError(f"{root.location}/{CERTIFICATES}/{name} is another process's. {RESTORE}")
         records.append(record)
-    if root.protected and not records:
+    if not records:
         raise RunDamagedError(f"{root.location}/{CERTIFICATES} holds no record of who played. {RESTORE}")
+    if not any(_says(first, record) for record in records):
+        raise RunDamagedError(
+            f"{root.location}/{CERTIFICATE_FILE} says what none of the records in {CERTIFICATES} says. {RESTORE}"
+        )
     return first, records
+
+
+def _says(first: Record, record: Record) -> bool:
+    """Whether the certificate is this process's record, and the provenance that the record names."""
+    provenance = {part: value for part, value in first.items() if part not in record}
+    same = all(first.get(part) == value for part, value in record.items())
+    return same and name_of(provenance) == record["provenance"]
 
 
 def certificate_keys(location: Location) -> list[str]:
@@ -59,15 +70,13 @@ def certificate_keys(location: Location) -> list[str]:
     return [CERTIFICATE_FILE, *records]
 
 
-def _reader(root: Root) -> Callable[[str, bytes], Record]:
-    def read(key: str, raw: bytes) -> Record:
-        name = f"{root.location}/{key}"
-        if not root.protected:
-            return read_plain(raw, name, RESTORE)
-        record = read_record(raw, name, RESTORE)
-        if record.get("run") != root.identity:
-            raise RunDamagedError(f"{name} is the certificate of another run. {RESTORE}")
-        del record[HASH]
-        return record
-
-    return read
+def _read(root: Root, key: str, raw: bytes) -> Record:
+    name = f"{root.location}/{key}"
+    record = read_record(raw, name, RESTORE)
+    expect(record, {"run": str, "provenance": str}, name, RESTORE)
+    if record["run"] != root.identity:
+        raise RunDamagedError(f"{name} is the certificate of another run. {RESTORE}")
+    if record.get("capture_check") is not None:
+        expect(record, {"capture_check": dict}, name, RESTORE)
+    del record[HASH]
+    return record

@@ -18,7 +18,7 @@ import probe_kit.version
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.extract.run_layout import PROVENANCE
 from probe_kit.extract.store.format.commits import create_once
-from probe_kit.extract.store.format.hashes import HASH, read_plain, read_record
+from probe_kit.extract.store.format.hashes import HASH, expect, read_record
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hashing import sha256_json, sha256_text
@@ -85,18 +85,19 @@ def keep_provenance(location: Location, provenance: Provenance) -> None:
 
 
 def read_provenances(root: Root) -> dict[str, Provenance]:
-    """Every provenance of a run by its name; a run made before there was any has none.
+    """Every provenance of a run by its name.
 
     Raises RunDamagedError if one is not what its name says.
     """
     found: dict[str, Provenance] = {}
-    location, read = root.location, read_record if root.protected else read_plain
+    location = root.location
     for file, raw in location.read_all(PROVENANCE, ".json").items():
         if not _NAMED.fullmatch(file):
             continue  # a copy that somebody made
         where, name = f"{location}/{PROVENANCE}/{file}", file.removesuffix(".json")
-        content = read(raw, where, _RESTORE)
-        content.pop(HASH, None)
+        content = read_record(raw, where, _RESTORE)
+        del content[HASH]
+        expect(content, {"device": str, "versions": dict}, where, _RESTORE)
         if name_of(content) != name:
             raise RunDamagedError(f"{where} was changed after it was written. {_RESTORE}")
         found[name] = content

@@ -20,7 +20,7 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract.run_layout import DATA, PROVENANCE, RUN_FILE, StoredStream
+from probe_kit.extract.run_layout import DATA, PROVENANCE, TRAJECTORY, StoredStream
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.checking import CheckedStore
@@ -36,7 +36,6 @@ from probe_kit.extract.store.format.commits import (
 from probe_kit.extract.store.format.hashes import Sum
 from probe_kit.extract.store.format.root import RESTORE, read_root
 from probe_kit.extract.store.format.rows import Rows, TokenBlock, role_mask, token_blocks
-from probe_kit.extract.store.format.trajectories import NAME as TRAJECTORY
 from probe_kit.extract.store.format.trajectories import Trajectories, has_trajectories, names_trajectory
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -65,9 +64,10 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
 
     allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
     Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
-    is another one, a committed object is missing, or plan, metadata or a commit is not what was written.
+    is another one, a committed object is missing, or plan, metadata or any record is not what was written.
     """
     run = Run(locate(path))
+    run.check_records()
     done = len(run.episodes)
     if done < run.planned and not allow_partial:
         failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
@@ -95,12 +95,16 @@ class Run:
         card = self.root.card
         self.settings: dict[str, Any] = card["settings"]
         self.settings_sha256: str = card["settings_sha256"]
-        try:
-            self._streams = {s["name"]: StoredStream.from_json(s) for s in card["streams"]}
-        except (TypeError, KeyError) as error:
-            raise RunDamagedError(
-                f"{location}/{RUN_FILE} describes its streams wrongly: {error!r}. {RESTORE}"
-            ) from error
+        self._streams = self.root.streams
+
+    def check_records(self) -> None:
+        """Raise RunDamagedError if a record of the run is not what was written, or names a commit that is gone.
+
+        Of commits, provenance, certificates, seal and failures; results stored with the run are checked when read.
+        """
+        _ = self.failed, self.provenances, self.columns
+        if self._commits:
+            read_certificate(self.root)
 
     def __repr__(self) -> str:
         return run_text(self)
@@ -112,11 +116,6 @@ class Run:
     def path(self) -> Path:
         """The run's folder. Raises UsageError if it lies in an object store."""
         return self.location.path
-
-    @property
-    def protected(self) -> bool:
-        """Whether every changed byte is found when it is read; runs of former versions are not so protected."""
-        return self.root.protected
 
     @property
     def model(self) -> str:
@@ -158,12 +157,10 @@ class Run:
         episodes.
         """
         certificate, processes = read_certificate(self.root)
-        if not processes:  # a run of schema 1
-            return certificate
         checks = [process["capture_check"] for process in processes if process.get("capture_check")]
         if checks:
             certificate["hooks_on_equals_hooks_off"] = all(
-                value == check[name.replace("_with_", "_without_")]
+                value == check.get(name.replace("_with_", "_without_"))
                 for check in checks
                 for name, value in check.items()
                 if name.endswith("_with_hooks_sha256")
@@ -174,10 +171,10 @@ class Run:
     def provenances(self) -> dict[str, Provenance]:
         """Device and versions that committed episodes were made with, by the name commits call them.
 
-        Empty for a run of schema 1. Raises RunDamagedError if a commit names one that is not there.
+        Raises RunDamagedError if a commit names one that is not there.
         """
         stored = read_provenances(self.root)
-        named = sorted({commit["provenance"] for commit in self.commits() if "provenance" in commit})
+        named = sorted({commit["provenance"] for commit in self.commits()})
         if missing := [name for name in named if name not in stored]:
             raise RunDamagedError(
                 f"{self.location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was "
@@ -418,7 +415,7 @@ class Run:
     @cached_property
     def columns(self) -> Columns | None:
         """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
-        return find_columns(self.root, self.stamp)
+        return find_columns(self.root, self._commits)
 
     def _note_slow_reading(self) -> None:
         warnings.warn(
@@ -436,8 +433,6 @@ class Run:
     def data(self) -> Store:
         """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
         store = self.location.store(DATA, read_only=True)
-        if not self.protected:
-            return store
         return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
 
     @cached_property
@@ -475,8 +470,7 @@ class Run:
             else:
                 array = self.columns.xarray(name).isel(episode=self._columns_rows)
             own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
-            old = {"step": "call"} if "step" in array.dims else {}  # its name in runs of schema 1
-            array = array.rename({**old, **own}).transpose("episode", "call", *own.values())
+            array = array.rename(own).transpose("episode", "call", *own.values())
             arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
         labels = ("episode_id", "category", "layout", "side_correct", "outcome")
         return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in labels})

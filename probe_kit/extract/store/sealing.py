@@ -51,8 +51,8 @@ def _seal(run: Run) -> bool:
         group.attrs["stamp"] = run.stamp
         folder = run.location.derived(COLUMNS, run.stamp)
         run.location.confirm({f"{folder}/{key}": one.length for key, one in store.sums.items()})
-    if run.protected:
-        write_seal(run.root, run.stamp, store.sums)  # what makes them count, so last
+    commits = {commit["episode"]: commit for commit in run.commits()}
+    write_seal(run.root, commits, store.sums)  # what makes them count, so last
     return True
 
 

@@ -1,6 +1,5 @@
 """Workers on a Ray cluster."""
 
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -11,7 +10,8 @@ from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.settings import RunSettings
-from probe_kit.extract.store.format.commits import commit_key
+from probe_kit.extract.store.format.commits import commit_key, read_commit
+from probe_kit.extract.store.format.root import read_root
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.workers.loading import load_worker
 from probe_kit.extract.workers.scheduler import Scheduler
@@ -185,6 +185,8 @@ class RayCrew:
 
     def _committed(self, numbers: set[int]) -> list[Event]:
         """What a dead actor finished before it could say so."""
-        location = locate(self._run)
-        finished = [number for number in sorted(numbers) if location.exists(commit_key(number))]
-        return [Done(number, json.loads(location.read(commit_key(number)))["outcome"]) for number in finished]
+        root = read_root(locate(self._run))
+        finished = [(number, commit_key(number)) for number in sorted(numbers)]
+        finished = [(number, key) for number, key in finished if root.location.exists(key)]
+        commits = [read_commit(root, number, key, root.location.read(key)) for number, key in finished]
+        return [Done(commit["episode"], commit["outcome"]) for commit in commits]

@@ -87,8 +87,8 @@ def _used(run: RunReader) -> set[str]:
 
 
 def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredIntervention:
-    settings, created = bundle.head.get("settings"), str(bundle.head.get("created", ""))
-    if not isinstance(settings, Mapping) or settings.get("format") != FORMAT:
+    settings, created = bundle.head["settings"], bundle.times.get("created", "")
+    if settings.get("format") != FORMAT:
         return StoredIntervention(bundle.key, "other version", created)
     state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
     return StoredIntervention(

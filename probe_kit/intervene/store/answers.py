@@ -7,7 +7,6 @@ attention.npz      of the kind `attention`: shares per inference, block, iterati
 certificate.json   what was loaded, and what was checked
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +22,7 @@ from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
 from probe_kit.extract.store.format.hashes import as_json
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import stamp_of_run
 
@@ -125,7 +124,7 @@ class Stored:
     @property
     def created(self) -> str:
         """ISO time, UTC."""
-        return str(self.bundle.head.get("created", ""))
+        return self.bundle.times.get("created", "")
 
     def answers(self) -> Answers:
         """What was measured. Raises RunDamagedError if it was changed."""
@@ -133,8 +132,7 @@ class Stored:
 
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked. Raises RunDamagedError if it was changed."""
-        found: dict[str, Any] = json.loads(self.bundle.read(CERTIFICATE))
-        return found
+        return self.bundle.read_json(CERTIFICATE)
 
 
 def save(
@@ -154,7 +152,7 @@ def save(
         EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
     }  # fmt: skip
     now = datetime.now(UTC).isoformat(timespec="microseconds")
-    write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings), "created": now}, files)
+    write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings)}, files, {"created": now})
 
 
 def is_stored(run: Location, key: str) -> bool:
@@ -169,6 +167,9 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
     RunDamagedError if any of the run was changed or lost its settings.
     """
     found = [Stored(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    for one in found:
+        if key_of(one.settings) != one.key:
+            raise one.bundle.head_damaged(f"has the settings of {key_of(one.settings)}")
     wanted = {
         "format": FORMAT, "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
         "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),

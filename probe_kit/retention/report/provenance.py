@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from probe_kit.extract.store.locations.summary import NOT_PROTECTED
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.train.data.run_reader import RunReader
@@ -44,7 +43,6 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
         "mixed": ", ".join(getattr(run, "mixed", ())),
-        "integrity": "" if getattr(run, "protected", True) else NOT_PROTECTED,
         "probes": str(probes.get("key", "none")),
     }
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}

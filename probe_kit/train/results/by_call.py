@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import is_current, load_results, read_probes, settings_of
-from probe_kit.train.settings import FORMAT
+from probe_kit.train.results.store import is_current, is_ours, load_results, read_probes, settings_of
 
 
 def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
@@ -15,9 +14,9 @@ def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
     """
     found = {like.settings.call: like}
     for key, bundle in read_probes(run.location).items():
-        if bundle.head["settings"].get("format") != FORMAT:
+        if not is_ours(bundle):
             continue
-        settings = settings_of(bundle.head)
+        settings = settings_of(bundle)
         alike = replace(settings, call=like.settings.call, episodes=like.settings.episodes)
         if alike == like.settings and settings.call != like.settings.call and is_current(settings, run):
             found[settings.call] = load_results(run, key)

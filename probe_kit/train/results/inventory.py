@@ -8,8 +8,14 @@ from probe_kit.errors import NoProbesError
 from probe_kit.extract.store.format.bundles import Bundle
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.resume import unfinished_sweeps
-from probe_kit.train.results.store import is_current, load_results, read_controls, read_probes, settings_of
-from probe_kit.train.settings import FORMAT
+from probe_kit.train.results.store import (
+    is_current,
+    is_ours,
+    load_results,
+    read_controls,
+    read_probes,
+    settings_of,
+)
 
 
 @dataclass(frozen=True)
@@ -42,8 +48,7 @@ class Inventory:
 
     episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
     in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone.
-    protected: whether a changed byte is found, as it is not in runs of former versions. probes: oldest first.
-    unfinished: finished sites of interrupted sweeps, by key.
+    probes: oldest first. unfinished: finished sites of interrupted sweeps, by key.
     """
 
     run: str
@@ -57,7 +62,6 @@ class Inventory:
     planned: int
     failed: int
     outcomes: Mapping[str, int]
-    protected: bool
     streams: Mapping[str, str]
     probes: tuple[StoredProbes, ...]
     unfinished: Mapping[str, int]
@@ -79,7 +83,6 @@ def inventory(run: Any) -> Inventory:
         planned=getattr(run, "planned", len(episodes)),
         failed=len(getattr(run, "failed", ())),
         outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
-        protected=getattr(run, "protected", True),
         streams={name: _words(run, name) for name in run.streams},
         probes=tuple(stored_probes(run)),
         unfinished=unfinished_sweeps(run.location),
@@ -108,11 +111,10 @@ def _used(run: RunReader) -> str | None:
 
 
 def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
-    key, header = bundle.key, bundle.head
-    created = str(header.get("created", ""))
-    if not _readable(header):
+    key, created = bundle.key, bundle.times.get("created", "")
+    if not is_ours(bundle):
         return StoredProbes(key, "other version", created)
-    settings = settings_of(header)
+    settings = settings_of(bundle)
     current = [run for run in readers if is_current(settings, run)]
     state = "used" if key in used else "other" if current else "other episodes"
     wording = getattr(current[0], "wording", None) if current else None
@@ -130,11 +132,6 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
         controls=_controls(bundle),
         wording=wording or "",
     )
-
-
-def _readable(header: Mapping[str, Any]) -> bool:
-    settings = header.get("settings")
-    return isinstance(settings, Mapping) and settings.get("format") == FORMAT
 
 
 def _controls(bundle: Bundle) -> tuple[str, ...]:

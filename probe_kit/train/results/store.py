@@ -28,7 +28,7 @@ from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import Curve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
-from probe_kit.train.settings import FORMAT, ProbeSettings
+from probe_kit.train.settings import FORMAT, ProbeSettings, key_of
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
@@ -43,29 +43,20 @@ def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = T
     location = locate(run)
     if not is_stored(location, results.key):
         files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
-        _write(location, results.key, _header(results, asked), files | _controls(results))
+        head = {"settings": asdict(results.settings), "stamp": results.stamp}
+        times = {"created": results.created, "asked": _now() if asked else ""}
+        write_bundle(location, PROBES, results.key, head, files | _controls(results), times)
         return
-    stored = {key: bundle.head for key, bundle in read_probes(location).items()}
-    header, found = stored[results.key], _controls(results)
-    if asked and results.key != max(_ours(stored), key=lambda key: _rank(key, stored[key])):
-        header = {**header, "asked": _now()}
-    if found or header != stored[results.key]:
-        _write(location, results.key, header, {**found, **({SCORES: _scores(results)} if found else {})})
+    stored = read_probes(location)
+    own, found = stored[results.key], _controls(results)
+    times = dict(own.times)
+    if asked and own.key != max(_ours(stored).values(), key=_rank).key:
+        times["asked"] = _now()
+    if found or times != own.times:
+        files = {**found, SCORES: _scores(results)} if found else {}
+        write_bundle(location, PROBES, results.key, own.head, files, times)
     else:
         tidy_bundle(location, PROBES, results.key)
-
-
-def _write(run: Location, key: str, header: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
-    write_bundle(run, PROBES, key, header, files)
-
-
-def _header(results: ProbeResults, asked: bool) -> dict[str, Any]:
-    return {
-        "settings": asdict(results.settings),
-        "created": results.created,
-        "asked": _now() if asked else "",
-        "stamp": results.stamp,
-    }
 
 
 def _scores(results: ProbeResults) -> bytes:
@@ -108,7 +99,7 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
     """
     location = run.location
     probes = read_probes(location)
-    stored = _ours({name: bundle.head for name, bundle in probes.items()})
+    stored = _ours(probes)
     if key is not None:
         found = [name for name in stored if name == key] or [
             name for name in stored if key and name.startswith(key)
@@ -119,13 +110,12 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
                 f"{', '.join(stored) or 'none'}"
             )
         return _read(run, probes[found[0]])
-    asked = [(name, settings_of(header)) for name, header in stored.items()]
-    current = [name for name, settings in asked if (settings.target, settings.call) == (target, 0)]
-    current = [name for name in current if is_current(settings_of(stored[name]), run)]
+    asked = [(bundle, settings_of(bundle)) for bundle in stored.values()]
+    fitting = [(bundle, own) for bundle, own in asked if (own.target, own.call) == (target, 0)]
+    current = [bundle for bundle, own in fitting if is_current(own, run)]
     if not current:
         raise NoProbesError(_why_none(run, target, len(probes)))
-    newest = max(current, key=lambda name: _rank(name, stored[name]))
-    return _read(run, probes[newest])
+    return _read(run, max(current, key=_rank))
 
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
@@ -145,13 +135,19 @@ def _why_none(run: RunReader, target: Target, stored: int) -> str:
     )
 
 
-def _rank(key: str, header: Mapping[str, Any]) -> tuple[str, str, str]:
+def _rank(bundle: Bundle) -> tuple[str, str, str]:
     """What is newest has the highest; results of former versions count as asked for when they were made."""
-    return str(header.get("asked", header["created"])), str(header["created"]), key
+    created = bundle.times.get("created", "")
+    return bundle.times.get("asked", created), created, bundle.key
 
 
-def _ours(headers: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    return {name: header for name, header in headers.items() if header["settings"].get("format") == FORMAT}
+def _ours(probes: Mapping[str, Bundle]) -> dict[str, Bundle]:
+    return {name: bundle for name, bundle in probes.items() if is_ours(bundle)}
+
+
+def is_ours(bundle: Bundle) -> bool:
+    """Whether stored probes are of this version's format."""
+    return bool(bundle.head["settings"].get("format") == FORMAT)
 
 
 def _now() -> str:
@@ -186,29 +182,35 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
 
 def read_probes(run: Location) -> dict[str, Bundle]:
     """Every complete result by key, of whatever version. Raises RunDamagedError for one that was changed."""
-    return read_bundles(run, PROBES)
+    found = read_bundles(run, PROBES)
+    for key, bundle in found.items():
+        if (own := key_of(bundle.head["settings"])) != key:
+            raise bundle.head_damaged(f"has the settings of {own}")
+    return found
 
 
-def settings_of(header: Mapping[str, Any]) -> ProbeSettings:
+def settings_of(bundle: Bundle) -> ProbeSettings:
     """The settings of results of this version's format. Raises RunDamagedError."""
-    stored = header["settings"]
+    stored = bundle.head["settings"]
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
         return ProbeSettings(**{**stored, **lists})
-    except (KeyError, TypeError) as error:
-        raise RunDamagedError(
-            f"stored probes of format {FORMAT} have settings that cannot be theirs: {error}. Remove the folder in "
-            f"{PROBES}/ whose settings.json says {str(stored)[:80]} …, and run the same `probe-kit train` again"
-        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise bundle.head_damaged(f"has settings that cannot be those of format {FORMAT}: {error!r}") from error
 
 
 def read_controls(bundle: Bundle) -> Controls:
     """What results were held against so far. Raises RunDamagedError."""
-    return Controls.from_json(json.loads(bundle.read(CONTROLS))) if bundle.has(CONTROLS) else Controls()
+    if not bundle.has(CONTROLS):
+        return Controls()
+    try:
+        return Controls.from_json(bundle.read_json(CONTROLS))
+    except (KeyError, TypeError, ValueError) as error:
+        raise bundle.damaged(CONTROLS, f"holds no controls ({error!r})") from error
 
 
 def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
-    settings = settings_of(bundle.head)
+    settings = settings_of(bundle)
     _refuse_foreign(run, bundle, settings)
     try:
         with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
@@ -223,14 +225,14 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
         curves,
         StoredDirections(bundle, DIRECTIONS),
         read_controls(bundle),
-        bundle.head["created"],
-        bundle.head.get("stamp", ""),
+        bundle.times.get("created", ""),
+        _stamp(bundle),
     )
 
 
 def _refuse_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
     """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
-    stamp, now = bundle.head.get("stamp", ""), stamp_of_run(run)
+    stamp, now = _stamp(bundle), stamp_of_run(run)
     if stamp == now or not (stamp and now):
         return
     if settings.run_settings != run.settings_sha256 or is_current(settings, run):
@@ -238,6 +240,11 @@ def _refuse_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> 
             f"{run.location}/{bundle.folder} holds probes of other activations than the run has: they were fitted "
             f"to commits {stamp[:12]}, here are {now[:12]}. Remove it and run the same `probe-kit train` again"
         )
+
+
+def _stamp(bundle: Bundle) -> str:
+    """Hash of the commits that probes were fitted to; empty for arrays in memory."""
+    return str(bundle.head.get("stamp", ""))
 
 
 def stamp_of_run(run: RunReader) -> str:

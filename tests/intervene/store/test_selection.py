@@ -160,8 +160,8 @@ def made_in(run: ArrayRun, names: list[str]) -> None:
     """As if they had been stored in this order."""
     for at, name in enumerate(names):
         settings = settings_of(run, name)
-        head = {"settings": settings, "created": f"2026-01-01T00:00:{at:02d}"}
-        write_bundle(run.location, INTERVENTIONS, key_of(settings), head)
+        times = {"created": f"2026-01-01T00:00:{at:02d}"}
+        write_bundle(run.location, INTERVENTIONS, key_of(settings), {"settings": settings}, times=times)
 
 
 def read(run: ArrayRun) -> dict[str, Any]:

@@ -1,9 +1,11 @@
-import json
+import shutil
 from collections.abc import Callable
 
+from probe_kit.extract.store.format.bundles import write_bundle
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.results.inventory import inventory
+from probe_kit.train.settings import key_of
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -29,6 +31,7 @@ def test_probes_of_other_episodes_and_other_versions_are_named(planted_run: Plan
     shorter = {pair: array[:60] for pair, array in run.features.items()}
     fewer = ArrayRun(run.path, run.model, run.suite, run.episodes[:60], shorter)
     assert [probes.state for probes in inventory(fewer).probes] == ["other episodes"]
-    header = run.path / "probes" / results.key / "settings.json"
-    header.write_text(json.dumps({"settings": {"format": 1}, "created": "2020"}), encoding="utf-8")
+    shutil.rmtree(run.path / "probes" / results.key)
+    older = {"format": 1}
+    write_bundle(run.location, "probes", key_of(older), {"settings": older}, times={"created": "2020"})
     assert [(probes.state, probes.views) for probes in inventory(run).probes] == [("other version", ())]

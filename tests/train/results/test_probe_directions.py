@@ -24,7 +24,7 @@ def direction(scale: float = 1.0) -> Direction:
 def bundle(folder: Path, places: dict[tuple[str, str, Site], Direction]) -> Bundle:
     file = BytesIO()
     save_directions(places, file)
-    write_bundle(locate(folder), "probes", KEY, {}, {"directions.npz": file.getvalue()})
+    write_bundle(locate(folder), "probes", KEY, {"settings": {}}, {"directions.npz": file.getvalue()})
     return read_bundle(locate(folder), "probes", KEY)
 
 

@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,8 +8,12 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.extract.store.format.bundles import write_bundle
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, load_results, save_results, train_probes
+from probe_kit.train.settings import key_of
+from tests.support.rehashing import write_record
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -29,7 +34,7 @@ def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun)
     results = train_probes(run, permutations=2)
     folder = run.path / "probes" / results.key
     assert sorted(path.name for path in folder.iterdir()) == [
-        "decisions.npz", "directions.npz", "scores.csv", "settings.json",
+        "decisions.npz", "directions.npz", "scores.csv", "settings.json", "times.json",
     ]  # fmt: skip
     scores = pd.read_csv(folder / "scores.csv")
     np.testing.assert_allclose(scores["accuracy"], results.scores["accuracy"])
@@ -89,6 +94,37 @@ def test_an_unknown_key_lists_the_known_ones(planted_run: PlantedRun) -> None:
         load_results(run, "ffffffffffff")
 
 
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "times.json"}
+
+
+def test_the_same_probes_have_the_same_bytes_whenever_they_were_fitted(
+    planted_run: PlantedRun, tmp_path: Path
+) -> None:
+    """Killed and begun anew or not: only the record of times tells when."""
+    run = planted_run()
+    folder = run.path / "probes" / train_probes(run, permutations=1).key
+    first, times = files_of(folder), (folder / "times.json").read_bytes()
+    shutil.move(folder, tmp_path / "before")
+    train_probes(run, permutations=1)
+    assert files_of(folder) == first
+    assert (folder / "times.json").read_bytes() != times
+
+
+def test_probes_of_before_times_had_a_record_are_read_and_ranked(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    old, new = train_probes(run, permutations=1), train_probes(run, permutations=2)
+    folder = run.path / "probes" / old.key
+    head = json.loads((folder / "settings.json").read_text())
+    write_record(folder / "settings.json", {**head, "created": "2020-01-01", "asked": "2999-01-01"})
+    (folder / "times.json").unlink()
+    assert (load_results(run).key, load_results(run).created) == (old.key, "2020-01-01")
+    train_probes(run, permutations=1, controls=("position",))
+    assert load_results(run).created == "2020-01-01"
+    assert not {"created", "asked"} & {*json.loads((folder / "settings.json").read_text())}
+    assert load_results(run, new.key).key == new.key
+
+
 def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     run = planted_run()
     results = train_probes(run, permutations=0)
@@ -101,11 +137,8 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
 def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> None:
     """An older version's settings have other fields; they must neither be read as ours nor stop us."""
     run = planted_run()
-    older = train_probes(run, permutations=1)
-    header = run.path / "probes" / older.key / "settings.json"
-    content = json.loads(header.read_text(encoding="utf-8"))
-    content["settings"] = {"format": 1, "model": "m"}
-    header.write_text(json.dumps(content), encoding="utf-8")
+    older = {"format": 1, "model": "m"}
+    write_bundle(locate(run.path), "probes", key_of(older), {"settings": older, "created": "2026", "asked": ""})
     with pytest.raises(NoProbesError):
         load_results(run)
     newer = train_probes(run, permutations=2)

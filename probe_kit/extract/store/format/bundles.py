@@ -1,9 +1,11 @@
 """Bundles: results that are stored with a run, a folder each, complete or not there.
 
     <home>/<key>/settings.json    the head, a record written last: what it is, whose, and the sums of its files
+    <home>/<key>/times.json       a record of when it was made, which no other hash covers
     <home>/<key>/<file>           what the head names; anything else there is not read
     <home>/.<key>.partial/        work that is not finished; only then may a folder lie there without a head
 
+Of the same settings and the same run, every file but `times.json` has the same bytes, killed and resumed or not.
 Files are never written over: what changes gets another name, and counts when the head names it.
 """
 
@@ -13,44 +15,36 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
+from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import RunDamagedError, RunNotFoundError
 from probe_kit.extract.run_layout import INTERVENTIONS, PROBES
-from probe_kit.extract.store.format.hashes import (
-    HASH,
-    Sum,
-    as_record,
-    digest_of,
-    expect,
-    is_record,
-    read_plain,
-    read_record,
-)
+from probe_kit.extract.store.format.hashes import HASH, Sum, as_record, digest_of, expect, is_sum, read_record
 from probe_kit.extract.store.format.root import read_root
 from probe_kit.extract.store.locations.location import Location
 
 BUNDLES = (PROBES, INTERVENTIONS)
 """Where bundles may lie in a run."""
 _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
-HEAD, PARTIAL = "settings.json", ".partial"
+HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8
-_PARTS = {"settings": dict, "created": str}
-"""Of heads that nothing protects."""
+_TIMES = ("created", "asked")
 
 
 @dataclass(frozen=True)
 class Bundle:
     """One bundle, its head checked; files are checked when they are read.
 
-    head: what whoever stored it says. files: by the name asked for, the name that counts now and the sum of it;
-    None in a run that nothing protects.
+    head: what whoever stored it says. times: by name, when what happened to it (UTC, ISO 8601). files: by the name
+    asked for, the name that counts now and the sum of it.
     """
 
     location: Location
     home: str
     key: str
     head: Mapping[str, Any]
-    files: Mapping[str, tuple[str, Sum]] | None
+    times: Mapping[str, str]
+    files: Mapping[str, tuple[str, Sum]]
 
     @property
     def folder(self) -> str:
@@ -59,16 +53,16 @@ class Bundle:
 
     def has(self, name: str) -> bool:
         """Whether it has a file of this name."""
-        return self.location.exists(f"{self.folder}/{name}") if self.files is None else name in self.files
+        return name in self.files
 
     def read(self, name: str) -> bytes:
         """One file. Raises RunDamagedError if it is missing or was changed."""
         try:
             content = self.location.read(self._place(name))
         except FileNotFoundError:
-            raise self._damaged(name, "is missing") from None
-        if self.files is not None and (problem := self.files[name][1].problem(content)):
-            raise self._damaged(name, problem)
+            raise self.damaged(name, "is missing") from None
+        if problem := self.files[name][1].problem(content):
+            raise self.damaged(name, problem)
         return content
 
     def open(self, name: str) -> BinaryIO:
@@ -76,51 +70,71 @@ class Bundle:
         try:
             return self.location.open(self._place(name))
         except FileNotFoundError:
-            raise self._damaged(name, "is missing") from None
+            raise self.damaged(name, "is missing") from None
 
     def check(self, name: str) -> None:
         """Read one file to its end, a piece at a time. Raises RunDamagedError if it was changed."""
-        if self.files is None:
-            return
         try:
             _, digest = digest_of(self.location.pieces(self._place(name)))
         except FileNotFoundError:
-            raise self._damaged(name, "is missing") from None
+            raise self.damaged(name, "is missing") from None
         if digest != self.files[name][1].digest:
-            raise self._damaged(name, "has other bytes than were written")
+            raise self.damaged(name, "has other bytes than were written")
 
     def problems(self, deep: bool) -> Iterator[str]:
         """What is missing or has another size; with `deep` whose bytes are others."""
-        names = {actual: name for name, (actual, _) in (self.files or {}).items()}
+        names = {actual: name for name, (actual, _) in self.files.items()}
         sizes = self.location.sizes(self.folder, names)
         for actual, name in names.items():
-            known = (self.files or {})[name][1]
+            known = self.files[name][1]
             try:
                 if sizes.get(actual) != known.length:
                     seen = f"{sizes[actual]} bytes; {known.length} were written" if actual in sizes else None
-                    raise self._damaged(name, f"has {seen}" if seen else "is missing")
+                    raise self.damaged(name, f"has {seen}" if seen else "is missing")
                 if deep:
                     self.check(name)
             except RunDamagedError as error:
                 yield str(error)
 
     def _place(self, name: str) -> str:
-        return f"{self.folder}/{name if self.files is None else self.files[name][0]}"
+        if name not in self.files:
+            raise self.head_damaged(f"names no file {name}")
+        return f"{self.folder}/{self.files[name][0]}"
 
-    def _damaged(self, name: str, problem: str) -> RunDamagedError:
+    def read_json(self, name: str) -> dict[str, Any]:
+        """One file that holds a JSON object, in which numbers may be NaN. Raises RunDamagedError."""
+        try:
+            content = parse_json(self.read(name))
+        except ValueError as error:
+            raise self.damaged(name, f"is no JSON ({error})") from error
+        if not isinstance(content, dict):
+            raise self.damaged(name, f"holds a {type(content).__name__}, not an object")
+        return content
+
+    def head_damaged(self, problem: str) -> RunDamagedError:
+        """What is raised about the head."""
+        return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {_advice(self.folder)}")
+
+    def damaged(self, name: str, problem: str) -> RunDamagedError:
+        """What is raised about one file."""
         return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {_advice(self.folder)}")
 
 
 def write_bundle(
-    location: Location, home: str, key: str, head: Mapping[str, Any], files: Mapping[str, bytes] = {}
+    location: Location,
+    home: str,
+    key: str,
+    head: Mapping[str, Any],
+    files: Mapping[str, bytes] = {},
+    times: Mapping[str, str] = {},
 ) -> None:
     """Store a bundle, or change one: files that are not given stay as they are.
 
-    head: replaces the former one, without the parts that are kept here (`key`, `run`, `files`). What killed
-    processes left in its folder is removed.
+    head, times: replace the former ones; of the head without the parts that are kept here (`key`, `run`, `files`).
+    What killed processes left in its folder is removed.
     """
     with location.tended(f"{home}/{key}"):
-        _write_bundle(location, home, key, head, files)
+        _write_bundle(location, home, key, head, files, times)
 
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
@@ -130,10 +144,15 @@ def tidy_bundle(location: Location, home: str, key: str) -> None:
 
 
 def _write_bundle(
-    location: Location, home: str, key: str, head: Mapping[str, Any], files: Mapping[str, bytes]
+    location: Location,
+    home: str,
+    key: str,
+    head: Mapping[str, Any],
+    files: Mapping[str, bytes],
+    times: Mapping[str, str],
 ) -> None:
     before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
-    kept = _files_of(before) if before else {}
+    kept = dict(before.files) if before else {}
     named, written = dict(kept), dict[str, int]()
     for name, content in files.items():
         known = Sum.of(content)
@@ -145,18 +164,13 @@ def _write_bundle(
     location.confirm(written)
     stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
     whose = {"key": key, "run": _identity(location)}
-    location.write_record(f"{home}/{key}/{HEAD}", as_record({**head, **whose, "files": stored}))
+    location.write_record(f"{home}/{key}/{TIMES}", as_record({**times, **whose}))
+    record = as_record({**head, **whose, "files": stored})
+    if before is None or location.read(f"{home}/{key}/{HEAD}") != record:
+        location.write_record(f"{home}/{key}/{HEAD}", record)
     for name, (actual, _) in kept.items():
         if named[name][0] != actual:
             location.delete(f"{home}/{key}/{actual}")
-
-
-def _files_of(bundle: Bundle) -> dict[str, tuple[str, Sum]]:
-    """Its files; those of a former version get their hashes here."""
-    if bundle.files is not None:
-        return dict(bundle.files)
-    names = (key.removeprefix(f"{bundle.folder}/") for key in bundle.location.keys(bundle.folder))
-    return {name: (name, Sum.of(bundle.read(name))) for name in names if name != HEAD}
 
 
 def _renamed(name: str, known: Sum) -> str:
@@ -165,26 +179,43 @@ def _renamed(name: str, known: Sum) -> str:
 
 
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
-    """The bundle `key`. Raises RunDamagedError if its head is missing, was changed, or is of another run."""
+    """The bundle `key`. Raises RunDamagedError if its head or times are missing, changed, or of another run."""
     folder = f"{home}/{key}"
     name, advice = f"{location}/{folder}/{HEAD}", _advice(folder)
-    try:
-        raw = location.read(f"{folder}/{HEAD}")
-    except FileNotFoundError:
-        raise RunDamagedError(f"{name} is missing, though the folder is there. {advice}") from None
-    run = _identity(location)
-    if not is_record(raw) and run is None:
-        plain = read_plain(raw, name, advice)
-        expect(plain, _PARTS, name, advice)
-        return Bundle(location, home, key, plain, None)
-    head = read_record(raw, name, advice)
-    if (head["key"], head["run"]) != (key, run):
-        raise RunDamagedError(f"{name} is {head['key']} of run {head['run']}; this is run {run}. {advice}")
-    files = {one: (actual, Sum(*known)) for one, (actual, *known) in head["files"].items()}
+    head = _read_own(location, home, key, HEAD)
+    former = {part: head.pop(part) for part in _TIMES if part in head}  # where heads of former versions said it
+    times = former or _read_own(location, home, key, TIMES)
+    if strange := [part for part, value in times.items() if not isinstance(value, str)]:
+        raise RunDamagedError(f"{location}/{folder} has no time as {strange[0]!r}. {advice}")
+    expect(head, {"settings": dict, "files": dict}, name, advice)
+    stored = head.pop("files")
+    if wrong := [one for one, known in stored.items() if not _is_file(known)]:
+        raise RunDamagedError(f"{name} has no name, length and hash of {wrong[0]!r}. {advice}")
+    files = {one: (actual, Sum(*known)) for one, (actual, *known) in stored.items()}
     if strange := sorted(actual for actual, _ in files.values() if "/" in actual or actual in ("", ".", "..")):
         raise RunDamagedError(f"{name} names {strange[0]!r}, which is no file beside it. {advice}")
-    rest = {part: value for part, value in head.items() if part not in (HASH, "key", "run", "files")}
-    return Bundle(location, home, key, rest, files)
+    return Bundle(location, home, key, head, times, files)
+
+
+def _read_own(location: Location, home: str, key: str, file: str) -> dict[str, Any]:
+    """A record of the bundle `key`, without what only says whose it is."""
+    folder = f"{home}/{key}"
+    name, advice = f"{location}/{folder}/{file}", _advice(folder)
+    try:
+        raw = location.read(f"{folder}/{file}")
+    except FileNotFoundError:
+        raise RunDamagedError(f"{name} is missing, though the folder is there. {advice}") from None
+    record, run = read_record(raw, name, advice), _identity(location)
+    if (record.get("key"), record.get("run", "")) != (key, run):
+        raise RunDamagedError(
+            f"{name} is {record.get('key')} of run {record.get('run')}; this is run {run}. {advice}"
+        )
+    return {part: value for part, value in record.items() if part not in (HASH, "key", "run")}
+
+
+def _is_file(stored: Any) -> bool:
+    """Whether a head says [name, length, hash] of a file."""
+    return isinstance(stored, list) and len(stored) == 3 and isinstance(stored[0], str) and is_sum(stored[1:])
 
 
 def bundle_keys(location: Location, home: str) -> list[str]:

@@ -6,13 +6,16 @@ writes them. They are derived: safe to delete, and used only while their stamp m
     columns.zarr/<stream>/pooled   float32 (call, view, [iteration,] layer, episode, feature)
     columns.zarr/<stream>/role     uint8   (call, episode, token), codes named by the attribute `roles`
     sealed/<stamp>.json            the hash of every object in columns.zarr, and of which run and commits they are
+
+A seal says which episodes it was made of. It is older than a run that has more; one that names an episode which is
+not committed any more shows that the run lost it.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.errors import ChunkNotFoundError
@@ -21,26 +24,29 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import COLUMNS, SEALED, StoredStream
 from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.checking import CheckedStore
-from probe_kit.extract.store.format.hashes import Sum, as_record, read_record, read_sums
+from probe_kit.extract.store.format.commits import Commit, commit_key, stamp_of
+from probe_kit.extract.store.format.hashes import Sum, as_record, check_sums, expect, read_record, read_sums
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
 
 if TYPE_CHECKING:
     import xarray as xr
+    import zarr
 
 
 STAMP_DIGITS = 16
+METADATA = "zarr.json"
+_NAMED = re.compile(rf"[0-9a-f]{{{STAMP_DIGITS}}}\.json")
 
 
 class Columns:
     """The sealed columns of a run.
 
-    sums: of every object in their folder; None in a run that nothing protects. advice: what to do if they are
-    damaged.
+    sums: of every object in their folder. advice: what to do if they are damaged.
     """
 
-    def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum] | None) -> None:
+    def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum]) -> None:
         self.folder, self.sums = folder, sums
         self._location = location
         self.advice = (
@@ -51,8 +57,6 @@ class Columns:
     def store(self) -> Store:
         """The objects, each checked as it is read."""
         store = self._location.store(self.folder, read_only=True)
-        if self.sums is None:
-            return store
         return CheckedStore(store, self.sums, self._where, lambda _key: self.advice)
 
     def _where(self, key: str) -> str:
@@ -80,28 +84,30 @@ class Columns:
         return dataset["pooled"].drop_attrs()
 
     def problems(self) -> Iterator[str]:
-        """What is missing or has another size, without reading it; nothing where there are no sums."""
-        sizes = self._location.sizes(self.folder, self.sums or {})
-        for key, known in (self.sums or {}).items():
+        """What is missing or has another size, without reading it."""
+        sizes = self._location.sizes(self.folder, self.sums)
+        for key, known in self.sums.items():
             if sizes.get(key) != known.length:
                 seen = f"has {sizes[key]} bytes; {known.length} were written" if key in sizes else "is missing"
                 yield f"{self.folder}/{key} {seen}. {self.advice}"
 
 
-def find_columns(root: Root, stamp: str) -> Columns | None:
-    """The columns of a run if they were sealed from exactly the commits that `stamp` names.
+def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
+    """The columns of a run if they were sealed from exactly these commits.
 
-    Raises RunDamagedError if what was noted of them when they were sealed was changed.
+    Raises RunDamagedError if what was noted of them when they were sealed was changed, or names commits that are
+    gone or others, or if a part of the columns is gone.
     """
-    location = root.location
-    folder = location.derived(COLUMNS, stamp)
-    if not location.exists(f"{folder}/zarr.json"):
+    location, stamp = root.location, stamp_of(commits)
+    sums = {seal["stamp"]: read_sums(seal["objects"]) for seal in _read_seals(root, commits)}.get(stamp)
+    if sums is None:
         return None
-    if root.protected:
-        sums = _read_seal(root, stamp)
-        return None if sums is None else Columns(location, folder, sums)
-    group = zarr.open_group(location.store(folder, read_only=True), mode="r")
-    return Columns(location, folder, None) if group.attrs.get("stamp") == stamp else None
+    found = Columns(location, location.derived(COLUMNS, stamp), sums)
+    if not location.exists(f"{found.folder}/{METADATA}"):
+        if not (location.keys(found.folder) and location.exists(seal_key(stamp))):
+            return None  # all of them were removed, as is allowed, or are being built again
+        raise RunDamagedError(f"{location}/{found.folder}/{METADATA} is missing. {found.advice}")
+    return found
 
 
 def seal_key(stamp: str) -> str:
@@ -109,22 +115,46 @@ def seal_key(stamp: str) -> str:
     return f"{SEALED}/{stamp[:STAMP_DIGITS]}.json"
 
 
-def write_seal(root: Root, stamp: str, sums: Mapping[str, Sum]) -> None:
-    """Note the hashes of the columns, which makes them count."""
-    objects = {key: one.to_json() for key, one in sums.items()}
-    root.location.write_record(
-        seal_key(stamp), as_record({"run": root.identity, "stamp": stamp, "objects": objects})
-    )
+def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
+    """Note the hashes of the columns, and the episodes they are of, which makes them count."""
+    stamp, objects = stamp_of(commits), {key: one.to_json() for key, one in sums.items()}
+    seal = {"run": root.identity, "stamp": stamp, "episodes": sorted(commits), "objects": objects}
+    root.location.write_record(seal_key(stamp), as_record(seal))
 
 
-def _read_seal(root: Root, stamp: str) -> dict[str, Sum] | None:
-    key = seal_key(stamp)
-    name = f"{root.location}/{key}"
-    advice = f"Delete it; `probe-kit run seal {root.location}` builds the columns again"
-    try:
-        seal = read_record(root.location.read(key), name, advice)
-    except FileNotFoundError:
-        return None
-    if (seal["run"], seal["stamp"]) != (root.identity, stamp):
-        raise RunDamagedError(f"{name} belongs to another run or to other episodes. {advice}")
-    return read_sums(seal["objects"])
+def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str, Any]]:
+    """All that count, each checked."""
+    for file, raw in root.location.read_all(SEALED, ".json").items():
+        if not _NAMED.fullmatch(file):
+            continue  # a copy that somebody made
+        name = f"{root.location}/{SEALED}/{file}"
+        advice = f"Delete it; `probe-kit run seal {root.location}` builds the columns again"
+        seal = read_record(raw, name, advice)
+        expect(seal, {"run": str, "stamp": str, "objects": dict}, name, advice)
+        check_sums(seal["objects"], name, advice)
+        if seal["run"] != root.identity or seal_key(seal["stamp"]) != f"{SEALED}/{file}":
+            raise RunDamagedError(f"{name} belongs to another run or to other episodes. {advice}")
+        if lost := {METADATA, *(f"{stream}/pooled/{METADATA}" for stream in root.streams)} - {*seal["objects"]}:
+            raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
+        if "episodes" in seal:  # seals of before this was noted say less
+            _refuse_lost(root, commits, seal, name, advice)
+        yield seal
+
+
+def _refuse_lost(
+    root: Root, commits: Mapping[int, Commit], seal: Mapping[str, Any], name: str, advice: str
+) -> None:
+    """Raise RunDamagedError if a seal was made of commits that are gone, or are others by now."""
+    expect(seal, {"episodes": list}, name, advice)
+    numbers = seal["episodes"]
+    if not all(type(number) is int for number in numbers):
+        raise RunDamagedError(f"{name} names other episodes than by number. {advice}")
+    absent = [number for number in numbers if number not in commits]
+    if lost := [number for number in absent if not root.location.exists(commit_key(number))]:
+        raise RunDamagedError(
+            f"{root.location}/{commit_key(lost[0])} is missing: {name} was made of {len(numbers)} episodes, of "
+            f"which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to redo "
+            f"them; to go on without, delete {SEALED} and {COLUMNS}"
+        )
+    if not absent and stamp_of({number: commits[number] for number in numbers}) != seal["stamp"]:
+        raise RunDamagedError(f"{name} was made of other commits than the run has. {advice}")

@@ -1,45 +1,36 @@
 """Commits: the small record that makes an episode count, written last and exactly once."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-import google_crc32c
-
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, ILLUSTRATIONS
+from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, ILLUSTRATIONS, TRAJECTORY, TRAJECTORY_AXES
 from probe_kit.extract.store.format.hashes import (
     HASH,
     Sum,
     as_record,
+    check_sums,
     expect,
-    is_record,
-    read_plain,
     read_record,
     read_sums,
 )
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.hashing import canonical_json, sha256_json
+from probe_kit.hashing import sha256_json
 
 Commit = dict[str, Any]
-CHECKSUM = "crc32c"
-"""What commits of former versions carry instead of a hash."""
-_PARTS = {"episode_id": str, "outcome": dict, "roles": list, "objects": dict}
-_NUMBERED = re.compile(r"(\d{8})\.json")
-
-
-def crc32c(content: bytes) -> str:
-    """The checksum that commits of former versions carry, as eight hex digits."""
-    return f"{google_crc32c.value(content):08x}"
-
-
-def crc32c_of(pieces: Iterable[bytes | memoryview]) -> tuple[int, str]:
-    """Length and the same checksum of what these pieces are together."""
-    value = length = 0
-    for piece in pieces:
-        value, length = google_crc32c.extend(value, bytes(piece)), length + len(piece)
-    return length, f"{value:08x}"
+_PARTS = {
+    "run": str,
+    "episode": int,
+    "episode_id": str,
+    "outcome": dict,
+    "roles": list,
+    "provenance": str,
+    "objects": dict,
+}
+_NUMBERED = re.compile(r"([0-9]{8})\.json")
+_PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
 
 def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:
@@ -55,11 +46,6 @@ def write_commit(location: Location, number: int, commit: Commit) -> bool:
 def commit_key(number: int) -> str:
     """Where the commit of episode `number` lies."""
     return f"{COMMITS}/{number:08d}.json"
-
-
-def commit_checksum(commit: Commit) -> str:
-    """crc32c over everything else that a commit of a former version says."""
-    return crc32c(canonical_json({key: value for key, value in commit.items() if key != CHECKSUM}).encode())
 
 
 def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
@@ -94,10 +80,6 @@ def read_commits(root: Root) -> dict[int, Commit]:
 def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     """One commit. Raises RunDamagedError if it was changed, or belongs to another episode or run."""
     name = f"{root.location}/{key}"
-    if not root.protected:
-        commit = read_plain(raw, name, redo(number))
-        expect(commit, _PARTS, name, redo(number))
-        return commit
     commit = read_record(raw, name, redo(number))
     expect(commit, _PARTS, name, redo(number))
     planned = root.planned.get(number)
@@ -111,7 +93,58 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
             f"{name} is the commit of {', '.join(wrong)}; in this place belongs that of episode {number}, "
             f"{planned['episode_id']}, of run {root.identity}. {redo(number)}"
         )
+    if problem := next(_problems(root, number, commit), None):
+        raise RunDamagedError(f"{name} {problem}. {redo(number)}")
+    check_sums(commit["objects"], name, redo(number))
+    _check_pictures(commit, name, redo(number))
     return commit
+
+
+def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
+    """What a commit says that none of this run can say."""
+    if not _PROVENANCE.fullmatch(commit["provenance"]):
+        yield f"names {commit['provenance']!r} as its provenance"
+    if not isinstance(commit["outcome"].get("outcome"), str):
+        yield "says no outcome"
+    if not _are_roles(root, commit["roles"]):
+        yield "says no roles of the tokens of every stream"
+    ids = commit.get("instruction_ids", [])
+    if not (isinstance(ids, list) and all(type(one) is int for one in ids)):
+        yield "has other instruction ids than numbers"
+    needed = {object_key(array, number, axes) for array, axes in root.arrays.items()}
+    trajectory = object_key(TRAJECTORY, number, TRAJECTORY_AXES)
+    if lost := sorted(needed - {*commit["objects"]}):
+        yield f"names no hash of {DATA}/{lost[0]}, which every episode has"
+    if strange := sorted({*commit["objects"]} - needed - {trajectory}):
+        yield f"names {strange[0]!r}, which is no object of this episode"
+    if trajectory in commit["objects"]:
+        if f"{TRAJECTORY}/zarr.json" not in root.metadata:
+            yield f"names {trajectory}, though the run keeps no trajectories"
+        if type(commit["outcome"].get("steps")) is not int:
+            yield "does not say how many steps its trajectory has"
+
+
+def object_key(array: str, number: int, axes: int) -> str:
+    """Where the object of episode `number` lies in `data.zarr`: a chunk holds all of one episode."""
+    return f"{array}/c/{number}{'/0' * (axes - 1)}"
+
+
+def _is_picture(key: str) -> bool:
+    folder, _, name = key.partition("/")
+    return folder in ILLUSTRATIONS and "/" not in name and name not in ("", ".", "..")
+
+
+def _are_roles(root: Root, calls: list[Any]) -> bool:
+    """Whether every captured inference says spans [role, start, stop] of the tokens of every stream."""
+    return len(calls) <= root.card["settings"]["captured_calls"] and all(
+        isinstance(call, dict) and all(_are_spans(call.get(name)) for name in root.streams) for call in calls
+    )
+
+
+def _are_spans(spans: Any) -> bool:
+    return isinstance(spans, list) and all(
+        isinstance(span, list) and [type(part) for part in span] == [str, int, int] for span in spans
+    )
 
 
 def redo(number: int) -> str:
@@ -131,13 +164,25 @@ def pictures_of(commit: Commit) -> dict[str, Sum] | None:
 
 def read_pictures(location: Location, number: int) -> dict[str, Sum] | None:
     """The same from the commit as it is stored; None also where there is no commit. Raises RunDamagedError."""
+    key = commit_key(number)
+    name = f"{location}/{key}"
     try:
-        raw = location.read(commit_key(number))
+        commit = read_record(location.read(key), name, redo(number))
     except FileNotFoundError:
         return None
-    return (
-        pictures_of(read_record(raw, f"{location}/{commit_key(number)}", redo(number))) if is_record(raw) else None
-    )
+    _check_pictures(commit, name, redo(number))
+    return pictures_of(commit)
+
+
+def _check_pictures(commit: Commit, name: str, advice: str) -> None:
+    pictures = commit.get("pictures", {})
+    if not isinstance(pictures, dict):
+        raise RunDamagedError(f"{name} names no pictures by key. {advice}")
+    if strange := [key for key in pictures if not _is_picture(key)]:
+        raise RunDamagedError(
+            f"{name} names {strange[0]!r} as a picture; pictures lie in {' or '.join(ILLUSTRATIONS)}. {advice}"
+        )
+    check_sums(pictures, name, advice)
 
 
 def picture_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
@@ -175,7 +220,7 @@ def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:
 
 def stamp_of(commits: Mapping[int, Commit]) -> str:
     """Hash of all commits: what derived files say they were made from."""
-    return sha256_json([[number, commits[number].get(HASH, commits[number])] for number in sorted(commits)])
+    return sha256_json([[number, commits[number][HASH]] for number in sorted(commits)])
 
 
 def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
@@ -188,7 +233,8 @@ def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
 def write_failure(root: Root, number: int, reason: str) -> None:
     """Record why an episode was given up."""
     failure = {"run": root.identity, "episode": number, "episode_id": root.planned[number]["episode_id"]}
-    create_once(root.location, f"{FAILED}/{number:08d}.json", {**failure, "reason": reason})
+    readable = reason.encode(errors="backslashreplace").decode()  # names of files may hold what is no character
+    create_once(root.location, f"{FAILED}/{number:08d}.json", {**failure, "reason": readable})
 
 
 def read_failures(root: Root) -> dict[str, str]:
@@ -197,9 +243,10 @@ def read_failures(root: Root) -> dict[str, str]:
     reasons = {}
     for number, key, raw in numbered(root.location, FAILED):
         name = f"{root.location}/{key}"
-        failure = read_record(raw, name, advice) if root.protected else read_plain(raw, name, advice)
-        expect(failure, {"episode_id": str, "reason": str}, name, advice)
-        if root.protected and (failure["run"], failure["episode"]) != (root.identity, number):
+        failure = read_record(raw, name, advice)
+        expect(failure, {"run": str, "episode": int, "episode_id": str, "reason": str}, name, advice)
+        planned = root.planned.get(number, {}).get("episode_id")
+        if (failure["run"], failure["episode"], failure["episode_id"]) != (root.identity, number, planned):
             raise RunDamagedError(f"{name} belongs to another run or episode. {advice}")
         reasons[failure["episode_id"]] = failure["reason"]
     return reasons

@@ -6,20 +6,23 @@
 
 `run.json` hashes the plan and the metadata; a commit hashes its objects and says whose it is; what is derived says
 from which commits. A record is JSON that carries the hash of all its other bytes, so that any change is seen.
+Every content has one spelling: a record in other bytes than `as_record` writes is damaged, whatever its hash says.
 Hashes find accidents, whatever they look like. They stop nobody who computes them anew: see `docs/storage.md`.
 """
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_json import parse_strict_json
 from probe_kit.errors import RunDamagedError
 
 HASH = "blake2b"
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
-_HEX = 2 * DIGEST_BYTES
+_HEX, _BLOCK_HEX = 2 * DIGEST_BYTES, 2 * BLOCK_BYTES
+_HEXADECIMAL = re.compile(r"[0-9a-f]+")
 _BEFORE, _AFTER = f'{{\n "{HASH}": "'.encode(), b'",'
 
 
@@ -51,8 +54,36 @@ class Sum(NamedTuple):
 
 
 def read_sums(stored: Mapping[str, Any]) -> dict[str, Sum]:
-    """By key, as `Sum.to_json` stored them."""
+    """By key, as `Sum.to_json` stored them; of a record that `check_sums` looked at."""
     return {key: Sum(*values) for key, values in stored.items()}
+
+
+def check_sums(stored: Mapping[str, Any], name: str, advice: str) -> None:
+    """Raise RunDamagedError unless every value is what `Sum.to_json` gives."""
+    for key, values in stored.items():
+        if not is_sum(values):
+            raise RunDamagedError(
+                f"{name} has {str(values)[:40]!r} as length and hash of {key!r}; expected a number of bytes and "
+                f"{_HEX} hex digits. {advice}"
+            )
+
+
+def is_sum(values: Any) -> bool:
+    """Whether this is what `Sum.to_json` gives."""
+    match values:
+        case [length, str(known)]:
+            return _is_length(length) and _are_digits(known, _HEX) and len(known) == _HEX
+        case [length, str(known), str(blocks)]:
+            return is_sum([length, known]) and _are_digits(blocks, _BLOCK_HEX)
+    return False
+
+
+def _is_length(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _are_digits(text: str, several: int) -> bool:
+    return len(text) % several == 0 and bool(_HEXADECIMAL.fullmatch(text))
 
 
 def digest(content: bytes) -> str:
@@ -91,24 +122,46 @@ def is_record(raw: bytes) -> bool:
 
 
 def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """What a record says, its own hash included. Raises RunDamagedError if any byte of it was changed.
+    """What a record says, with the hash that was computed of it. Raises RunDamagedError for any other bytes than
+    `as_record` gives for that content.
 
     name, advice: what it is and what to do, for the message.
     """
     start = len(_BEFORE)
     carried, rest = raw[start : start + _HEX], raw[start + _HEX + len(_AFTER) :]
-    whole = is_record(raw) and raw[start + _HEX :].startswith(_AFTER)
-    if not whole or digest(b"{" + rest).encode() != carried:
+    if is_record(raw) and digest(b"{" + rest).encode() != carried:
         raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
-    return read_plain(raw, name, advice)
+    content = read_plain(raw, name, advice)
+    content.pop(HASH, None)
+    try:
+        written = as_record(content)
+    except RecursionError:
+        raise RunDamagedError(f"{name} was changed after it was written: it nests too deeply. {advice}") from None
+    if raw != written:
+        raise RunDamagedError(f"{name} was changed after it was written: {_difference(raw, written)}. {advice}")
+    return {HASH: written[start : start + _HEX].decode(), **content}
+
+
+def _difference(raw: bytes, written: bytes) -> str:
+    """How bytes differ from the ones that probe_kit writes for their content."""
+    place = next((at for at, pair in enumerate(zip(raw, written, strict=False)) if pair[0] != pair[1]), None)
+    place = min(len(raw), len(written)) if place is None else place
+    seen, expected = (content[place : place + 20] for content in (raw, written))
+    return (
+        f"from byte {place} on it has {seen!r}; probe_kit writes {expected!r} for that content (spaces, order of "
+        "keys, spelling of numbers and the hash are part of a record)"
+    )
 
 
 def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """What JSON without a hash says, as runs of former versions have it. Raises RunDamagedError if it is none."""
+    """What an object of JSON says. Raises RunDamagedError if it is none, or names a key twice.
+
+    Of bytes that carry no hash; what they are compared with lies elsewhere.
+    """
     try:
-        content = parse_json(raw)
+        content = parse_strict_json(raw)
     except ValueError as error:
-        raise RunDamagedError(f"{name} cannot be read: {error}. {advice}") from error
+        raise RunDamagedError(f"{name} was changed after it was written: {error}. {advice}") from error
     if not isinstance(content, dict):
         raise RunDamagedError(f"{name} holds a {type(content).__name__}, not an object. {advice}")
     return content
@@ -117,6 +170,6 @@ def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
 def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, advice: str) -> None:
     """Raise RunDamagedError unless `content` has these parts, each of its type."""
     for part, kind in parts.items():
-        if not isinstance(content.get(part), kind):
+        if type(content.get(part)) is not kind:  # a boolean is no number
             seen = type(content[part]).__name__ if part in content else "nothing"
             raise RunDamagedError(f"{name} has {seen} as {part!r}; expected {kind.__name__}. {advice}")

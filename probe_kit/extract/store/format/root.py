@@ -10,11 +10,12 @@ from functools import cached_property
 from typing import Any
 
 from probe_kit.errors import RunDamagedError, RunNotFoundError
-from probe_kit.extract.run_layout import DATA, PLAN_FILE, PROTECTED_SINCE, READABLE, RUN_FILE, SCHEMA_VERSION
+from probe_kit.extract.run_layout import DATA, PLAN_FILE, RUN_FILE, SCHEMA_VERSION, StoredStream
 from probe_kit.extract.store.format.hashes import (
     HASH,
     Sum,
     as_record,
+    check_sums,
     expect,
     is_record,
     read_plain,
@@ -25,8 +26,14 @@ from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import what_to_open
 from probe_kit.hashing import sha256_json
 
-_PARTS = {"settings": dict, "settings_sha256": str, "streams": list}
-_EPISODE = {"episode": int, "episode_id": str}
+_PARTS = {"settings": dict, "settings_sha256": str, "streams": list, "objects": dict}
+_SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
+_FURTHER = {"random_weights": bool, "suite": dict}
+"""What the settings of every extracted run say besides, and those of a run that other code wrote may not."""
+_EPISODE = {
+    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
+    "episode": int,
+}
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
@@ -34,19 +41,15 @@ RESTORE = "Restore it from a copy, or extract the run again"
 class Root:
     """What `run.json` says, checked.
 
-    identity: its hash; None for a run of a former version, which nothing protects.
-    sums: of the plan and the arrays' metadata, by key; empty for such a run.
+    identity: the hash that was computed of it. streams: as it stores them, by name. sums: of the plan and the
+    arrays' metadata, by key.
     """
 
     location: Location
     card: Mapping[str, Any]
-    identity: str | None
+    identity: str
+    streams: Mapping[str, StoredStream]
     sums: Mapping[str, Sum]
-
-    @property
-    def protected(self) -> bool:
-        """Whether a changed byte anywhere in the run is found."""
-        return self.identity is not None
 
     def read(self, key: str) -> bytes:
         """An object that belongs to every run. Raises RunDamagedError if it is missing or was changed."""
@@ -55,7 +58,7 @@ class Root:
             content = self.location.read(key)
         except FileNotFoundError:
             raise RunDamagedError(f"{name} is missing. {RESTORE}") from None
-        if self.protected and (problem := self.sums[key].problem(content)):
+        if problem := self.sums[key].problem(content):
             raise RunDamagedError(f"{name} {problem}. {RESTORE}")
         return content
 
@@ -73,6 +76,8 @@ class Root:
         plan: list[dict[str, Any]] = content["episodes"]
         for episode in plan:
             expect(episode if isinstance(episode, dict) else {}, _EPISODE, name, RESTORE)
+        if len({episode["episode"] for episode in plan}) < len(plan):
+            raise RunDamagedError(f"{name} plans two episodes of one number. {RESTORE}")
         return plan
 
     @cached_property
@@ -85,6 +90,12 @@ class Root:
         """Sums of the arrays' metadata, by key in `data.zarr`."""
         inside = f"{DATA}/"
         return {key.removeprefix(inside): one for key, one in self.sums.items() if key.startswith(inside)}
+
+    @cached_property
+    def arrays(self) -> dict[str, int]:
+        """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
+        with_tokens = self.card["settings"]["tokens"] == "all"
+        return {name: axes for one in self.streams.values() for name, axes in one.arrays(with_tokens).items()}
 
 
 def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> bytes:
@@ -112,15 +123,36 @@ def read_root(location: Location) -> Root:
         raise RunNotFoundError(
             f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}"
         ) from None
-    card = read_record(raw, name, RESTORE) if is_record(raw) else read_plain(raw, name, RESTORE)
-    schema = card.get("schema_version")
-    if schema not in READABLE:
-        raise RunDamagedError(
-            f"{location} has schema {schema}; this version of probe_kit reads {', '.join(map(str, READABLE))}. "
-            "Update it"
-        )
+    card = _read_card(raw, name)
     expect(card, _PARTS, name, RESTORE)
-    identity = card.get(HASH)
-    if identity is None and schema >= PROTECTED_SINCE:
-        raise RunDamagedError(f"{name} has lost the hash it was written with. {RESTORE}")
-    return Root(location, card, identity, read_sums(card["objects"]) if identity else {})
+    there = {part: kind for part, kind in _FURTHER.items() if part in card["settings"]}
+    expect(card["settings"], {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
+    if sha256_json(card["settings"]) != card["settings_sha256"]:
+        raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
+    check_sums(card["objects"], name, RESTORE)
+    root = Root(location, card, card[HASH], _read_streams(card["streams"], name), read_sums(card["objects"]))
+    if lost := {PLAN_FILE, *(f"{DATA}/{array}/zarr.json" for array in root.arrays)} - {*root.sums}:
+        raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
+    return root
+
+
+def _read_card(raw: bytes, name: str) -> dict[str, Any]:
+    """What `run.json` says. Runs of former versions carried no hash of their own; their schema is named."""
+    card = read_record(raw, name, RESTORE) if is_record(raw) else read_plain(raw, name, RESTORE)
+    if (schema := card.get("schema_version")) != SCHEMA_VERSION or type(schema) is not int:
+        newer = type(schema) is int and schema > SCHEMA_VERSION
+        raise RunDamagedError(
+            f"{name} has schema {schema}; this version of probe_kit reads schema {SCHEMA_VERSION}. "
+            + ("Update probe_kit" if newer else "Extract the run again, or read it with the version that made it")
+        )
+    return read_record(raw, name, RESTORE)
+
+
+def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
+    try:
+        streams = [StoredStream.from_json(dict(one)) for one in stored]
+    except (TypeError, ValueError, KeyError) as error:
+        raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
+    if len({stream.name for stream in streams}) < len(streams):
+        raise RunDamagedError(f"{name} describes two streams of one name. {RESTORE}")
+    return {stream.name: stream for stream in streams}

@@ -16,19 +16,17 @@ from zarr.core.array_spec import ArrayConfigLike
 
 from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import DATA
+from probe_kit.extract.run_layout import TRAJECTORY
 from probe_kit.extract.store.format.arrays import codecs
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.format.rows import Rows
-
-NAME = "trajectory"
 
 
 def create_trajectories(store: Store, episodes: int, frames: int, codec: str) -> None:
     """Create the array at its final size: `frames` is one more than an episode has actions at most."""
     zarr.create_array(
         store,
-        name=NAME,
+        name=TRAJECTORY,
         shape=(episodes, frames, len(CHANNELS)),
         chunks=(1, frames, len(CHANNELS)),
         dtype="float32",
@@ -42,18 +40,17 @@ def create_trajectories(store: Store, episodes: int, frames: int, codec: str) ->
 
 def has_trajectories(root: Root) -> bool:
     """Whether the run was begun with room for them."""
-    metadata = f"{NAME}/zarr.json"
-    return metadata in root.metadata if root.protected else root.location.exists(f"{DATA}/{metadata}")
+    return f"{TRAJECTORY}/zarr.json" in root.metadata
 
 
 def names_trajectory(commit: Mapping[str, Any]) -> bool:
     """Whether an episode's commit names a trajectory; one that did not act has none."""
-    return any(key.startswith(f"{NAME}/") for key in commit["objects"])
+    return any(key.startswith(f"{TRAJECTORY}/") for key in commit["objects"])
 
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
     """Store the frames (T + 1, C) of episode `number`."""
-    array: zarr.Array[Any] = zarr.open_array(store, path=NAME, mode="r+", zarr_format=3, config=config)
+    array: zarr.Array[Any] = zarr.open_array(store, path=TRAJECTORY, mode="r+", zarr_format=3, config=config)
     row = np.full(array.shape[1:], np.nan, np.float32)
     row[: len(frames)] = frames
     array[number] = row

@@ -6,15 +6,12 @@ from functools import partial
 from pathlib import Path
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import COMMITS, DATA, PROVENANCE, RUN_FILE
+from probe_kit.extract.run_layout import COMMITS, DATA, PROVENANCE
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.bundles import bundle_problems
 from probe_kit.extract.store.format.columns import Columns, find_columns
 from probe_kit.extract.store.format.commits import (
-    CHECKSUM,
     Commit,
-    commit_checksum,
-    commit_key,
     committed_sizes,
     numbered,
     picture_problems,
@@ -30,7 +27,6 @@ from probe_kit.extract.store.integrity.orphans import stray_keys
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import read_provenances
-from probe_kit.hashing import sha256_json
 
 
 @dataclass(frozen=True)
@@ -38,9 +34,8 @@ class Audit:
     """What was found.
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
-    deep: whether every byte was read, not only sizes. protected: whether hashes bind everything to the root, as in
-    every run that this version writes; in others much can change unseen. strays: objects that belong to no part
-    of the run and that nothing reads, such as copies that somebody made.
+    deep: whether every byte was read, not only sizes. strays: objects that belong to no part of the run and that
+    nothing reads, such as copies that somebody made.
     """
 
     path: str
@@ -50,13 +45,17 @@ class Audit:
     sealed: bool
     deep: bool
     problems: tuple[str, ...]
-    protected: bool = True
     strays: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
         """Whether nothing is damaged; an unfinished run can be whole as far as it goes."""
         return not self.problems
+
+    @property
+    def finished(self) -> bool:
+        """Whether every planned episode is committed; an older state of a run is whole, but not finished."""
+        return self.ok and self.committed == self.planned
 
 
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
@@ -81,7 +80,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     problems += _commit_problems(root, commits)
     problems += picture_problems(location, commits)
     problems += _provenance_problems(root, commits)
-    if commits and root.protected:
+    if commits:
         problems += _caught(partial(read_certificate, root))
     failures: dict[str, str] = {}
     problems += _caught(lambda: failures.update(read_failures(root)))
@@ -99,10 +98,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
         sealed=columns is not None,
         deep=deep,
         problems=tuple(problems),
-        protected=root.protected,
-        strays=tuple(stray_keys(root, commits, columns, stamp_of(commits)))
-        if root.protected and not problems
-        else (),
+        strays=() if problems else tuple(stray_keys(root, commits, columns, stamp_of(commits))),
     )
 
 
@@ -116,8 +112,6 @@ def _caught(look: Callable[[], object]) -> list[str]:
 
 
 def _root_problems(root: Root) -> Iterator[str]:
-    if sha256_json(root.card["settings"]) != root.card["settings_sha256"]:
-        yield f"{RUN_FILE}: the settings do not have the hash stored beside them"
     for key in root.sums:
         yield from _caught(partial(root.read, key))
 
@@ -125,8 +119,6 @@ def _root_problems(root: Root) -> Iterator[str]:
 def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
     sizes = committed_sizes(root.location, commits)
     for number, commit in commits.items():
-        if not root.protected and commit_checksum(commit) != commit.get(CHECKSUM):
-            yield f"{commit_key(number)} was changed after it was written"
         for key, (length, *_) in commit["objects"].items():
             if problem := wrong_size(sizes, key, length):
                 yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
@@ -138,14 +130,14 @@ def _provenance_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[
     except RunDamagedError as error:
         yield str(error)
         return
-    for name in sorted({commit["provenance"] for commit in commits.values() if "provenance" in commit}):
+    for name in sorted({commit["provenance"] for commit in commits.values()}):
         if name not in stored:
             yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with. {RESTORE}"
 
 
 def _columns(root: Root, commits: Mapping[int, Commit], problems: list[str]) -> Columns | None:
     try:
-        return find_columns(root, stamp_of(commits))
+        return find_columns(root, commits)
     except RunDamagedError as error:
         problems.append(str(error))
         return None

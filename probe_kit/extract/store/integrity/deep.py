@@ -10,7 +10,7 @@ import numpy as np
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import DATA
 from probe_kit.extract.store.format.columns import Columns
-from probe_kit.extract.store.format.commits import Commit, crc32c_of, pictures_of, redo, redo_picture
+from probe_kit.extract.store.format.commits import Commit, pictures_of, redo, redo_picture
 from probe_kit.extract.store.format.hashes import digest_of
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
@@ -49,7 +49,7 @@ def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
 
 def _sealed(columns: Columns | None) -> Iterator[Job]:
     if columns is not None:
-        for key, (length, checksum, _) in (columns.sums or {}).items():
+        for key, (length, checksum, _) in columns.sums.items():
             yield f"{columns.folder}/{key}", length, checksum, "", columns.advice
 
 
@@ -67,14 +67,13 @@ def _wrong(location: Location, jobs: list[Job]) -> Iterator[str]:
 
 def _problem(location: Location, key: str, length: int, checksum: str) -> str | None:
     """None also for what has another size or is not there, which was said before."""
-    former = len(checksum) == len("00000000")
     try:
-        seen, found = (crc32c_of if former else digest_of)(location.pieces(key))
+        seen, found = digest_of(location.pieces(key))
     except FileNotFoundError:
         return None
     if seen != length or found == checksum:
         return None
-    return f"has other bytes than were written{f' (crc32c is not {checksum})' if former else ''}"
+    return "has other bytes than were written"
 
 
 def _differences(run: Run) -> Iterator[str]:

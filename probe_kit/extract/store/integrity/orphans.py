@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import DATA, FAILED, ILLUSTRATIONS, PROVENANCE, RUN_FILE
 from probe_kit.extract.store.certificates import certificate_keys
-from probe_kit.extract.store.format.bundles import BUNDLES, HEAD, PARTIAL, bundle_keys, read_bundle
+from probe_kit.extract.store.format.bundles import BUNDLES, HEAD, PARTIAL, TIMES, bundle_keys, read_bundle
 from probe_kit.extract.store.format.columns import Columns, seal_key
 from probe_kit.extract.store.format.commits import Commit, commit_key, numbered, pictures_of
 from probe_kit.extract.store.format.root import Root
@@ -30,7 +30,7 @@ def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
     yield from (key for _, key, _ in numbered(root.location, FAILED))
     if columns is not None:
         yield seal_key(stamp)
-        yield from (f"{columns.folder}/{key}" for key in columns.sums or {})
+        yield from (f"{columns.folder}/{key}" for key in columns.sums)
     for home in BUNDLES:
         for key in bundle_keys(root.location, home):
             yield from _of_bundle(root, home, key)
@@ -42,7 +42,8 @@ def _of_bundle(root: Root, home: str, key: str) -> Iterator[str]:
     except RunDamagedError:  # said elsewhere
         return
     yield f"{bundle.folder}/{HEAD}"
-    yield from (f"{bundle.folder}/{actual}" for actual, _ in (bundle.files or {}).values())
+    yield f"{bundle.folder}/{TIMES}"
+    yield from (f"{bundle.folder}/{actual}" for actual, _ in bundle.files.values())
 
 
 def _expected(key: str) -> bool:

@@ -198,16 +198,16 @@ class Bucket(Location):
         """A listing, then many requests side by side. What was listed and is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
-
-        def read(name: str) -> bytes | None:
-            try:
-                return self.read(f"{folder}/{name}")
-            except FileNotFoundError:
-                return None
-
         with ThreadPoolExecutor(READERS) as readers:
-            contents = zip(names, readers.map(read, names), strict=True)
-            return {name: content for name, content in contents if content is not None}
+            contents = readers.map(lambda name: self._read_if_there(f"{folder}/{name}"), names)
+            return {name: raw for name, raw in zip(names, contents, strict=True) if raw is not None}
+
+    def _read_if_there(self, key: str) -> bytes | None:
+        """None for what was removed since it was listed: seals and failures come and go."""
+        try:
+            return self.read(key)
+        except FileNotFoundError:
+            return None
 
     def keys(self, folder: str) -> list[str]:
         """From a listing."""

@@ -14,7 +14,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from probe_kit._system.drafts import draft_of
-from probe_kit.errors import DiskSpaceError, RunDamagedError, SettingsMismatchError
+from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.extract.run_layout import (
     CERTIFICATES,
     COLUMNS,
@@ -75,11 +75,12 @@ class Folder(Location):
         try:
             yield
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno not in FULL_DISK:
                 raise
+            free = f"{self.free_bytes() / 1e6:.1f} MB free"
             raise DiskSpaceError(
-                f"the disk of {self} is full ({self.free_bytes() / 1e6:.1f} MB free); every committed episode is "
-                "whole and kept. Free some space, then the same command continues"
+                f"the disk of {self} {FULL_DISK[error.errno]} ({free}); every committed episode is whole and "
+                "kept. Free some space, then the same command continues"
             ) from error
 
     def exists(self, key: str) -> bool:
@@ -103,12 +104,11 @@ class Folder(Location):
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """One file after another."""
-        there = {}
+        found = {}
         for path in sorted((self._path / folder).glob(f"*{suffix}")):
-            if path.is_file():
-                with suppress(FileNotFoundError):  # another process has removed it since
-                    there[path.name] = path.read_bytes()
-        return there
+            with suppress(FileNotFoundError):  # no plain file, or removed since: seals and failures come and go
+                found[path.name] = self.read(f"{folder}/{path.name}")
+        return found
 
     def keys(self, folder: str) -> list[str]:
         """Every file."""

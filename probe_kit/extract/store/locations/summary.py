@@ -45,10 +45,6 @@ class Summarised(Protocol):
         """Episodes of the plan."""
 
     @property
-    def protected(self) -> bool:
-        """Whether every changed byte is found."""
-
-    @property
     def episodes(self) -> "pd.DataFrame":
         """Committed episodes."""
 
@@ -57,15 +53,11 @@ class Summarised(Protocol):
         """Captured streams."""
 
 
-NOT_PROTECTED = "not protected: made by a former version, without hashes that find every change"
-
-
 def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
     random += ", LISTENED TO (it did not act)" if LISTENED in _outcomes(run) else ""
-    old = "" if run.protected else ", not protected"
-    return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}{old}, at {run.location}>"
+    return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
 
 
 def run_html(run: Summarised) -> str:
@@ -78,7 +70,6 @@ def run_html(run: Summarised) -> str:
         "outcomes": ", ".join(f"{name} {count}" for name, count in _outcomes(run).items()),
         "streams": streams_text(run.streams.values()),
         "at": run.location.name if Path(str(run.location)).is_absolute() else str(run.location),
-        **({} if run.protected else {"integrity": NOT_PROTECTED}),
     }
     return facts_html(f"Run of {run.label}", facts, "run.episodes is the table, run.column(site) one site of it")
 

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -89,6 +90,7 @@ def test_a_run_begun_without_room_for_them_is_finished_without(
     """As a run that an earlier version began."""
     shutil.rmtree(copy / "data.zarr/trajectory")
     shutil.rmtree(copy / "commits")
+    shutil.rmtree(copy / "sealed", ignore_errors=True)
     rehash(copy)
     run = Run(locate(copy))
     assert not run.has_trajectories
@@ -98,6 +100,9 @@ def test_a_run_begun_without_room_for_them_is_finished_without(
     planned = make_plan(small_suite, streams, 0, 1, True)
     writer = RunWriter(locate(copy), planned, run.settings)
     frames = recorded_run.trajectory(0).frames
-    writer.write(EpisodeRecord(planned.episodes[0], {"steps": 4}, {}, [], frames, (1, 2)))
+    kinds: tuple[Literal["pooled", "tokens"], ...] = ("pooled", "tokens")
+    arrays = {kind: {name: recorded_run.rows(name, kind)[0] for name in recorded_run.streams} for kind in kinds}
+    outcome = {"outcome": "oob", "side_placed": "none", "steps": 4}
+    writer.write(EpisodeRecord(planned.episodes[0], outcome, arrays, [], frames, (1, 2)))
     assert list(writer.location.keys("data.zarr/trajectory")) == []
     assert Run(locate(copy)).instruction_ids(0) == (1, 2)

@@ -1,12 +1,13 @@
 """What every location of a run keeps, whether a folder or an object store."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
 
-from probe_kit.errors import MissingExtraError, SettingsMismatchError, StoreError, UsageError
+from probe_kit.errors import DiskSpaceError, MissingExtraError, SettingsMismatchError, StoreError, UsageError
 from probe_kit.extract.store.locations.folder import Folder
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -167,3 +168,15 @@ def test_without_obstore_the_error_names_the_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(__import__("sys").modules, "obstore", None)
     with pytest.raises(MissingExtraError, match=r"probe-kit\[remote\]"):
         locate("s3://bucket/run")
+
+
+def test_a_process_that_may_write_no_larger_file_has_a_full_disk(tmp_path: Path) -> None:
+    """As under `ulimit -f`: the system then says EFBIG."""
+    location, before = locate(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(DiskSpaceError, match=r"takes no file so large"), location.in_words():
+            location.write("frames/a.webp", bytes(5000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert location.keys("") == []

@@ -1,0 +1,319 @@
+"""A record counts in one spelling: other bytes are damage by name, whatever they say or carry as their hash."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import ProbeKitError, RunDamagedError
+from probe_kit.extract import Run, open_run, verify_run
+from probe_kit.extract.store.format.commits import write_failure
+from probe_kit.extract.store.format.hashes import HASH, as_record, read_record
+from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.intervene import stored_interventions
+from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.train import load_results, train_probes
+from probe_kit.train.results.inventory import inventory
+from tests.support.faults import Fault, Stored, applied
+from tests.support.little_run import intervene_on_little_run
+from tests.support.reading import readings
+from tests.support.representations import WAYS, carrying, rewritten
+
+Edit = Callable[[dict[str, Any]], object]
+COMMIT, CERTIFIED = "commits/00000004.json", "certificates/*.json"
+PROBES, INTERVENTION = "probes/*/settings.json", "interventions/*/settings.json"
+
+
+def same(_content: dict[str, Any]) -> None:
+    """Only the spelling is another one."""
+
+
+def settings(**values: Any) -> Edit:
+    return lambda content: content["settings"].update(values)
+
+
+def part(name: str, value: Any) -> Edit:
+    return lambda content: content.update({name: value})
+
+
+def without(name: str) -> Edit:
+    return lambda content: content.pop(name)
+
+
+CHANGES: list[tuple[str, str, Edit]] = [
+    ("run.json", "the same", same),
+    ("run.json", "views exchanged", lambda card: card["streams"][0]["views"].reverse()),
+    ("run.json", "fewer iterations", lambda card: card["streams"][1].update(iterations=1)),
+    ("run.json", "fewer layers", lambda card: card["streams"][0].update(layers=1)),
+    ("run.json", "another part", lambda card: card["streams"][0].update(part="action")),
+    ("run.json", "trained weights", settings(random_weights=False)),
+    ("run.json", "another model", settings(model="pi0")),
+    ("run.json", "more calls", settings(captured_calls=2)),
+    ("run.json", "another suite", lambda card: card["settings"]["suite"].update(identity="other@1#0")),
+    ("run.json", "an older schema", part("schema_version", 2)),
+    ("run.json", "no hash of the plan", lambda card: card["objects"].pop("plan.json")),
+    ("run.json", "no hashes", lambda card: card["objects"].clear()),
+    ("run.json", "another hash of the settings", part("settings_sha256", "0" * 64)),
+    (COMMIT, "the same", same),
+    (COMMIT, "another outcome", lambda commit: commit["outcome"].update(outcome="correct", cube_x=9.0)),
+    (COMMIT, "another place", lambda commit: commit["outcome"].update(side_placed="left", cube_y=0.5)),
+    (COMMIT, "another episode", part("episode", 5)),
+    (COMMIT, "another run", part("run", "0" * 64)),
+    (COMMIT, "other roles", lambda commit: commit["roles"][0]["backbone"].append(["state", 0, 9])),
+    (COMMIT, "no roles", part("roles", [])),
+    (COMMIT, "no objects", part("objects", {})),
+    (COMMIT, "an object less", lambda commit: commit["objects"].popitem()),
+    (COMMIT, "another's object", lambda commit: commit["objects"].update({"x/c/0": [1, "0" * 64]})),
+    (COMMIT, "an object without length", lambda commit: next(iter(commit["objects"].values())).pop(0)),
+    (COMMIT, "a picture elsewhere", part("pictures", {"run.json": [1, "0" * 64]})),
+    (COMMIT, "a picture outside", part("pictures", {"frames/../run.json": [1, "0" * 64]})),
+    (COMMIT, "other instruction ids", part("instruction_ids", [7])),
+    ("sealed/*.json", "the same", same),
+    ("sealed/*.json", "another stamp", part("stamp", "0" * 64)),
+    ("sealed/*.json", "another run", part("run", "0" * 64)),
+    ("sealed/*.json", "other episodes", part("episodes", [0, 99])),
+    ("sealed/*.json", "no objects", part("objects", {})),
+    ("certificate.json", "the same", same),
+    ("certificate.json", "no check", without("capture_check")),
+    ("certificate.json", "another device", part("device", "cuda")),
+    (CERTIFIED, "the same", same),
+    (CERTIFIED, "another check", lambda record: record["capture_check"].update(x="y")),
+    ("provenance/*.json", "the same", same),
+    ("provenance/*.json", "another device", part("device", "cuda")),
+    ("provenance/*.json", "other versions", lambda provenance: provenance["versions"].update(torch="0")),
+    ("failed/*.json", "the same", same),
+    ("failed/*.json", "another episode", part("episode_id", "another")),
+    (PROBES, "the same", same),
+    (PROBES, "more relabellings", settings(permutations=2000)),
+    (PROBES, "another format", settings(format=1)),
+    (PROBES, "no files", without("files")),
+    (PROBES, "another's file", lambda head: head["files"].update({"scores.csv": ["../x", 1, "0" * 64]})),
+    ("probes/*/times.json", "the same", same),
+    ("probes/*/times.json", "another run", part("run", "0" * 64)),
+    (INTERVENTION, "the same", same),
+    (INTERVENTION, "of other episodes", settings(stamp="0" * 64)),
+    (INTERVENTION, "no files", without("files")),
+    ("interventions/*/times.json", "another's", part("key", "0" * 12)),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy with every kind of record, a failure among them; a test puts back what it changes."""
+    place = Path(shutil.copytree(little_runs / "run", tmp_path_factory.mktemp("spelt") / "run"))
+    write_failure(open_run(place).root, 3, "the gripper broke")
+    assert verify_run(place, deep=True).ok
+    return place
+
+
+def the_record(run: Path, pattern: str) -> Path:
+    return min(run.glob(pattern))
+
+
+def assert_named(run: Path, path: Path, content: bytes, what: str) -> None:
+    """By verification; and by reading, of which opening is the first part."""
+    if content == path.read_bytes():
+        return  # a record without numbers has no other spelling of them
+    with applied({path: content}):
+        problems = verify_run(run).problems
+    name = path.parent.name if path.parent != run else path.name
+    assert any(name in problem for problem in problems), f"{what}: {problems or 'unseen'}"
+
+
+def changed(run: Path, pattern: str, edit: Edit) -> tuple[Path, dict[str, Any], str]:
+    path = the_record(run, pattern)
+    content = json.loads(path.read_bytes())
+    kept = content[HASH]
+    edit(content)
+    return path, content, kept
+
+
+def test_there_are_changes_of_every_kind_of_record() -> None:
+    assert len(CHANGES) > 50
+    assert len({pattern for pattern, _, _ in CHANGES}) == 11
+    assert len(WAYS) > 12
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_other_bytes_for_the_same_content_are_no_record(way: str) -> None:
+    content = {"a": [1, 10, {"z": "a"}], "b": 100, "run": "x"}
+    kept = json.loads(as_record(content))[HASH]
+    for hashed, raw in carrying(content, kept, WAYS[way]):
+        if "for 10" in way and hashed == "the hash of the bytes":
+            continue  # whole in itself, with another number; what belongs to it then says that it is another one
+        with pytest.raises(RunDamagedError, match="it was changed after it was written"):
+            read_record(raw, "it", "do")
+
+
+_TURN = count()
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: " ".join(change[:2]))
+def test_a_changed_record_in_another_spelling_is_named(run: Path, change: tuple[str, str, Edit]) -> None:
+    """Every change in some spellings, each with some hash; all of them are a slow test."""
+    path, content, kept = changed(run, *change[::2])
+    draw = Random(next(_TURN))
+    for way in draw.sample(sorted(WAYS), 3):
+        hashed, raw = draw.choice(list(carrying(content, kept, WAYS[way])))
+        assert_named(run, path, raw, f"{way} with {hashed}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: " ".join(change[:2]))
+def test_every_change_in_every_spelling_with_every_hash_is_named(
+    run: Path, change: tuple[str, str, Edit], way: str
+) -> None:
+    path, content, kept = changed(run, *change[::2])
+    for hashed, raw in carrying(content, kept, WAYS[way]):
+        assert_named(run, path, raw, f"{way} with {hashed}")
+
+
+@pytest.mark.parametrize(
+    "change", [one for one in CHANGES if one[1] != "the same"], ids=lambda change: " ".join(change[:2])
+)
+def test_a_changed_record_with_its_own_hash_computed_anew_is_named(
+    run: Path, change: tuple[str, str, Edit]
+) -> None:
+    """What other records say of it, or what it can say at all, contradicts it."""
+    path, content, _ = changed(run, *change[::2])
+    with applied({path: rewritten(content)}):
+        problems = verify_run(run).problems
+        try:
+            readings(run)
+        except ProbeKitError as error:
+            problems += (str(error),)
+    assert problems
+
+
+@pytest.mark.parametrize("pattern", ["run.json", COMMIT, "sealed/*.json", "certificate.json", CERTIFIED,
+                                     "provenance/*.json", "failed/*.json"])  # fmt: skip
+@pytest.mark.parametrize("way", ["leading space", "indented by json.dump", "two hashes"])
+def test_a_run_with_a_record_in_other_bytes_does_not_open(run: Path, pattern: str, way: str) -> None:
+    path, content, kept = changed(run, pattern, same)
+    for _, raw in carrying(content, kept, WAYS[way]):
+        with applied({path: raw}), pytest.raises(RunDamagedError, match=path.name):
+            open_run(run, allow_partial=True)
+
+
+# -- records that say something else than they can -------------------------------------------------------
+
+RECORDS = sorted({pattern for pattern, _, _ in CHANGES})
+WRONG = (None, [], {}, "x", -1, 1.5, True, [[]], {"x": {}})
+
+
+def places(content: Any, depth: int = 4) -> Iterator[tuple[Any, Any]]:
+    """What can be changed: every holder with every name in it, but of long lists only the first two."""
+    pairs = list(content.items() if isinstance(content, dict) else enumerate(content[:2]))
+    for name, value in pairs:
+        if name != HASH:
+            yield content, name
+            if depth and isinstance(value, dict | list):
+                yield from places(value, depth - 1)
+
+
+def malformed(raw: bytes, wrong: tuple[Any, ...]) -> Iterator[tuple[str, bytes]]:
+    """The record with one part taken out, or in the place of it something of another kind, and a right hash."""
+    for at in range(len(list(places(json.loads(raw))))):
+        for value in (*wrong, ...):
+            content = json.loads(raw)
+            holder, name = list(places(content))[at]
+            if value is ...:
+                del holder[name]
+            else:
+                holder[name] = value
+            yield f"{name} {'taken out' if value is ... else f'is {value!r}'}", rewritten(content)
+
+
+def look_at_everything(run: Path) -> None:
+    """All records, and whatever is told of them; not the arrays."""
+    opened = open_run(run, allow_partial=True)
+    opened.certificate, repr(opened), opened._repr_html_()
+    inventory(opened)
+    listed_interventions(opened)
+    for one in stored_interventions(opened):
+        one.certificate()
+    load_results(opened)
+    read_thumbnail(opened.location, 4)
+
+
+def assert_no_traceback(run: Path, path: Path, cases: list[tuple[str, bytes]]) -> None:
+    wrong = []
+    for words, raw in cases:
+        with applied({path: raw}):
+            try:
+                verify_run(run)
+                look_at_everything(run)
+            except ProbeKitError:
+                continue
+            except Exception as error:  # noqa: BLE001 - whatever is no error of ours is a traceback for a user
+                wrong.append(f"{words}: {type(error).__name__}: {error}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("pattern", RECORDS)
+def test_a_malformed_record_with_a_right_hash_is_damage_and_no_traceback(run: Path, pattern: str) -> None:
+    path = the_record(run, pattern)
+    cases = list(malformed(path.read_bytes(), WRONG))
+    assert_no_traceback(run, path, Random(pattern).sample(cases, 6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pattern", RECORDS)
+def test_no_malformed_record_with_a_right_hash_ends_in_a_traceback(run: Path, pattern: str) -> None:
+    path = the_record(run, pattern)
+    assert_no_traceback(run, path, list(malformed(path.read_bytes(), WRONG)))
+
+
+# -- random changes of a real run ------------------------------------------------------------------------
+
+
+def changed_bytes(stored: Stored, draw: Random) -> Fault | None:
+    """One byte replaced, put in or taken out, anywhere in a file of any kind."""
+    path = stored.draw(draw)
+    content = path.read_bytes()
+    place, byte = draw.randrange(len(content)), bytes([draw.randrange(256)])
+    how = draw.choice(("replaced", "put in", "taken out"))
+    rest = content[place + (how != "put in") :]
+    after = content[:place] + (byte if how != "taken out" else b"") + rest
+    return None if after == content else Fault(f"byte {place} of {path} {how}", {path: after})
+
+
+@pytest.fixture(scope="module")
+def real(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    """A copy of a run of pi0-tiny with all tokens, with probes and an intervention."""
+    place = Path(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("real") / "run"))
+    train_probes(open_run(place), ["color"], permutations=1)
+    intervene_on_little_run(open_run(place))
+    return Stored.of(place, place)
+
+
+def assert_none_is_silent(stored: Stored, seeds: range) -> None:
+    """Each is found by `run verify --deep`, or nothing that can be read is another number."""
+    wrong = []
+    for seed in seeds:
+        if fault := changed_bytes(stored, Random(seed)):
+            with applied(fault.change):
+                try:
+                    if verify_run(stored.run, deep=True).ok and readings(stored.run) != stored.told:
+                        wrong.append(f"seed {seed}: {fault.words}: SILENT")
+                except ProbeKitError:
+                    continue
+                except Exception as error:  # noqa: BLE001 - whatever is no error of ours is a traceback for a user
+                    wrong.append(f"seed {seed}: {fault.words}: {type(error).__name__}: {error}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_changed_byte_of_a_real_run_is_silent(real: Stored) -> None:
+    assert_none_is_silent(real, range(100))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", range(100, 2100, 100))
+def test_two_thousand_changed_bytes_of_a_real_run_are_not_silent(real: Stored, start: int) -> None:
+    assert_none_is_silent(real, range(start, start + 100))
