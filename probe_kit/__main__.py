@@ -1,5 +1,15 @@
-"""`python -m probe_kit` is `probe-kit`."""
+"""The `probe-kit` command, also as `python -m probe_kit`."""
 
-from probe_kit.start import main
+from probe_kit._terminal.interruption import leave_at_once
 
-main()
+
+def main() -> None:
+    """Entry point of the console script; a SIGTERM counts as Ctrl-C."""
+    leave_at_once()
+    from probe_kit.cli import main as run_command
+
+    run_command()
+
+
+if __name__ == "__main__":
+    main()

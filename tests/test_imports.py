@@ -11,7 +11,7 @@ from tests.support.import_graph import children, circles, import_graph, levels, 
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
-TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command", "start"}
+TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command"}
 BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system"}
 FOLDERS = {
     **dict.fromkeys(BASE, BASE),

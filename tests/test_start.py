@@ -61,7 +61,7 @@ def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_
 
 def test_what_a_shell_runs_in_the_background_still_ignores_ctrl_c() -> None:
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.argv[1:] = ['--version'];"
-    code += "from probe_kit.start import main; import os; os.kill(os.getpid(), signal.SIGINT); main()"
+    code += "from probe_kit.__main__ import main; import os; os.kill(os.getpid(), signal.SIGINT); main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 0
     assert done.stdout.startswith("probe-kit ")

@@ -79,8 +79,8 @@ def test_a_folder_that_is_being_filled_is_no_bundle_and_one_that_lost_its_head_i
 @pytest.mark.parametrize(
     ("raw", "why"),
     [
-        (b'{"a": 1, "a": 2}', "names 'a' twice"),
-        (b'{"a": {"b": 1, "c": 2, "b": 1}}', "names 'b' twice"),
+        (b'{"a": 1, "a": 2}', "names the key 'a' twice"),
+        (b'{"a": {"b": 1, "c": 2, "b": 1}}', "names the key 'b' twice"),
         (b'\xef\xbb\xbf{"a": 1}', "byte order mark"),
         (b'{"a": NaN}', "no finite number"),
         (b'{"a": -Infinity}', "no finite number"),
