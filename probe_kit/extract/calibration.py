@@ -137,7 +137,7 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
     from torch.cuda import OutOfMemoryError
 
     try:
-        controller.rehearse([example] * batch, list(range(batch)))
+        controller.run_preflight([example] * batch, list(range(batch)))
     except OutOfMemoryError as error:
         raise MemoryError(str(error)) from error
 
@@ -147,7 +147,7 @@ def _turn(settings: RunSettings, controller: PolicyController, plan: Plan) -> fl
     stage = Stage(settings.scene, None)
     try:
         setting_up = _seconds(lambda: stage.begin(plan.episodes[0], False))
-        if controller.listens:
+        if controller.capture_only:
             return setting_up
         steps = min(controller.execute, max(1, settings.scene.max_steps // (TURNS + 1)))
         actions = np.zeros((steps, 7), np.float32)

@@ -110,7 +110,7 @@ class GatedMLP(nn.Module):
 
 
 class Gate(nn.Module):
-    """Scales what is added to the stream; a module, so that what is added can be listened to."""
+    """Scales what is added to the stream; a module, so that what is added can be captured."""
 
     def forward(self, gate: Tensor, added: Tensor) -> Tensor:
         """(B, T, D) of gate (B, 1, D) and (B, T, D)."""

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.train.data.run_reader import RunReader
 
 _MARKS: Sequence[Callable[[RunReader, int], str]] = (
@@ -15,8 +15,8 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
 
 
 def full_name(label: str, random_weights: bool, heard: bool = False, group: str | None = None) -> str:
-    """A label, marked if nobody trained the model or it was only listened to, with its group if there is one."""
-    name = label + (" (random weights)" if random_weights else "") + (" (listened to)" if heard else "")
+    """A label, marked if nobody trained the model or it only captured activations, with its group if there is one."""
+    name = label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
     return name if group is None else f"{group}: {name}"
 
 
@@ -38,7 +38,7 @@ def distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
 def full_names(runs: Sequence[RunReader], labels: Mapping[str, str] | None = None) -> list[str]:
     """The full names of runs, in order; labels: by location, distinct ones by default."""
     called = distinct_labels(runs) if labels is None else labels
-    return [full_name(called[str(run.location)], run.random_weights, listened(run.episodes)) for run in runs]
+    return [full_name(called[str(run.location)], run.random_weights, capture_only(run.episodes)) for run in runs]
 
 
 def _doubles(runs: Sequence[RunReader], labels: Mapping[str, str]) -> set[str]:

@@ -13,8 +13,8 @@ class Source:
     """Whose numbers a row holds.
 
     label: what the run is called in tables and legends. action_stream: `expert`, or `action` in a policy without
-    one, whose iterations are action tokens. call: the captured inference that was probed, from 0. listened: the
-    model was only heard and did not act.
+    one, whose iterations are action tokens. call: the captured inference that was probed, from 0.
+    capture_only: activations were captured without acting.
     """
 
     run: str
@@ -27,12 +27,12 @@ class Source:
     label: str = ""
     action_stream: str | None = None
     call: int | None = None
-    listened: bool = False
+    capture_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """What the policy did; `sr` is None where it was listened to and did not act.
+    """What the policy did; `sr` is None where it captured activations only and did not act.
 
     delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
     which decides `regime`. sr_by_epsilon: SR by zone radius in metres. sr and all that follows from it is None

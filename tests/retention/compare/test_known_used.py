@@ -165,7 +165,7 @@ def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRu
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
     found = join(reader, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
-    assert [row.signal for row in found.rows] == [True, False, None]
+    assert [row.has_signal for row in found.rows] == [True, False, None]
     assert any(note.startswith("In shape probes beat neither") for note in found.notes)
 
 
