@@ -15,7 +15,7 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
 
 
 def full_name(label: str, random_weights: bool, heard: bool = False, group: str | None = None) -> str:
-    """A label, marked if nobody trained the model or it only captured activations, with its group if there is one."""
+    """A label, marked if nobody trained the model or it only captured, with its group if there is one."""
     name = label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
     return name if group is None else f"{group}: {name}"
 

@@ -104,7 +104,7 @@ def normalised_score(success_rates: Sequence[float]) -> float:
 
 
 def capture_only(episodes: "pd.DataFrame") -> bool:
-    """Whether the model of these episodes only captured activations: it did not act, and there is no success rate."""
+    """Whether the model of these episodes only captured: it did not act, and there is no success rate."""
     return not episodes.empty and bool((episodes["outcome"] == CAPTURE_ONLY).all())
 
 

@@ -26,7 +26,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def model_name(row: RetentionRow) -> str:
-    """The model, marked if its weights are random or it only captured activations, and its group if there is one."""
+    """The model, marked if its weights are random or it only captured, and its group if there is one."""
     return full_name(row.label or row.model, row.random_weights, row.capture_only, row.group)
 
 

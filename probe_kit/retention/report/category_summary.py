@@ -122,7 +122,7 @@ class Story:
 def stories(rows: Sequence[RetentionRow]) -> list[Story]:
     """One per probed policy of a retention table, by the first view of each, beside the first asked run.
 
-    Runs that only captured activations, or not probed, have none; so have policies on another suite than the reader's
+    Runs that only captured, or not probed, have none; so have policies on another suite than the reader's
     no reader.
     """
     asked = [row for row in rows if row.category != MEAN and _asks_for_the_answer(row)]
