@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.extract.store.run import Run, open_run
     from probe_kit.extract.store.sealing import seal
+    from probe_kit.extract.vqa.templates import TEMPLATES
 
 __all__ = [
+    "TEMPLATES",
     "AskSettings",
     "Audit",
     "ExtractSettings",
@@ -35,6 +37,7 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "TEMPLATES": "vqa.templates",
         "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",

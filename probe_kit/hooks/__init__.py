@@ -15,8 +15,9 @@ from probe_kit.hooks.registry import known_families, load_model, load_policy
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.activation_cache import ActivationCache
     from probe_kit.hooks.capturing.apply_edits import applied
-    from probe_kit.hooks.capturing.attention import AttentionMass
+    from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
     from probe_kit.hooks.capturing.capture_context import capture, edit
+    from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
     from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading, Rows, Tap
     from probe_kit.hooks.contract.roles import Roles, pool
 
@@ -41,17 +42,23 @@ __all__ = [
     "Tap",
     "applied",
     "capture",
+    "capture_attention",
     "edit",
     "known_families",
     "load_model",
     "load_policy",
+    "load_weights",
     "pool",
+    "read_weights",
 ]
 
 # These import torch, which takes seconds; reading a run needs only sites.
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "read_weights": "checkpoints.weights",
+        "load_weights": "checkpoints.weights",
+        "capture_attention": "capturing.attention",
         "AttentionMass": "capturing.attention",
         "Model": "contract.model",
         "Policy": "contract.model",
