@@ -142,7 +142,7 @@ def _stop_with(*asked: Any) -> Any:
     """In place of loading a model: what can be wrong with the settings before."""
     from probe_kit.extract.prepared import as_protocol
     from probe_kit.extract.rollout.controllers import SCRIPTED
-    from probe_kit.extract.rollout.settings_checks import refuse_meaningless
+    from probe_kit.extract.rollout.settings_checks import check_meaningless
     from probe_kit.hooks.contract.options import check_options
     from probe_kit.hooks.registry import find_family
 
@@ -151,7 +151,7 @@ def _stop_with(*asked: Any) -> Any:
             family = find_family(settings.model, tuple(SCRIPTED))
             check_options(family.name, family.options, settings.options)
             assert family.acts != hasattr(settings, "prompt")
-        refuse_meaningless(settings)
+        check_meaningless(settings)
     raise UsageError("accepted so far")
 
 

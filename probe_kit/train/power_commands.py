@@ -81,7 +81,7 @@ def _answer(one: "Needed") -> str:
 
 
 def _print(found: "list[Power]") -> None:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
     from probe_kit.statistics.significance import detectable
 
     headings = (
@@ -101,7 +101,7 @@ def _print(found: "list[Power]") -> None:
         for one in found
     ]
     out.print(
-        FittingTable(
+        ResponsiveTable(
             title="Power: how often a signal is seen",
             caption="binding and twin at chance; ±: of the three, the largest, measured over seeds; a leaking "
             "control of that accuracy is red in 80 % of suites",

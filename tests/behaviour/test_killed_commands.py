@@ -132,7 +132,7 @@ def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
             return _of_ask(request.getfixturevalue("six"))
         case "extract":
             suite: Suite = request.getfixturevalue("six")
-            given = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--listen", "--tokens", "all")
+            given = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--no-act", "--tokens", "all")
             return _of_extract(name, "extract", *given, "--workers", "2")
         case "run seal":
             return _of_run(name, partial(_unsealed, request.getfixturevalue("little_runs") / "run"), "run", "seal")

@@ -16,7 +16,7 @@ from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
@@ -67,10 +67,10 @@ class ActingController(Controller, Protocol):
     """Acts.
 
     flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
-    listens: whether what `act` gives is only to be heard, and episodes end with it.
+    capture_only: whether what `act` gives is only to be heard, and episodes end with it.
     """
 
-    listens: bool
+    capture_only: bool
     flagged: NDArray[np.bool_] | None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -88,7 +88,7 @@ class ScriptedController:
         self.streams: list[StoredStream] = []
         self.script: str | None = name
         self.threads: int | None = None
-        self.on_gpu = self.listens = False
+        self.on_gpu = self.capture_only = False
         self.flagged: NDArray[np.bool_] | None = None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -106,7 +106,7 @@ class ScriptedController:
 class PolicyController:
     """Infers, executes the head of the chunk, and captures the first inferences of every episode.
 
-    One that listens infers and captures once per episode; nothing is executed.
+    One that capture_only infers and captures once per episode; nothing is executed.
     """
 
     def __init__(
@@ -119,19 +119,19 @@ class PolicyController:
         with_tokens: bool,
         edits: Sequence[Edit] = (),
         vectors: Vectors | None = None,
-        listens: bool = False,
+        capture_only: bool = False,
         limit: float | None = None,
     ) -> None:
         """examples: an observation per instruction of the suite, as the scene will show them.
 
         limit: seconds that a call of the policy may take, after which this process ends.
         """
-        self.policy, self.listens, self._limit = policy, listens, limit
-        self._infer = policy.listen if listens else policy.act
+        self.policy, self.capture_only, self._limit = policy, capture_only, limit
+        self._infer = policy.infer_without_acting if capture_only else policy.act
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
-        with acting(name, policy.card.checkpoint):
+        with while_acting(name, policy.card.checkpoint):
             self.streams = stored_streams(policy, policy.roles(examples))
         self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
         card = policy.card
@@ -148,7 +148,7 @@ class PolicyController:
         }
         if card.settings:
             self.identity["policy"] = dict(card.settings)
-        if listens and (deaf := policy.deaf_to()):
+        if capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._ledger: list[dict[str, Any]] = []
@@ -163,7 +163,7 @@ class PolicyController:
             return self._act(turns)
 
     def _acting(self) -> AbstractContextManager[None]:
-        return acting(self.identity["model"], self.policy.card.checkpoint, self._limit)
+        return while_acting(self.identity["model"], self.policy.card.checkpoint, self._limit)
 
     def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         observations = copied([turn.seen for turn in turns])
@@ -186,11 +186,11 @@ class PolicyController:
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
         """What the policy gives for observations that it may write to, and cannot change later."""
         chunks = self._infer(copied([turn.seen for turn in turns]), list(seeds))
-        if not self.listens:
+        if not self.capture_only:
             _check_chunks(chunks, len(turns))
         return np.array(chunks)
 
-    def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
+    def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
         with self._acting():
             self._infer(copied(observations), list(seeds))
@@ -205,7 +205,7 @@ class PolicyController:
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
         exponent = self.policy.card.ensemble
-        if exponent is None or self.listens:
+        if exponent is None or self.capture_only:
             return chunk[: self.execute]
         turn.past.append(chunk)
         return ensemble(turn.past, exponent)[None]

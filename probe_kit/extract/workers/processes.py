@@ -18,7 +18,7 @@ MORE = "more"
 
 
 def run_in_processes(
-    settings: RunSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]
+    settings: RunSettings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]
 ) -> None:
     """Play the episodes in `settings.workers` processes; one that dies is replaced.
 
@@ -32,7 +32,7 @@ def run_in_processes(
             ready = wait([hand.connection for hand in crew])
             for hand in crew:
                 if hand.connection in ready:
-                    _hear(hand, scheduler, heard)
+                    _receive(hand, scheduler, on_event)
     finally:
         for hand in crew:
             hand.connection.close()  # all of them, so that they end side by side
@@ -74,22 +74,22 @@ class _Hand:
         return self._child.close()
 
 
-def _hear(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def _receive(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     try:
         message = hand.connection.recv()
     except (EOFError, ConnectionResetError):
-        _replace(hand, scheduler, heard)
+        _replace(hand, scheduler, on_event)
         return
     if isinstance(message, ProbeKitError):
         raise message
     if message == MORE:
         hand.waiting = hand.began = True
     else:
-        scheduler.hear(hand.slot, message)
-        heard(message)
+        scheduler.record(hand.slot, message)
+        on_event(message)
 
 
-def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def _replace(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     code = hand.close()
     if not hand.began:
         raise WorkerDiedError(
@@ -99,7 +99,7 @@ def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) 
     why = _why(code, hand.limit)
     tell_lost(f"worker {hand.slot} {why}", len(scheduler.holds(hand.slot)))
     for event in scheduler.lose(hand.slot, f"the worker playing it {why}"):
-        heard(event)
+        on_event(event)
     hand.start()
 
 

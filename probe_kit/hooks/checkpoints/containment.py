@@ -20,7 +20,7 @@ from typing import Any, TextIO
 import numpy as np
 from rich.file_proxy import FileProxy
 
-from probe_kit._terminal.plain_text import visible
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.hooks.contract.observation import Observation
 
 _ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -124,7 +124,7 @@ class _Quoted(TextIOBase):
         self._stream = stream
 
     def write(self, text: str) -> int:
-        self._stream.write(visible(text))
+        self._stream.write(terminal_safe(text))
         return len(text)
 
     def flush(self) -> None:

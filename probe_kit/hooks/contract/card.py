@@ -9,7 +9,7 @@ from typing import Any
 class SourceWeights:
     """What identifies the weights that a policy's network grew from; None for what is not known.
 
-    checkpoint: their hub id. sha256: as `Card.weights_sha256`. parameters: how many numbers they are in memory.
+    checkpoint: their hub id. sha256: as `ModelCard.weights_sha256`. parameters: how many numbers they are in memory.
     """
 
     checkpoint: str | None = None
@@ -18,7 +18,7 @@ class SourceWeights:
 
 
 @dataclass(frozen=True)
-class Card:
+class ModelCard:
     """What was really loaded.
 
     settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and

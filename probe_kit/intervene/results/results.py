@@ -39,7 +39,7 @@ from probe_kit.train.results.store import load_results
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit._terminal.responsive_table import FittingTable
+    from probe_kit._terminal.responsive_table import ResponsiveTable
 
 
 FOLLOW, WORDS = "follow", "words"
@@ -238,7 +238,7 @@ class Effects:
         """
         return csv_of_frame(self.table)
 
-    def to_rich(self) -> "FittingTable":
+    def to_rich(self) -> "ResponsiveTable":
         """The table for a console."""
         of = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
         from probe_kit.intervene.kinds.site_table import following_table, passing_table, words_table

@@ -36,7 +36,7 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
     In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines. Raises SuiteError
     if the file is there and a person has reviewed any row of it.
     """
-    _refuse_reviewed(path)
+    _check_reviewed(path)
     previews = path.with_name(f"{path.stem}-previews")
     previews.mkdir(parents=True, exist_ok=True)
     rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
@@ -51,7 +51,7 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
     return page
 
 
-def _refuse_reviewed(path: Path) -> None:
+def _check_reviewed(path: Path) -> None:
     try:
         reviewed = sum(row["status"] != STATUSES[0] for row in read_curation(path))
     except SuiteError:  # no such file, or no curation

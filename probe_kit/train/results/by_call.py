@@ -7,7 +7,7 @@ from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_current, is_ours, load_results, read_probes, settings_of
 
 
-def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
+def load_results_by_call(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
     """By captured inference, in order: the stored probes of `run` that differ from `like` in nothing else.
 
     Episodes that ended before an inference have no part in its probes. `like` itself is among them.

@@ -16,7 +16,7 @@ Array = Any
 """A numpy array, or a torch tensor on any device."""
 
 
-def namespace(array: Array) -> Any:
+def array_namespace(array: Array) -> Any:
     """The module that made `array`: numpy or torch."""
     return import_module(type(array).__module__.partition(".")[0])
 

@@ -25,7 +25,7 @@ from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.containment import contained
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
 
@@ -156,10 +156,10 @@ def everything() -> dict[str, Any]:
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_all_is_as_it_was_after_a_call(spoil: Any) -> None:
     before = everything()
-    with acting("mine", "here"):
+    with while_acting("mine", "here"):
         spoil(None, None)
     assert everything() == before
-    with suppress(PolicyFailedError), acting("mine", "here"):
+    with suppress(PolicyFailedError), while_acting("mine", "here"):
         raise spoil(None, ValueError("and then this"))
     assert everything() == before
 
@@ -242,13 +242,13 @@ def test_what_a_policy_prints_is_text_on_stderr(
 
 
 def press_ctrl_c() -> None:
-    with acting("mine", "here"):
+    with while_acting("mine", "here"):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
 
 
 def press_nothing() -> None:
-    with acting("mine", "here"):
+    with while_acting("mine", "here"):
         raise KeyboardInterrupt
 
 

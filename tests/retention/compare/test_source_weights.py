@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file
 
-from probe_kit.hooks import Card, known_families, load_model
+from probe_kit.hooks import ModelCard, known_families, load_model
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.retention import retention
@@ -24,21 +24,21 @@ GROWN = {name: family for name, family in known_families().items() if family.sou
 RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 
-def reader(path: Path, card: Card, called: str = "") -> SaidRun:
+def reader(path: Path, card: ModelCard, called: str = "") -> SaidRun:
     return replace(asked(path, RIGHT, card.family, called), certificate={"policy": card.to_json()})
 
 
-def policy(path: Path, card: Card) -> SaidRun:
+def policy(path: Path, card: ModelCard) -> SaidRun:
     return replace(acted(path, RIGHT, card.family), certificate={"policy": card.to_json()})
 
 
-def card(family: str, checkpoint: str, parameters: int, random: bool = False) -> Card:
+def card(family: str, checkpoint: str, parameters: int, random: bool = False) -> ModelCard:
     """As a loader fills it; `Family.load` adds what is known of the source."""
-    plain = Card(family, checkpoint, "0" * 64, random, parameters, "float32", "cpu", "", (), 0, 0)
+    plain = ModelCard(family, checkpoint, "0" * 64, random, parameters, "float32", "cpu", "", (), 0, 0)
     return replace(plain, **find_family(family)._source_of(plain, checkpoint))
 
 
-def xiaomi(checkpoint: str | None = None, random: bool = False) -> Card:
+def xiaomi(checkpoint: str | None = None, random: bool = False) -> ModelCard:
     return card("xiaomi-r0", checkpoint or str(GROWN["xiaomi-r0"].default_checkpoint), 1, random)
 
 
@@ -137,7 +137,7 @@ def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_
         (replace(QWEN_4B, checkpoint="my/copy"), "unknown whether the policy grew from these weights"),
     ],
 )
-def test_every_format_says_whether_the_reader_is_the_source(tmp_path: Path, card: Card, words: str) -> None:
+def test_every_format_says_whether_the_reader_is_the_source(tmp_path: Path, card: ModelCard, words: str) -> None:
     runs = [reader(tmp_path / "r", card), policy(tmp_path / "p", xiaomi())]
     table = retention(runs, gap=True)
     console = Console(width=300, record=True, file=StringIO())

@@ -23,7 +23,7 @@ from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.build import default_folder
 from probe_kit.suite.ladder import Wording
 from probe_kit.train import ArrayRun, train_probes
-from probe_kit.train.data.captured_call import at_call
+from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.run_suite import suite_of
 from tests.support.little_run import STREAMS, certify, episode, little_settings
 
@@ -119,7 +119,7 @@ def test_a_run_is_told_by_all_that_it_was_to_have_whatever_is_left_of_it(tmp_pat
     suite = build_suite(tmp_path / "suite", ["state", "color"], 4)
     part = suite.select(["state", "color"], 2)
     unfinished = run_on(part, tmp_path / "unfinished", episodes=1)
-    later = at_call(run_on(part, tmp_path / "later", episodes=3, calls=2), 1)
+    later = restrict_to_call(run_on(part, tmp_path / "later", episodes=3, calls=2), 1)
     worded = run_on(part, tmp_path / "worded", wordings=("knowledge", "named")).in_wording("named")
     assert len(later.episodes) == 0
     assert worded.episodes["item_id"].nunique() < len(part.items)

@@ -137,11 +137,11 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str,
         if lost := {METADATA, *(f"{stream}/pooled/{METADATA}" for stream in root.streams)} - {*seal["objects"]}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
         if "episodes" in seal:  # seals of before this was noted say less
-            _refuse_lost(root, commits, seal, name, advice)
+            _check_lost(root, commits, seal, name, advice)
         yield seal
 
 
-def _refuse_lost(
+def _check_lost(
     root: Root, commits: Mapping[int, Commit], seal: Mapping[str, Any], name: str, advice: str
 ) -> None:
     """Raise RunDamagedError if a seal was made of commits that are gone, or are others by now."""
