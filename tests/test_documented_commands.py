@@ -40,7 +40,7 @@ ANYWHERE = {
 }
 
 OTHER_PROGRAMS = {
-    "git": "fetches this very checkout",
+    "cd": "enters this very checkout",
     "pytest": "is what runs this",
     ".": "activates the environment that this runs in",
     "pip": "installs an extra; which ones there are is checked",
@@ -239,7 +239,7 @@ STAND_INS = {
 """By page, patterns of what is shortened or replaced by the embedded models; all else is typed as it stands."""
 
 NOT_TYPED = {
-    r"git clone": "fetches this very checkout",
+    r"^cd probe_kit": "this is that checkout",
     r"^\. \.venv": "this runs in that environment",
     r"^pip install": "the extras are installed here",
     r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
