@@ -1,22 +1,23 @@
 """`probe-kit doctor`."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from probe_kit._terminal.console import err, marked, out, print_json
+from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
     from probe_kit.doctor import Finding
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Say what works on this machine, and what to do about the rest; exit 1 if the demo could not run."""
+    """Check the installation and suggest fixes; exit with 1 if the demo cannot run."""
     from probe_kit.doctor import examine
 
-    with err.status("looking around"):
+    with err.status("checking the installation"):
         findings = examine()
     if as_json:
         print_json([finding.to_json() for finding in findings])

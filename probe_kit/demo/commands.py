@@ -9,21 +9,21 @@ from probe_kit._terminal.console import counter, out, progress
 
 
 def demo(
-    out_folder: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
+    out_folder: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder for the results.")] = Path(
         "probe-kit-demo"
     ),
     compare: Annotated[
         bool,
         typer.Option(
             "--compare",
-            help="Test the instrument instead: policies of which the truth is known, expected beside measured.",
+            help="Validate the pipeline instead: run policies with known ground truth, print expected and "
+            "measured verdicts.",
         ),
     ] = False,
 ) -> None:
     """Run the whole pipeline on the embedded models: answers, episodes, activations, probes, retention.
 
-    Takes under 4 minutes on 2 cores and downloads nothing. With --compare it does so for every policy of which the
-    truth is known, and takes about six times as long.
+    Takes under 4 minutes on 2 cores and downloads nothing. --compare takes about six times as long.
     """
     from probe_kit.demo.pipeline import compare_organisms, run_demo
 

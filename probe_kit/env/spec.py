@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import SceneError
+from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.items import Side
 
 XY = tuple[float, float]
 XYZ = tuple[float, float, float]
-ArmName = Literal["panda", "widowx"]
-Rendering = Literal["raw", "visual-matching"]
 Euler = Literal["zyx", "xyz"]
 
 EPSILON_MARGIN = 0.01

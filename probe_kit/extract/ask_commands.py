@@ -2,165 +2,62 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from probe_kit._terminal.console import counter, err, marked, out, progress, say, split
-from probe_kit.errors import UsageError
-from probe_kit.extract.commands import print_plan, read_size
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import counter, err, marked, out, progress, say
+from probe_kit.extract import command_options as own
+from probe_kit.extract.commands import print_plan
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
-    from probe_kit.extract.settings import AskSettings
-
-CONTROLS = "Controls"
-MACHINE = "How fast it comes (changes no number)"
 
 
 def ask(
-    model: Annotated[str, typer.Option(help="A model of `probe-kit models` that answers.")],
-    prompt: Annotated[
-        str,
-        typer.Option(
-            help="Comma-separated: seen, p1, p2 (the paper's), or text files with {object}, and {A} and {B} for "
-            "the sides."
-        ),
-    ] = "p1,p2,seen",
-    picture_size: Annotated[
-        str, typer.Option(help="Comma-separated, width first; the paper's are 224x224,560x480.")
-    ] = "224x224",
-    out_folder: Annotated[
-        str | None,
-        typer.Option("--out", help="Folder or URL; runs lie in it as <prompt>-<size>. Default runs/ask-<model>-…"),
-    ] = None,
-    checkpoint: Annotated[str | None, typer.Option(help="Folder or hub id; default the family's.")] = None,
-    model_option: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--model-option",
-            "-M",
-            metavar="KEY=VALUE",
-            help="An option of this model; `probe-kit models NAME` lists them. May be repeated.",
-        ),
-    ] = None,
-    label: Annotated[str | None, typer.Option(help="What tables call these runs; prompt and size follow.")] = None,
-    suite: Annotated[Path | None, typer.Option(help="Suite folder; default the embedded suite.")] = None,
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the suite.")] = None,
-    items: Annotated[int | None, typer.Option(help="Items per category, even; default all.")] = None,
-    scene: Annotated[
-        str | None,
-        typer.Option(help="Scene preset, as of the run to compare with; default the one the model was made for."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of cube places, as of the run to compare with.")] = 0,
-    tokens: Annotated[
-        str,
-        typer.Option(help="none: answers only. pooled: also views of the streams, for probes. all: every token."),
-    ] = "none",
-    picture: Annotated[
-        str,
-        typer.Option(
-            help="frame: the first frame. side-by-side: the two pictures on grey. none: words alone; accuracy is "
-            "then one half, or the suite leaks.",
-            rich_help_panel=CONTROLS,
-        ),
-    ] = "frame",
-    query: Annotated[
-        str,
-        typer.Option(
-            "--query",
-            help="target; distractor: what the other picture shows; absent: what neither shows (with seen; right: "
-            "no).",
-            rich_help_panel=CONTROLS,
-        ),
-    ] = "target",
-    random_weights: Annotated[
-        bool, typer.Option("--random-weights", help="Ask an untrained twin.", rich_help_panel=CONTROLS)
-    ] = False,
-    weights_seed: Annotated[int, typer.Option(help="Seed of --random-weights.", rich_help_panel=CONTROLS)] = 0,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
-    dtype: Annotated[str | None, typer.Option(help="float32 or bfloat16; default the checkpoint's.")] = None,
-    batch: Annotated[
-        int,
-        typer.Option(
-            help="Questions per call; above 1, numbers repeat up to float rounding.", rich_help_panel=MACHINE
-        ),
-    ] = 1,
-    env_workers: Annotated[
-        int | None, typer.Option(help="Processes that draw; default two per question.", rich_help_panel=MACHINE)
-    ] = None,
-    workers: Annotated[
-        int, typer.Option(help="Processes with a model each, one per GPU.", rich_help_panel=MACHINE)
-    ] = 0,
-    ray: Annotated[
-        str | None, typer.Option(help="Work on this Ray cluster; auto: find one.", rich_help_panel=MACHINE)
-    ] = None,
-    inference_limit: Annotated[
-        float | None,
-        typer.Option(
-            help="Seconds after which a worker whose model hangs is ended; needs --workers.",
-            rich_help_panel=MACHINE,
-        ),
-    ] = None,
-    frames: Annotated[
-        str,
-        typer.Option(help="ends: a thumbnail of every first frame. none: no pictures.", rich_help_panel=MACHINE),
-    ] = "ends",
-    allow_mixed: Annotated[
-        bool,
-        typer.Option("--allow-mixed", help="Continue a run begun with other versions or on another device."),
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plans and stop.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Start even if the disk looks too small.")] = False,
+    model: common.ModelName,
+    prompt: own.Prompts = own.P1_P2_SEEN,
+    picture_size: own.PictureSizes = own.SIZE_224,
+    out_folder: own.AskOutFolder = None,
+    checkpoint: common.Checkpoint = None,
+    options: common.ModelOptions = None,
+    suite: common.SuiteFolder = None,
+    categories: common.Categories = None,
+    items: own.EvenItems = None,
+    scene: common.Scene = None,
+    seed: common.Seed = 0,
+    device: common.Device = "cpu",
+    dtype: own.Dtype = None,
+    label: own.Label = None,
+    tokens: own.AskStoredTokens = "none",
+    frames: own.Frames = "ends",
+    picture: own.ShownPicture = "frame",
+    asked: own.AskedObject = "target",
+    random_weights: common.RandomWeights = False,
+    weights_seed: common.WeightsSeed = 0,
+    batch: own.AskBatch = 1,
+    env_workers: common.EnvWorkers = None,
+    workers: common.Workers = 0,
+    ray: common.RayAddress = None,
+    inference_limit: common.InferenceLimit = None,
+    dry_run: common.DryRun = False,
+    allow_mixed: common.AllowMixed = False,
+    force: common.Force = False,
 ) -> None:
-    """Ask a vision-language model about the first frame of every episode, in words.
+    """Ask a vision-language model about the first frame of every episode.
 
-    One run per prompt and picture size, in the scenes that `probe-kit extract` plays with the same --suite,
-    --scene and --seed. Every question is asked twice, with the options exchanged, and answered twice: in text, and
-    as a choice between the options' logits. Runs are read like any other: `probe-kit retention ASKED… ACTED…` puts
-    both in one table, with --gap it tests the difference, and `probe-kit join` says what is known and not used.
+    Makes one run per prompt and picture size. Use the --suite, --scene and --seed of the policy runs to compare
+    with. Every question is asked in both orders of the options. Answers are read from the text and from the logits
+    of the options. Then compare with policies: `probe-kit retention ASKED… ACTED…` or `probe-kit join`.
 
-    The same command continues interrupted runs; other settings in the same folder are refused.
+    The same command resumes interrupted runs. Other settings in the same folder are an error.
     """
+    chosen = own.settings_of(locals())
     from probe_kit.extract.extraction import prepare_asks
-    from probe_kit.extract.protocols import scene_of
     from probe_kit.extract.settings import AskSettings
     from probe_kit.extract.store.locations.locate import locate
-    from probe_kit.extract.vqa.templates import find_template
-    from probe_kit.hooks.contract.options import read_pairs
 
-    templates = [find_template(name) for name in _several(prompt, "--prompt")]
-    sizes = [read_size(text) for text in _several(picture_size, "--picture-size")]
-    shared = {
-        "checkpoint": checkpoint,
-        "random_weights": random_weights,
-        "weights_seed": weights_seed,
-        "options": read_pairs(model_option or []),
-        "label": label,
-        "suite": suite,
-        "categories": split(categories),
-        "items": items,
-        "seed": seed,
-        "tokens": tokens,
-        "device": device,
-        "dtype": dtype,
-        "frames": frames,
-        "batch": batch,
-        "env_workers": env_workers,
-        "workers": workers,
-        "ray": ray,
-        "inference_limit": inference_limit,
-        "allow_mixed": allow_mixed,
-        "picture": picture,
-        "query": query,
-    }
-    wanted = [
-        AskSettings(model, prompt=template, scene=scene_of(model, None, scene, picture_size=size), **shared)  # type: ignore[arg-type]
-        for template in templates
-        for size in sizes
-    ]
-    _check_doubles(wanted)
-    places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{own.short_name}" for own in wanted]
+    wanted = AskSettings.per_prompt_and_size(chosen.pop("prompt"), chosen.pop("picture_size"), **chosen)
+    places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]
     runs: list[Run] = []
     prepared = prepare_asks(wanted, places)
     for place in places:
@@ -173,21 +70,6 @@ def ask(
                 runs.append(extraction.run(location, force=force, progress=counter(bar, "questions")))
     if not dry_run:
         _print_answers(runs)
-
-
-def _several(text: str, option: str) -> tuple[str, ...]:
-    parts = split(text) or ()
-    if not parts:
-        raise UsageError(f"{option} is empty; name at least one")
-    return parts
-
-
-def _check_doubles(wanted: "Sequence[AskSettings]") -> None:
-    names = [own.short_name for own in wanted]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UsageError(
-            f"{', '.join(twice)} is asked for twice; give every prompt and size once, and files own names"
-        )
 
 
 def _print_answers(runs: "Sequence[Run]") -> None:

@@ -5,17 +5,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._terminal.console import marked, out, print_json
+from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
     from probe_kit.hooks.family import Family
 
 
 def models(
-    name: Annotated[str | None, typer.Argument(help="Show one model only.")] = None,
-    run: Annotated[str | None, typer.Option(help="Show the certificate of this run instead.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    name: Annotated[str | None, typer.Argument(help="Model to show. Default: all.")] = None,
+    run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """List the models that can be run: checkpoints, streams, what this machine lacks for them."""
+    """List the models with their checkpoints, streams, options and missing requirements."""
     if run is not None:
         from probe_kit.extract import open_run
 

@@ -1,4 +1,4 @@
-"""`probe-kit run` and `probe-kit export`: look after runs."""
+"""`probe-kit run` and `probe-kit export`: inspect, verify, seal and export runs."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -7,18 +7,20 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import err, out, print_json
+from probe_kit._terminal.options import AsJson, Partial, RunFolder
+from probe_kit.extract.run_layout import ExportFormat
 
-app = typer.Typer(help="Look after runs.", no_args_is_help=True)
+app = typer.Typer(help="Inspect, verify and finalise runs.", no_args_is_help=True)
 DAMAGED = 1
 
 
 @app.command("verify")
 def verify(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    run: RunFolder,
     deep: Annotated[bool, typer.Option("--deep", help="Read every byte.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Compare a run with what it says of itself; exit 1 if anything is missing or changed."""
+    """Check a run against its stored hashes; exit with 1 if anything is missing or changed."""
     from probe_kit.extract import verify_run
 
     found = verify_run(run, deep)
@@ -44,27 +46,26 @@ def verify(
 
 
 @app.command("seal")
-def seal_run(run: Annotated[str, typer.Argument(help="Run folder or URL.")]) -> None:
-    """Build the columns that make probing fast; `extract` does it by itself at the end."""
+def seal_run(run: RunFolder) -> None:
+    """Build the columns that make probing fast; `extract` builds them at its end."""
     from probe_kit.extract import seal
 
     out.print("sealed" if seal(run) else "nothing to do")
 
 
 def export(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    style: Annotated[str, typer.Option("--format", help="h5, safetensors or parquet.")],
+    run: RunFolder,
+    style: Annotated[ExportFormat, typer.Option("--format", help="Format of the file.")],
     out_file: Annotated[
-        Path | None, typer.Option("--out", help="File to write; default <run>.<format> beside the run.")
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="File to write. Default: <run>.<format> beside the run."),
     ] = None,
-    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
+    partial: Partial = False,
 ) -> None:
-    """Write a run as one ordinary file, with its sha256 beside it."""
+    """Write a run to one file, and the sha256 of this file beside it."""
     from probe_kit.extract import export_run
-    from probe_kit.extract.store.export import check_format
     from probe_kit.extract.store.locations.locate import locate
 
-    check_format(style)
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")
     with err.status("exporting"):

@@ -19,7 +19,7 @@ Every object is bound to the root by hashes, see `hashes`.
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -36,7 +36,16 @@ TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """Pictures for people, which a run can do without."""
-CODECS = ("zstd", "fast", "none")
+Codec = Literal["zstd", "fast", "none"]
+CODECS: tuple[Codec, ...] = get_args(Codec)
+Tokens = Literal["pooled", "all"]
+AskTokens = Literal["none", "pooled", "all"]
+"""What is stored of the streams: nothing, the pooled views, or these and every token."""
+VideoChoice = Literal["none", "first", "all"]
+"""Episodes of which a GIF is stored."""
+FrameChoice = Literal["ends", "none"]
+"""Frames of an episode of which a thumbnail is stored."""
+ExportFormat = Literal["h5", "safetensors", "parquet"]
 CAPTURE_ONLY = "capture_only"
 """Outcome of an episode in which the model was heard and did not act: there is no success rate."""
 

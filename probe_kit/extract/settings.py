@@ -4,22 +4,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.protocols import deviations, protocol_row, scene_of
-from probe_kit.extract.run_layout import CODECS
-from probe_kit.extract.vqa.phrases import QUERIES, Query
-from probe_kit.extract.vqa.templates import P1, Template
+from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.vqa.phrases import Picture, Query
+from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.contract.options import read_pairs
+from probe_kit.scene_names import SceneName
 from probe_kit.suite.ladder import Wording, check_wordings
 
-TOKENS = ("pooled", "all")
-VIDEOS = ("none", "first", "all")
-PICTURES = ("frame", "side-by-side", "none")
-FRAMES = ("ends", "none")
 # Named by what they lead to (a weights hash, a list of episodes), not by themselves.
 _ELSEWHERE = {
     "checkpoint",
@@ -62,6 +60,11 @@ _MACHINE = {
 
 _DEFAULT_SCENE = SceneSpec()
 """This very object stands for a scene that was not chosen."""
+SCENE_OPTIONS = (
+    "max_steps", "tile_side", "light_level", "rendering", "background", "picture_size", "epsilon", "arm",
+    "arm_urdf", "start_grasped", "early_stop",
+)  # fmt: skip
+"""Options of a command that replace the field of that name in the scene."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +118,14 @@ class RunSettings:
     inference_limit: float | None = None
     allow_mixed: bool = False
 
-    tokens_allowed: ClassVar[tuple[str, ...]] = TOKENS
+    tokens_allowed: ClassVar[tuple[str, ...]] = get_args(Tokens)
 
     def __post_init__(self) -> None:
         if self.scene is _DEFAULT_SCENE:
             object.__setattr__(self, "scene", scene_of(self.model, self._protocol))
         self._check_one_of("tokens", self.tokens_allowed)
-        self._check_one_of("codec", CODECS)
-        self._check_one_of("frames", FRAMES)
+        self._check_one_of("codec", get_args(Codec))
+        self._check_one_of("frames", get_args(FrameChoice))
         for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
             self._check_at_least(name, bound)
         self._check_limit()
@@ -130,6 +133,33 @@ class RunSettings:
             raise UsageError(
                 f"label is {self.label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters"
             )
+
+    @classmethod
+    def from_options(
+        cls,
+        *,
+        model: str,
+        options: Sequence[str] | None = None,
+        scene: SceneName | None = None,
+        batch: int | Literal["auto"] = 1,
+        **given: Any,
+    ) -> Self:
+        """Settings from the options of a command; an option that is None has the default of protocol or model.
+
+        options: KEY=VALUE of the family. scene: a preset, of which those of `SCENE_OPTIONS` that are neither None
+        nor False replace fields. batch: `auto` calibrates. given: other fields by name.
+        Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
+        """
+        changes = {name: given.pop(name, None) for name in SCENE_OPTIONS}
+        changes = {name: value for name, value in changes.items() if value is not None and value is not False}
+        return cls(
+            model=model,
+            options=read_pairs(options or []),
+            scene=scene_of(model, given.get("protocol"), scene, **changes),
+            batch=1 if batch == "auto" else batch,
+            calibrate=batch == "auto",
+            **given,
+        )
 
     def _check_one_of(self, name: str, allowed: Iterable[str]) -> None:
         if getattr(self, name) not in allowed:
@@ -206,7 +236,7 @@ class ExtractSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_one_of("video", VIDEOS)
+        self._check_one_of("video", get_args(VideoChoice))
         self._check_at_least("captured_calls", 1)
         self._check_at_least("execute", 1)
         if self.wordings is not None:
@@ -272,7 +302,7 @@ class AskSettings(RunSettings):
     picture: str = "frame"
     query: Query = "target"
 
-    tokens_allowed: ClassVar[tuple[str, ...]] = ("none", *TOKENS)
+    tokens_allowed: ClassVar[tuple[str, ...]] = get_args(AskTokens)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -280,13 +310,35 @@ class AskSettings(RunSettings):
             raise UsageError(
                 "batch and processes are chosen for runs that act; ask with a number, such as batch=8"
             )
-        self._check_one_of("picture", PICTURES)
-        self._check_one_of("query", QUERIES)
+        self._check_one_of("picture", get_args(Picture))
+        self._check_one_of("asked", get_args(Query))
         if self.query == "absent" and not self.prompt.yes_or_no:
             raise UsageError(
                 f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask "
                 "for yes or no. Use --prompt seen"
             )
+
+    @classmethod
+    def per_prompt_and_size(
+        cls, prompts: Sequence[str], picture_sizes: Sequence[tuple[int, int]], **options: Any
+    ) -> list[Self]:
+        """Settings of one run per prompt and picture size, prompts outermost.
+
+        prompts: names or files of templates. picture_sizes: (width, height) in pixels. options: the rest, as in
+        `from_options`. Raises UsageError for two runs of one name, and what `from_options` raises.
+        """
+        templates = [find_template(prompt) for prompt in prompts]
+        every = [
+            cls.from_options(prompt=template, picture_size=size, **options)
+            for template in templates
+            for size in picture_sizes
+        ]
+        names = [settings.short_name for settings in every]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise UsageError(
+                f"{', '.join(twice)} is asked for twice; give every prompt and size once, and files own names"
+            )
+        return every
 
     @property
     def short_name(self) -> str:

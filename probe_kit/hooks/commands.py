@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from probe_kit._terminal.console import err, marked, out, print_json
+from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -13,14 +14,17 @@ if TYPE_CHECKING:
 
 
 def verify(
-    family: Annotated[str, typer.Argument(help="A family of `probe-kit models`.")],
-    folder: Annotated[Path | None, typer.Argument(help="Golden reference: checkpoint/ and reference.npz.")] = None,
-    keys: Annotated[Path | None, typer.Option(help="Recorded key list of the full-size model.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    family: Annotated[str, typer.Argument(help="Model family; `probe-kit models` lists them.")],
+    folder: Annotated[Path | None, typer.Argument(help="Folder with checkpoint/ and reference.npz.")] = None,
+    keys: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Recorded tensor names of the full-size model.")
+    ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare an adapter with outputs recorded from the model's original implementation.
 
-    Exit code 1 if anything is over its tolerance. What the adapter cannot produce is listed, never passed.
+    Exits with 1 if an error exceeds its tolerance. Outputs that the adapter cannot produce are listed as not
+    compared.
     """
     from probe_kit.hooks.verification.reference_files import check_key_list, check_reference
 
@@ -41,12 +45,14 @@ def verify(
 
 
 def new_adapter(
-    name: Annotated[str, typer.Argument(help="Of your family of models, such as my-vla.")],
-    out_folder: Annotated[Path | None, typer.Option("--out", help="New folder; default one of that name.")] = None,
+    name: Annotated[str, typer.Argument(help="Name of your model family, such as my-vla.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="New folder. Default: NAME.")
+    ] = None,
 ) -> None:
-    """Write a package with an adapter of your own, its entry point and its contract test.
+    """Write a package with an adapter for your own model, its entry point and its contract test.
 
-    It passes the contract as it is, with a small network in the place of yours; its README says what to change.
+    The package contains a small example network and passes the contract test. Its README lists what to change.
     """
     from probe_kit.hooks.new_adapter import write_adapter
 

@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
@@ -23,7 +23,8 @@ from probe_kit.models.bounds import MOST_STEPS
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.model import Model
 
-DTYPES = ("float32", "bfloat16")
+Dtype = Literal["float32", "bfloat16"]
+DTYPES: tuple[Dtype, ...] = get_args(Dtype)
 SIZE = "size"
 """The option that chooses one of a family's `sizes`."""
 

@@ -1,18 +1,16 @@
 """`probe-kit run show`: what a run holds, and what probes and interventions are stored with it."""
 
 from dataclasses import asdict
-from typing import Annotated
-
-import typer
 
 from probe_kit._terminal.console import out, print_json
+from probe_kit._terminal.options import AsJson, RunFolder
 
 
 def show(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    run: RunFolder,
+    as_json: AsJson = False,
 ) -> None:
-    """List what a run holds: episodes, streams, and every set of probes and intervention by its key."""
+    """List the episodes, streams, probes and interventions of a run; the last two by key."""
     from probe_kit.extract import open_run
     from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
     from probe_kit.train.commands import facts_table

@@ -1,4 +1,4 @@
-"""`probe-kit suite`: build, convert, check and look at suites."""
+"""`probe-kit suite`: build, convert, check and show suites."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,31 +6,40 @@ from typing import Annotated, Any
 import typer
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit._terminal.console import counter, err, out, print_json, progress, split
+from probe_kit._terminal.console import counter, err, out, print_json, progress
+from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit.errors import UsageError
+from probe_kit.suite.converters.conversion import EVERY_SOURCE
+from probe_kit.suite.generators.couples import SuiteVersion
 
-app = typer.Typer(help="Build, convert, check and look at suites of questions.", no_args_is_help=True)
+app = typer.Typer(help="Build, convert, check and show suites of questions.", no_args_is_help=True)
+
+ShownSuite = Annotated[
+    Path | None, typer.Argument(metavar="[FOLDER]", help="Suite folder. Default: the embedded suite.")
+]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="New folder for the suite.")]
+REVIEW = "Review"
 
 
 @app.command("build")
 def build(
     folder: Annotated[Path, typer.Argument(help="New folder for the suite.")],
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all embedded ones.")] = None,
+    categories: Categories = None,
     n: Annotated[
-        int, typer.Option("--n", help="Items per category, even: items come as twins.", max=100_000)
+        int, typer.Option("--n", help="Number of items per category, an even number.", max=100_000)
     ] = 150,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    seed: Seed = 0,
     suite_version: Annotated[
-        int,
-        typer.Option(help="2, or 1, the first one, which gives more away to pixels and words alone."),
+        SuiteVersion,
+        typer.Option(help="Version of the generators. 1: the first, which leaks more through pixels and words."),
     ] = 2,
 ) -> None:
-    """Draw the embedded suite into FOLDER."""
+    """Draw the embedded suite and save it in FOLDER."""
     from probe_kit.suite import build_suite
 
     with progress() as bar:
         drawing = counter(bar, "drawing items")
-        suite = build_suite(folder, split(categories), n, seed, progress=drawing, version=suite_version)
+        suite = build_suite(folder, categories, n, seed, progress=drawing, version=suite_version)
     out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
 
 
@@ -39,24 +48,30 @@ def from_csv(
     table: Annotated[
         Path, typer.Argument(help="CSV: instruction,correct,wrong[,group,category,object,other_object].")
     ],
-    out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
+    out_folder: OutFolder,
     license_name: Annotated[
         str | None,
-        typer.Option("--license", help="Needed: what others may do with the pictures, such as CC0-1.0 (SPDX)."),
+        typer.Option("--license", help="Licence of the pictures (SPDX), such as CC0-1.0. Required."),
     ] = None,
-    attribution: Annotated[str, typer.Option(help="Whom to name for the pictures.")] = "the author of the table",
-    category: Annotated[str, typer.Option(help="Of rows that name none.")] = "questions",
-    name: Annotated[str | None, typer.Option(help="Of the suite; default the table's file name.")] = None,
-    real_faces: Annotated[bool, typer.Option("--real-faces", help="Some pictures show real people.")] = False,
+    attribution: Annotated[
+        str, typer.Option(help="Author to credit for the pictures.")
+    ] = "the author of the table",
+    category: Annotated[str, typer.Option(help="Category of rows that name none.")] = "questions",
+    name: Annotated[
+        str | None, typer.Option(help="Name of the suite. Default: the file name of the table.")
+    ] = None,
+    real_faces: Annotated[
+        bool, typer.Option("--real-faces", help="Declare that some pictures show real people.")
+    ] = False,
 ) -> None:
-    """Make a suite of your own questions: a line each, pictures as paths beside the table.
+    """Make a suite from your own questions: a row per question, with paths of pictures relative to the table.
 
     \b
     instruction,correct,wrong,group,category
     Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
 
-    Rows of one group, or that share a picture, are never in training and test at once. Both layouts of every row
-    are played; the answer lies left and right in turn.
+    Rows of one group, or with a common picture, are never split between training and test. Every row is played
+    with the answer on the left and on the right.
     """
     from probe_kit.suite import Terms, suite_from_csv
 
@@ -75,10 +90,12 @@ def from_csv(
 
 @app.command("show")
 def show(
-    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
-    out_folder: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("suite-sheets"),
+    folder: ShownSuite = None,
+    out_folder: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder for the sheets.")] = Path(
+        "suite-sheets"
+    ),
 ) -> None:
-    """Write a contact sheet per category: pairs, instructions, the correct picture framed."""
+    """Write a contact sheet per category with picture pairs and instructions; correct pictures are framed."""
     from probe_kit.suite import contact_sheets, default_suite, load_suite
 
     suite = default_suite() if folder is None else load_suite(folder)
@@ -88,8 +105,8 @@ def show(
 
 @app.command("list")
 def list_categories(
-    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    folder: ShownSuite = None,
+    as_json: AsJson = False,
 ) -> None:
     """List the categories of a suite with their item counts."""
     from rich.table import Table
@@ -113,18 +130,18 @@ def list_categories(
 
 @app.command()
 def validate(
-    folder: Annotated[Path | None, typer.Argument(help="Suite folder; default the embedded suite.")] = None,
+    folder: ShownSuite = None,
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Also run the leakage gates: pixels, text and side alone.")
+        bool, typer.Option("--baselines", help="Also test for leaks through pixels, text or side alone.")
     ] = False,
     power: Annotated[
-        bool, typer.Option("--power", help="Also say how strong a leak must be to be found at this size.")
+        bool, typer.Option("--power", help="Also print the smallest leak that a suite of this size can detect.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Check every rule of the item format; exit code 1 if one is broken.
+    """Check every rule of the item format; exit with 1 if one is violated.
 
-    With --baselines, probes that see the pictures, the instruction or the side alone must be at chance.
+    With --baselines, probes on the pictures, the instruction or the side alone must be at chance.
     """
     from probe_kit.suite import default_suite, validate_suite
 
@@ -154,20 +171,30 @@ def _least_leaks(folder: Path) -> dict[str, float]:
 @app.command()
 def convert(
     source: Annotated[
-        str, typer.Argument(help="mllm-compbench, iconqa, mmbench, ok-vqa, vl-think or act2answer.")
+        str,
+        typer.Argument(parser=one_of(EVERY_SOURCE), metavar=choices(EVERY_SOURCE), help="Benchmark to convert."),
     ],
-    root: Annotated[Path, typer.Option(help="Folder the benchmark was unpacked to.")],
-    out_folder: Annotated[Path, typer.Option("--out", help="New folder for the suite.")],
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the source.")] = None,
-    n: Annotated[int, typer.Option("--n", help="Most items per category.", max=1_000_000)] = 150,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    curation: Annotated[Path | None, typer.Option(help="Reviewed file; only what it accepts is emitted.")] = None,
-    emit_curation: Annotated[Path | None, typer.Option(help="Write a file to review, with an HTML page.")] = None,
+    root: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the unpacked benchmark.")],
+    out_folder: OutFolder,
+    categories: Categories = None,
+    n: Annotated[int, typer.Option("--n", help="Largest number of items per category.", max=1_000_000)] = 150,
+    seed: Seed = 0,
+    curation: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Reviewed file; use only the items it accepts.", rich_help_panel=REVIEW),
+    ] = None,
+    emit_curation: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a file to review, with an HTML page.", rich_help_panel=REVIEW),
+    ] = None,
     option: Annotated[
-        list[str] | None, typer.Option("--option", "-o", help="NAME=VALUE of the source, such as min_side=64.")
+        list[str] | None,
+        typer.Option(
+            "--option", "-o", metavar="NAME=VALUE", help="Set an option of the benchmark, such as min_side=64."
+        ),
     ] = None,
 ) -> None:
-    """Turn a benchmark's files into a suite, counting every stage beside the paper's numbers."""
+    """Convert a benchmark to a suite and compare the count of every stage with the paper."""
     from probe_kit.suite.converters import convert as convert_source
 
     with err.status("converting"):
@@ -175,7 +202,7 @@ def convert(
             source,
             root,
             out_folder,
-            categories=split(categories),
+            categories=categories,
             n=n,
             seed=seed,
             curation=curation,

@@ -9,9 +9,8 @@ from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
-    from probe_kit.train.controls.baselines import BASELINES, Baseline
+    from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
     from probe_kit.train.data.array_run import ArrayRun
-    from probe_kit.train.data.labels import INCOMPLETE, TARGETS, Incomplete, Target
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
@@ -53,8 +52,8 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "ArrayRun": "data.array_run",
-        "BASELINES": "controls.baselines",
-        "Baseline": "controls.baselines",
+        "BASELINES": "choices",
+        "Baseline": "choices",
         "BaselineScore": "results.control_scores",
         "Controls": "results.control_scores",
         "ProbeCurve": "results.probe_curve",
@@ -62,14 +61,14 @@ __getattr__, __dir__ = lazy_names(
         "ControlComparison": "results.control_scores",
         "FOLD_UNITS": "probe_kit.statistics.folds",
         "FoldUnit": "probe_kit.statistics.folds",
-        "INCOMPLETE": "data.labels",
-        "Incomplete": "data.labels",
+        "INCOMPLETE": "choices",
+        "Incomplete": "choices",
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "settings",
         "Progress": "probe_sweep",
         "RunReader": "data.run_reader",
-        "TARGETS": "data.labels",
-        "Target": "data.labels",
+        "TARGETS": "choices",
+        "Target": "choices",
         "TwinScore": "results.control_scores",
         "load_results_by_call": "results.by_call",
         "load_results": "results.store",

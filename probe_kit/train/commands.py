@@ -1,111 +1,71 @@
 """`probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import typer
 from rich.text import Text
 
+from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
+from probe_kit.train import command_options as own
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-    from probe_kit.train import Baseline, FoldUnit, Incomplete, ProbeResults, RunReader, Target
+    from probe_kit.train import Baseline, ProbeResults, RunReader
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
 
 def train(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    categories: Annotated[
-        str | None, typer.Option(help="Comma-separated; default each of the run. all: every episode pooled.")
-    ] = None,
-    views: Annotated[
-        str, typer.Option(help="Comma-separated: mean, last, mean:language …, tokens, tokens:ROLE.")
-    ] = "mean",
-    permutations: Annotated[
-        int, typer.Option(help="Relabellings behind the p-values.", min=0, max=1_000_000)
-    ] = 200,
-    token_permutations: Annotated[
-        int, typer.Option(help="Relabellings for token views.", min=0, max=1_000_000)
-    ] = 59,
-    target: Annotated[
-        str, typer.Option(help="correct: side of the right picture. chosen: side placed. shuffled: control.")
-    ] = "correct",
-    folds: Annotated[
-        str, typer.Option(help="groups, or concepts: items about the same two concepts stay together too.")
-    ] = "groups",
-    incomplete: Annotated[
-        str, typer.Option(help="Items of which an episode is missing: keep the other, or drop it too.")
-    ] = "keep",
-    controls: Annotated[
-        str | None,
-        typer.Option(
-            help="Comma-separated: position, instruction, pixels, binding, or none. Default binding; without the "
-            "suite's pictures it is left out, with a warning."
-        ),
-    ] = None,
-    suite: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the run's suite, for pixels and binding; default the embedded one."),
-    ] = None,
-    twin: Annotated[
-        str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
-    ] = None,
-    call: Annotated[
-        str,
-        typer.Option(
-            help="Captured inferences to probe, counted from 0 and comma-separated, or all that enough episodes "
-            "reached; see extract --captured-calls."
-        ),
-    ] = "0",
-    wording: Annotated[
-        str | None, typer.Option(help="Of a run with several wordings: the one to probe; default its first.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of folds and relabellings.")] = 0,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            help="Processes that share the sites; default 1, with --ray one for every core.", min=1, max=1024
-        ),
-    ] = None,
-    ray: Annotated[str | None, typer.Option(help="Share the sites on a Ray cluster: ADDRESS or auto.")] = None,
-    device: Annotated[str | None, typer.Option(help="Solve with torch there, such as cuda; one process.")] = None,
-    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
+    run: common.RunFolder,
+    categories: own.Categories = None,
+    views: own.Views = own.MEAN,
+    target: own.ProbeTarget = "correct",
+    wording: common.Wording = None,
+    call: own.Calls = "0",
+    seed: common.Seed = 0,
+    partial: common.Partial = False,
+    controls: own.Controls = None,
+    twin: own.Twin = None,
+    suite: own.Suite = None,
+    permutations: own.Permutations = 200,
+    token_permutations: own.TokenPermutations = 59,
+    folds: own.Folds = "groups",
+    incomplete: own.IncompleteItems = "keep",
+    jobs: own.Jobs = None,
+    device: own.SolverDevice = None,
+    ray: common.RayAddress = None,
 ) -> None:
-    """Fit logistic probes at every site and store their scores in the run.
+    """Fit linear probes at every site and store their scores in the run.
 
-    Nested, grouped cross-validation; p-values by relabelling groups of items. Same settings are read back.
+    Cross-validation is nested and grouped; p-values come from permuted labels. Stored results of the same settings
+    are loaded, not fitted again.
     """
     from probe_kit.extract import open_run
-    from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes
+    from probe_kit.train import train_probes
 
-    asked, baselines = cast("Target", _one_of("target", target, TARGETS)), _baselines(controls)
-    units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
-    rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    beside = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
+    untrained = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
     left_out: dict[int, Exception] = {}
     for number in _calls(call, opened):
         try:
             with progress() as bar:
                 results = train_probes(
                     opened,
-                    split(categories),
-                    split(views) or (),
+                    categories,
+                    views,
                     permutations=permutations,
                     token_permutations=token_permutations,
-                    target=asked,
+                    target=target,
                     call=number,
-                    folds=units,
-                    incomplete=rest,
-                    controls=baselines,
+                    folds=folds,
+                    incomplete=incomplete,
+                    controls=cast("tuple[Baseline, ...] | None", controls),
                     suite=suite,
-                    twin=beside,
+                    twin=untrained,
                     seed=seed,
                     jobs=jobs,
                     device=device,
@@ -192,23 +152,6 @@ def _calls(text: str, run: "RunReader") -> list[int]:
     if not found or not all(part.isdecimal() for part in found):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
     return list(dict.fromkeys(map(int, found)))
-
-
-def _baselines(names: str | None) -> "tuple[Baseline, ...] | None":
-    """None for the default."""
-    from probe_kit.train import BASELINES
-
-    if names is None:
-        return None
-    if names == "none":
-        return ()
-    return tuple(cast("Baseline", _one_of("control", name, BASELINES)) for name in split(names) or ())
-
-
-def _one_of(what: str, name: str, known: Mapping[str, str]) -> str:
-    if name not in known:
-        raise UsageError(f"unknown {what} {name!r}; expected one of {', '.join(known)}")
-    return name
 
 
 def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:

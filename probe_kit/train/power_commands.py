@@ -7,36 +7,59 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from probe_kit._terminal.console import err, out, print_json, split, whole_number
+from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.train.power import Needed, Power
 
 MOST_ITEMS = 100_000
+INVERSE = "Number of items for a goal"
 ITEMS = "24,60,150,300"
 
 
 def power(
     items: Annotated[
-        str | None, typer.Option(help="Comma-separated numbers of items per category [default: 24,60,150,300].")
+        str | None,
+        typer.Option(
+            metavar="N,N,…", help="Numbers of items per category, comma-separated. Default: 24,60,150,300."
+        ),
     ] = None,
     signal: Annotated[
-        str, typer.Option(help="Comma-separated signals: points of accuracy above chance, in %.")
+        str,
+        typer.Option(
+            metavar="X,X,…", help="Probe accuracies above chance, in percentage points, comma-separated."
+        ),
     ] = "10,15,25",
-    sites: Annotated[int, typer.Option(help="Sites among which the best is looked for.", min=1, max=10_000)] = 19,
+    sites: Annotated[int, typer.Option(help="Number of sites that are tested.", min=1, max=10_000)] = 19,
+    draws: Annotated[
+        int, typer.Option(help="Number of simulated experiments per estimate.", min=20, max=100_000)
+    ] = 400,
+    as_json: AsJson = False,
     wanted: Annotated[
         float | None,
-        typer.Option("--power", help="Instead: the fewest items that see each so often, in %.", min=1, max=99.9),
+        typer.Option(
+            "--power",
+            help="Find the smallest number of items with this power, in %.",
+            min=1,
+            max=99.9,
+            rich_help_panel=INVERSE,
+        ),
     ] = None,
     width: Annotated[
-        float | None, typer.Option(help="Instead: items for an SR interval so wide, in points.", min=0.1, max=100)
+        float | None,
+        typer.Option(
+            help="Find the number of items for a success-rate interval of this width, in points.",
+            min=0.1,
+            max=100,
+            rich_help_panel=INVERSE,
+        ),
     ] = None,
-    draws: Annotated[int, typer.Option(help="Simulated experiments per number.", min=20, max=100_000)] = 400,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
-    """How many items do I need? Power of probes against chance, binding and a twin, by simulation.
+    """Estimate the power of probes against chance, binding and an untrained network by simulation.
 
-    Assumes two items and four episodes per group, neighbouring sites correlated 0.9, and controls at chance.
+    Assumes two items and four episodes per group, a correlation of 0.9 between neighbouring sites, and controls at
+    chance.
     """
     from probe_kit.train.power import items_for_width, items_needed, simulate
 

@@ -9,11 +9,10 @@ import numpy as np
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.controls.baselines import Baseline
+from probe_kit.train.choices import Baseline, Incomplete, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.data.captured_call import restrict_to_call
-from probe_kit.train.data.labels import Incomplete, Target
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution.dispatch import probe_columns

@@ -6,7 +6,7 @@ from typing import Any
 
 from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.data.labels import Incomplete, Target
+from probe_kit.train.choices import Incomplete, Target
 
 FORMAT = 4  # raise when settings have other fields or would give other numbers
 

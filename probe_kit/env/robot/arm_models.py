@@ -6,7 +6,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from probe_kit.env.robot.widowx import write_urdf
-from probe_kit.env.spec import XYZ, ArmName
+from probe_kit.env.spec import XYZ
+from probe_kit.scene_names import ArmName
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ import numpy as np
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import ExportFormat, StoredStream
 from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
 
 
-def export_run(path: Path | str | Location, style: str, out: Path, allow_partial: bool = False) -> Path:
+def export_run(path: Path | str | Location, style: ExportFormat, out: Path, allow_partial: bool = False) -> Path:
     """Write the run at `path` to the file `out` and its sha256 to `out`.sha256; returns `out`.
 
     h5: `<stream>/pooled`, `<stream>/tokens`, and a dataset per column under `episodes`.
@@ -37,7 +37,7 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
     if not run.streams:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
     with draft_of(out) as draft:
-        _WRITERS[style](run, draft)
+        WRITERS[style](run, draft)
         with draft.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         write_whole(out.with_name(f"{out.name}.sha256"), f"{digest}  {out.name}\n")
@@ -46,8 +46,8 @@ def export_run(path: Path | str | Location, style: str, out: Path, allow_partial
 
 def check_format(style: str) -> None:
     """Raise UsageError for a format that is not offered."""
-    if style not in _WRITERS:
-        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_WRITERS)}")
+    if style not in WRITERS:
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(WRITERS)}")
 
 
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
@@ -130,7 +130,7 @@ def _vectors(stored: StoredStream, row: Any) -> Iterator[dict[str, Any]]:
                 yield {"call": call, "site": str(site), "view": view, "vector": vector}
 
 
-_WRITERS: dict[str, Callable[[Run, Path], None]] = {
+WRITERS: dict[ExportFormat, Callable[[Run, Path], None]] = {
     "h5": _write_h5,
     "safetensors": _write_safetensors,
     "parquet": _write_parquet,

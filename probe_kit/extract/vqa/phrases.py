@@ -12,6 +12,8 @@ from probe_kit.hashing import derive_seed
 from probe_kit.suite import Item, Suite
 
 Query = Literal["target", "distractor", "absent"]
+Picture = Literal["frame", "side-by-side", "none"]
+"""What a question shows: the first frame, the two pictures on grey, or nothing."""
 QUERIES: Mapping[Query, str] = {
     "target": "the object of the instruction",
     "distractor": "the other picture's: right is the other side",

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -43,5 +43,6 @@ def as_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-ACT2ANSWER = "act2answer"
+ProtocolName = Literal["act2answer"]
+ACT2ANSWER: ProtocolName = "act2answer"
 OWN_SEEDS = "draws come from the episode's seed; the release seeds once per process"

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from probe_kit.train.data.labels import TARGETS
+from probe_kit.train.choices import TARGETS
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings

@@ -78,6 +78,8 @@ _ALL = (
     _Source(vlthink.SOURCE, vlthink.CATEGORIES, VlThinkOptions, vlthink.read, reuse=True),
 )
 SOURCES: dict[str, _Source] = {source.name: source for source in _ALL}
+EVERY_SOURCE = (*SOURCES, ACT2ANSWER)
+"""What `convert` takes as a source."""
 
 
 def convert(
@@ -101,8 +103,8 @@ def convert(
     Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
     should be; `out` is then left as it was.
     """
-    if source not in (*SOURCES, ACT2ANSWER):
-        raise UsageError(f"unknown source {source!r}; available: {', '.join((*SOURCES, ACT2ANSWER))}.")
+    if source not in EVERY_SOURCE:
+        raise UsageError(f"unknown source {source!r}; available: {', '.join(EVERY_SOURCE)}.")
     if n < 1:
         raise UsageError(f"n is {n}; expected at least 1 item per category.")
     if source == ACT2ANSWER:

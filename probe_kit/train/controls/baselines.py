@@ -1,12 +1,13 @@
 """Features that never saw the model: what layout, instruction and pictures alone give away."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.train.choices import BASELINES, Baseline
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -14,13 +15,6 @@ if TYPE_CHECKING:
 
     from probe_kit.suite import Suite
 
-Baseline = Literal["position", "instruction", "pixels", "binding"]
-BASELINES: dict[str, str] = {
-    "position": "the layout alone",
-    "instruction": "the words of the instruction, alone and with the layout",
-    "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
-    "binding": "random nonlinear features of pictures and words together, as wide as the site; needs the suite",
-}
 PICTURED: frozenset[Baseline] = frozenset({"pixels", "binding"})
 """Those that need the pictures of the run's suite."""
 DEFAULT: tuple[Baseline, ...] = ("binding",)

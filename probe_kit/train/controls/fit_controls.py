@@ -13,7 +13,8 @@ from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
-from probe_kit.train.controls.baselines import DEFAULT, PICTURED, Baseline, baseline_features
+from probe_kit.train.choices import Baseline
+from probe_kit.train.controls.baselines import DEFAULT, PICTURED, baseline_features
 from probe_kit.train.controls.random_features import RandomFeatureInputs, random_feature_scores
 from probe_kit.train.crossval.category_problem import POOLED, category_problem
 from probe_kit.train.crossval.metrics import chance_level, correctness

@@ -1,6 +1,6 @@
 """What a probe is asked to read: the correct side, the chosen side, or a shuffled control."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,22 +8,11 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.choices import TARGETS, Target
 from probe_kit.train.data.run_reader import check_several_wordings
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Target = Literal["correct", "chosen", "shuffled"]
-Incomplete = Literal["keep", "drop"]
-INCOMPLETE: dict[str, str] = {
-    "keep": "items of which a layout is missing take part with the other",
-    "drop": "they do not: the classes are balanced again",
-}
-TARGETS: dict[str, str] = {
-    "correct": "side of the correct picture",
-    "chosen": "side on which the cube was placed; episodes outside both zones are left out",
-    "shuffled": "control: side of the correct picture, flipped for a random half of the items",
-}
 
 
 def target_labels(episodes: "pd.DataFrame", target: Target, seed: int) -> NDArray[np.int8]:

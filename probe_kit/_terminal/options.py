@@ -1,0 +1,185 @@
+"""Options that several commands share, each declared once as an annotated type.
+
+`def command(partial: Partial = False, device: Device = "cpu")` gives a command the option with its help. Closed
+vocabularies are `Literal` types of the library, whose values help lists and parsing checks; `some_of` and `one_of`
+do the same for comma-separated values and for the names of a registry.
+"""
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import typer
+
+from probe_kit._terminal.console import split, whole_number
+from probe_kit.errors import UsageError
+from probe_kit.scene_names import SceneName
+
+WEIGHTS = "Model weights"
+SPEED = "Speed and hardware (no effect on results beyond rounding)"
+RESUMING = "Planning and resuming"
+
+
+class Names(tuple[str, ...]):
+    """The parts of a comma-separated option in order, each once."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: str | Self) -> Self:
+        """The parts of `text`; a default that is no text is returned as it is."""
+        return cls(split(text) or ()) if isinstance(text, str) else text
+
+    def __str__(self) -> str:
+        """As it is typed."""
+        return ",".join(self)
+
+
+def choices(names: Collection[object]) -> str:
+    """How help shows what an option accepts, such as `<one|two>`."""
+    return f"<{'|'.join(map(str, names))}>"
+
+
+def one_of(names: Collection[str]) -> Callable[[str], str]:
+    """A parser for the names of a registry; others end the command with exit code 2 and the list of names."""
+
+    def parse(text: str) -> str:
+        return _checked(text, names)
+
+    return parse
+
+
+def some_of(names: Collection[str], none: str | None = None) -> Callable[[str | Names], Names]:
+    """A parser for comma-separated `names`; none: a word for the empty selection."""
+
+    def parse(text: str | Names) -> Names:
+        if text == none:
+            return Names()
+        found = Names.parse(text)
+        if not found:
+            raise typer.BadParameter(f"it is empty; expected some of {', '.join(names)}")
+        return Names(_checked(part, names) for part in found)
+
+    return parse
+
+
+def _checked(name: str, known: Collection[str]) -> str:
+    if name not in known:
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, known))}.")
+    return name
+
+
+def read_size(text: str) -> tuple[int, int]:
+    """(width, height) in pixels of WIDTHxHEIGHT. Raises UsageError for another form."""
+    width, height = map(whole_number, text.partition("x")[::2])
+    if width is None or height is None:
+        raise UsageError(f"picture size {text!r} is not WIDTHxHEIGHT, such as 224x224")
+    return width, height
+
+
+# -- what to read -----------------------------------------------------------------------------------------------
+
+RunFolder = Annotated[str, typer.Argument(help="Run folder or URL.", metavar="RUN")]
+Partial = Annotated[bool, typer.Option("--partial", help="Accept unfinished runs.")]
+SuiteFolder = Annotated[
+    Path | None, typer.Option("--suite", help="Suite folder. Default: the embedded suite.", metavar="FOLDER")
+]
+Categories = Annotated[
+    Names | None,
+    typer.Option(
+        "--categories", parser=Names.parse, metavar="A,B,…", help="Categories, comma-separated. Default: all."
+    ),
+]
+Items = Annotated[int | None, typer.Option("--items", help="Number of items per category. Default: all.")]
+Wording = Annotated[
+    str | None,
+    typer.Option(
+        "--wording", help="Wording to analyse in a run with several wordings. Default: the first of the run."
+    ),
+]
+Scene = Annotated[
+    SceneName | None,
+    typer.Option("--scene", help="Scene preset. Default: that of the protocol or the model."),
+]
+Seed = Annotated[int, typer.Option("--seed", help="Random seed. The same seed gives the same result.")]
+
+# -- model ------------------------------------------------------------------------------------------------------
+
+ModelName = Annotated[str, typer.Option("--model", metavar="NAME", help="Model; `probe-kit models` lists them.")]
+Checkpoint = Annotated[
+    str | None,
+    typer.Option(
+        "--checkpoint", help="Checkpoint folder or Hugging Face id. Default: the family's released checkpoint."
+    ),
+]
+ModelOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--model-option",
+        "-M",
+        metavar="KEY=VALUE",
+        help="Set an option of the model; `probe-kit models NAME` lists them. Repeat for several.",
+    ),
+]
+RandomWeights = Annotated[
+    bool,
+    typer.Option("--random-weights", help="Use untrained weights, as a control.", rich_help_panel=WEIGHTS),
+]
+WeightsSeed = Annotated[
+    int, typer.Option("--weights-seed", help="Seed of the untrained weights.", rich_help_panel=WEIGHTS)
+]
+Device = Annotated[str, typer.Option("--device", help="Device of the model: cpu, cuda, cuda:1, …")]
+
+# -- speed ------------------------------------------------------------------------------------------------------
+
+EnvWorkers = Annotated[
+    int | None,
+    typer.Option(
+        "--env-workers",
+        help="Number of simulation processes. Default: two per observation of a batch.",
+        rich_help_panel=SPEED,
+    ),
+]
+Workers = Annotated[
+    int,
+    typer.Option(
+        "--workers",
+        help="Number of model processes, one per GPU. 0: use this process.",
+        rich_help_panel=SPEED,
+    ),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Run on this Ray cluster. auto: use the local cluster, or start one.",
+        rich_help_panel=SPEED,
+    ),
+]
+InferenceLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--inference-limit",
+        help="Stop a worker whose model call takes longer, in seconds. Requires --workers or --ray.",
+        rich_help_panel=SPEED,
+    ),
+]
+
+# -- planning and output ----------------------------------------------------------------------------------------
+
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.", rich_help_panel=RESUMING)]
+AllowMixed = Annotated[
+    bool,
+    typer.Option(
+        "--allow-mixed",
+        help="Resume a run that was started with other library versions or on another device.",
+        rich_help_panel=RESUMING,
+    ),
+]
+Force = Annotated[
+    bool,
+    typer.Option("--force", help="Start even if disk space seems insufficient.", rich_help_panel=RESUMING),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Format = Annotated[Literal["table", "json", "csv"], typer.Option("--format", help="Format of the printed result.")]

@@ -1,0 +1,297 @@
+"""Options of `probe-kit extract` and `probe-kit ask`, by help panel."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from probe_kit._terminal.console import whole_number
+from probe_kit._terminal.options import SPEED, Names, choices, read_size, some_of
+from probe_kit.errors import UsageError
+from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.vqa.phrases import Asked, Picture
+from probe_kit.hooks import family as hook_family
+from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.scene_names import ArmName, Rendering
+from probe_kit.suite.ladder import WORDINGS
+
+SCENE = "Scene (stored with the run)"
+STORED = "Stored data"
+CONTROLS = "Controls"
+_STARTING = ("out_folder", "dry_run", "force")
+
+
+def settings_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a command but those that say where and whether it starts."""
+    return {name: value for name, value in options.items() if name not in _STARTING}
+
+
+class Sizes(tuple[tuple[int, int], ...]):
+    """Comma-separated sizes of pictures, (width, height) in pixels each."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: "str | Sizes") -> "Sizes":
+        """The sizes of `text`, each WIDTHxHEIGHT; a default that is no text is returned as it is."""
+        if not isinstance(text, str):
+            return text
+        return cls(map(read_size, several("--picture-size", text)))
+
+    def __str__(self) -> str:
+        """As they are typed."""
+        return ",".join(f"{width}x{height}" for width, height in self)
+
+
+class Size(tuple[int, int]):
+    """One size of a picture, (width, height) in pixels."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: str) -> "Size":
+        """The size that WIDTHxHEIGHT names."""
+        return cls(read_size(text))
+
+
+def several(option: str, text: str | Names) -> Names:
+    """The parts of a comma-separated option. Raises UsageError for none."""
+    parts = Names.parse(text)
+    if not parts:
+        raise UsageError(f"{option} is empty; name at least one")
+    return parts
+
+
+def _prompts(text: str | Names) -> Names:
+    return several("--prompt", text)
+
+
+def _batch(text: str | int) -> int | str:
+    """A number of observations, or `auto`. Raises UsageError for anything else."""
+    number = whole_number(str(text))
+    if number is None and text != "auto":
+        raise UsageError(f"--batch {text!r} is neither a whole number nor auto")
+    return "auto" if number is None else number
+
+
+# -- most used ----------------------------------------------------------------------------------------------
+
+OutFolder = Annotated[
+    str | None,
+    typer.Option(
+        "--out", metavar="FOLDER", help="Folder or s3://BUCKET/PREFIX/RUN. Default: runs/<model>-<settings hash>."
+    ),
+]
+AskOutFolder = Annotated[
+    str | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        help="Folder or URL that holds one run per prompt and size. Default: a folder per run below runs/.",
+    ),
+]
+EvenItems = Annotated[
+    int | None, typer.Option("--items", help="Number of items per category, an even number. Default: all.")
+]
+Wordings = Annotated[
+    Names | None,
+    typer.Option(
+        "--wordings",
+        parser=some_of(WORDINGS),
+        metavar=f"{choices(WORDINGS)},…",
+        help="Wordings of the instruction, comma-separated. Every item is played in each of them with the same "
+        "seeds. Default: knowledge, the wording of the item.",
+    ),
+]
+Protocol = Annotated[
+    ProtocolName | None,
+    typer.Option(
+        "--protocol",
+        help="Use scene, checkpoint and options of a published protocol. Your options take precedence.",
+    ),
+]
+Label = Annotated[
+    str | None,
+    typer.Option(
+        "--label", help="Name of the run in tables. Default: the model and the options in which it differs."
+    ),
+]
+Execute = Annotated[
+    int | None,
+    typer.Option("--execute", help="Number of actions executed per inference. Default: set by protocol or model."),
+]
+Listen = Annotated[
+    bool,
+    typer.Option(
+        "--no-act", help="Capture the first inference of each episode without acting. There is no success rate."
+    ),
+]
+Dtype = Annotated[
+    hook_family.Dtype | None,
+    typer.Option("--dtype", help="Data type of the weights. Default: the data type of the checkpoint."),
+]
+Prompts = Annotated[
+    Names,
+    typer.Option(
+        "--prompt",
+        parser=_prompts,
+        metavar="A,B,…",
+        help="Prompts, comma-separated: seen, p1, p2 (from the paper) or text files. A file contains {object}, "
+        "and {A} and {B} for the sides.",
+    ),
+]
+P1_P2_SEEN = Names(("p1", "p2", "seen"))
+PictureSizes = Annotated[
+    Sizes,
+    typer.Option(
+        "--picture-size",
+        parser=Sizes.parse,
+        metavar="WxH,…",
+        show_default="224x224",
+        help="Picture sizes in pixels, comma-separated. The paper uses 224x224 and 560x480.",
+    ),
+]
+SIZE_224 = Sizes([(224, 224)])
+
+# -- scene --------------------------------------------------------------------------------------------------
+
+MaxSteps = Annotated[
+    int | None, typer.Option("--max-steps", help="Number of actions per episode, at 5 Hz.", rich_help_panel=SCENE)
+]
+TileSide = Annotated[
+    float | None,
+    typer.Option(
+        "--tile-side",
+        help="Side of a tile in metres. The paper uses 0.1452, 0.2033 and 0.1162.",
+        rich_help_panel=SCENE,
+    ),
+]
+LightLevel = Annotated[
+    float | None,
+    typer.Option(
+        "--light-level",
+        help="Brightness of the light; 1 is the default. The paper uses 0.7 and 1.3.",
+        rich_help_panel=SCENE,
+    ),
+]
+RenderingStyle = Annotated[
+    Rendering | None,
+    typer.Option(
+        "--rendering",
+        help="visual-matching: draw robot, cube and tiles over a photo.",
+        rich_help_panel=SCENE,
+    ),
+]
+Background = Annotated[
+    Path | None,
+    typer.Option(
+        "--background", help="Photo for visual-matching. Default: the embedded photo.", rich_help_panel=SCENE
+    ),
+]
+PictureSize = Annotated[
+    Size | None,
+    typer.Option(
+        "--picture-size",
+        parser=Size.parse,
+        metavar="WxH",
+        help="Size of the camera image for the policy in pixels, such as 224x224.",
+        rich_help_panel=SCENE,
+    ),
+]
+Epsilon = Annotated[
+    float | None,
+    typer.Option(
+        "--epsilon",
+        help="Radius of the target zone in metres. Default: half a tile + 0.01.",
+        rich_help_panel=SCENE,
+    ),
+]
+Arm = Annotated[ArmName | None, typer.Option("--arm", help="Robot arm.", rich_help_panel=SCENE)]
+ArmUrdf = Annotated[
+    Path | None, typer.Option("--arm-urdf", help="Your own URDF file of this arm.", rich_help_panel=SCENE)
+]
+StartGrasped = Annotated[
+    bool, typer.Option("--start-grasped", help="Start with the cube in the gripper.", rich_help_panel=SCENE)
+]
+EarlyStop = Annotated[
+    bool,
+    typer.Option("--early-stop", help="End an episode when the released cube is at rest.", rich_help_panel=SCENE),
+]
+
+# -- stored data --------------------------------------------------------------------------------------------
+
+StoredTokens = Annotated[
+    Tokens,
+    typer.Option(
+        "--tokens", help="pooled: store pooled views. all: also store every token (large).", rich_help_panel=STORED
+    ),
+]
+AskStoredTokens = Annotated[
+    AskTokens,
+    typer.Option(
+        "--tokens",
+        help="none: store answers only. pooled: also store pooled views, for probes. all: also store every token.",
+        rich_help_panel=STORED,
+    ),
+]
+CapturedCalls = Annotated[
+    int,
+    typer.Option("--captured-calls", help="Number of inferences captured per episode.", rich_help_panel=STORED),
+]
+Frames = Annotated[
+    FrameChoice,
+    typer.Option(
+        "--frames", help="ends: store thumbnails of first and last frames for the report.", rich_help_panel=STORED
+    ),
+]
+Video = Annotated[
+    VideoChoice,
+    typer.Option("--video", help="Store a GIF of the first episode or of all.", rich_help_panel=STORED),
+]
+StorageCodec = Annotated[
+    Codec, typer.Option("--codec", help="Compression of stored activations.", rich_help_panel=STORED)
+]
+
+# -- controls of questions ----------------------------------------------------------------------------------
+
+ShownPicture = Annotated[
+    Picture,
+    typer.Option(
+        "--picture",
+        help="frame: show the first frame. side-by-side: show both pictures on grey. none: show no picture; "
+        "accuracy above 50 % then indicates a leak in the suite.",
+        rich_help_panel=CONTROLS,
+    ),
+]
+AskedObject = Annotated[
+    Asked,
+    typer.Option(
+        "--query",
+        help="target: ask for the object of the instruction. distractor: ask for the object of the other picture. "
+        "absent: ask for an object in neither picture (requires --prompt seen; no is correct).",
+        rich_help_panel=CONTROLS,
+    ),
+]
+
+# -- speed --------------------------------------------------------------------------------------------------
+
+Batch = Annotated[
+    object,
+    typer.Option(
+        "--batch",
+        parser=_batch,
+        metavar="N|auto",
+        help="Number of observations per model call. Above 1, results repeat up to rounding. auto: measure for "
+        "some seconds and choose --batch and --env-workers.",
+        rich_help_panel=SPEED,
+    ),
+]
+AskBatch = Annotated[
+    int,
+    typer.Option(
+        "--batch",
+        help="Number of questions per model call. Above 1, results repeat up to rounding.",
+        rich_help_panel=SPEED,
+    ),
+]

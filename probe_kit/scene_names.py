@@ -1,0 +1,8 @@
+"""Names of scenes, arms and renderings. Importing them loads no environment."""
+
+from typing import Literal
+
+SceneName = Literal["bridge", "vl-think", "frontal", "act2answer"]
+"""The presets of `SceneSpec.preset`; `probe_kit.env.spec.PRESETS` says what each changes."""
+ArmName = Literal["panda", "widowx"]
+Rendering = Literal["raw", "visual-matching"]

@@ -1,0 +1,189 @@
+"""Options of the commands: closed vocabularies in help and in errors, short functions, plain help texts."""
+
+import inspect
+import re
+import subprocess
+import sys
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from probe_kit.cli import app, commands_of
+from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.spec import PRESETS
+from probe_kit.extract.command_options import Size, Sizes
+from probe_kit.extract.protocols import SCENES
+from probe_kit.extract.run_layout import AskTokens, Codec, ExportFormat, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
+from probe_kit.extract.store.export import WRITERS
+from probe_kit.extract.vqa.phrases import ASKED, Asked, Picture
+from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.hooks.family import Dtype
+from probe_kit.scene_names import ArmName, Rendering, SceneName
+from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
+from probe_kit.suite.converters.conversion import EVERY_SOURCE
+from probe_kit.suite.generators.couples import SUITE_VERSIONS, SuiteVersion
+from probe_kit.suite.ladder import WORDINGS, Wording
+from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
+
+LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
+MOST_LINES = 100
+LONG = {"intervene", "retention"}
+"""Commands whose options are not yet declared by `probe_kit._terminal.options`."""
+
+CLOSED: dict[tuple[str, str], Collection[object]] = {
+    ("extract", "--wordings"): WORDINGS,
+    ("extract", "--protocol"): get_args(ProtocolName),
+    ("extract", "--scene"): PRESETS,
+    ("extract", "--dtype"): get_args(Dtype),
+    ("extract", "--tokens"): get_args(Tokens),
+    ("extract", "--frames"): get_args(FrameChoice),
+    ("extract", "--video"): get_args(VideoChoice),
+    ("extract", "--codec"): get_args(Codec),
+    ("extract", "--rendering"): get_args(Rendering),
+    ("extract", "--arm"): ARMS,
+    ("ask", "--scene"): PRESETS,
+    ("ask", "--dtype"): get_args(Dtype),
+    ("ask", "--tokens"): get_args(AskTokens),
+    ("ask", "--frames"): get_args(FrameChoice),
+    ("ask", "--picture"): get_args(Picture),
+    ("ask", "--ask"): ASKED,
+    ("train", "--target"): TARGETS,
+    ("train", "--folds"): FOLD_UNITS,
+    ("train", "--incomplete"): INCOMPLETE,
+    ("train", "--controls"): BASELINES,
+    ("export", "--format"): WRITERS,
+    ("suite build", "--suite-version"): SUITE_VERSIONS,
+    ("suite convert", "SOURCE"): EVERY_SOURCE,
+}
+"""Command and option, and what the library accepts for it."""
+REQUIRED = {
+    "extract": ["--model", "pi0-tiny"],
+    "ask": ["--model", "vlm-tiny"],
+    "train": ["RUN"],
+    "export": ["RUN"],
+    "suite build": ["FOLDER"],
+    "suite convert": ["--root", "ROOT", "--out", "OUT"],
+}
+
+
+def help_of(command: str) -> str:
+    """Help with every line break and frame removed, so that no wrapping hides a text."""
+    shown = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "300"}).stdout
+    return " ".join(re.sub(r"[│╭╮╰╯─]", " ", shown).split())
+
+
+@pytest.mark.parametrize(("command", "option"), CLOSED, ids=" ".join)
+def test_help_lists_the_choices_of_a_closed_vocabulary(command: str, option: str) -> None:
+    listed = "|".join(map(str, CLOSED[command, option]))
+    assert f"<{listed}>" in help_of(command)
+
+
+@pytest.mark.parametrize(("command", "option"), CLOSED, ids=" ".join)
+def test_a_wrong_choice_exits_2_and_names_the_choices(
+    command: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = [option, "wrong-choice"] if option.startswith("--") else ["wrong-choice"]
+    ended = CliRunner().invoke(app, [*command.split(), *REQUIRED[command], *given], env={"COLUMNS": "300"})
+    assert ended.exit_code == 2, ended.stderr
+    assert "'wrong-choice' is not one of" in ended.stderr
+    assert all(repr(str(choice)) in ended.stderr for choice in CLOSED[command, option]), ended.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", {command for command, _ in CLOSED})
+def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> None:
+    shown = re.findall(r"(--[a-z-]+) <[^>|]+\|[^>]+>", help_of(command))
+    several = [option for (of, option), names in CLOSED.items() if of == command and len(names) > 1]
+    assert sorted(shown) == sorted(option for option in several if option.startswith("--"))
+
+
+@pytest.mark.parametrize(
+    ("names", "declared"),
+    [
+        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Asked, ASKED), (Target, TARGETS),
+        (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
+        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS),
+    ],
+)  # fmt: skip
+def test_a_vocabulary_names_what_the_library_offers(names: Any, declared: Collection[object]) -> None:
+    assert get_args(names) == tuple(declared)
+
+
+@pytest.mark.parametrize("command", sorted(LEAVES))
+def test_no_command_function_is_longer_than_100_lines(command: str) -> None:
+    if command in LONG:
+        pytest.skip("its options move to `probe_kit._terminal.options` with its own change")
+    assert len(inspect.getsource(LEAVES[command].callback).splitlines()) <= MOST_LINES
+
+
+def test_every_option_of_extract_and_ask_is_a_setting_or_says_how_the_run_starts() -> None:
+    for command, settings in (("extract", ExtractSettings), ("ask", AskSettings)):
+        names = {parameter.name for parameter in LEAVES[command].params} - {"help"}
+        known = {*settings.__dataclass_fields__, *SCENE_OPTIONS, "out_folder", "dry_run", "force"}
+        assert names <= known
+
+
+def test_options_that_are_not_given_have_the_default_of_the_protocol_the_model_or_the_class() -> None:
+    assert ExtractSettings.from_options(model="expert") == ExtractSettings("expert")
+    assert ExtractSettings.from_options(model="expert", scene=None, arm=None, early_stop=False, items=None) == (
+        ExtractSettings("expert")
+    )
+    assert ExtractSettings.from_options(model="expert", protocol="act2answer").scene.name == "act2answer"
+    assert (
+        ExtractSettings.from_options(model="expert", protocol="act2answer", scene="vl-think").scene.home
+        == (PRESETS["vl-think"]["home"])
+    )
+    chosen = ExtractSettings.from_options(
+        model="pi0", options=["unnorm-key=bridge"], batch="auto", max_steps=7, early_stop=True, picture_size=(8, 6)
+    )
+    assert (chosen.options, chosen.batch, chosen.calibrate) == ({"unnorm_key": "bridge"}, 1, True)
+    assert (chosen.scene.max_steps, chosen.scene.early_stop) == (7, True)
+    assert chosen.scene.picture_shape == (6, 8)
+    with pytest.raises(TypeError, match="no_such_option"):
+        ExtractSettings.from_options(model="pi0", no_such_option=1)
+
+
+def test_a_scene_value_of_zero_is_given_and_therefore_checked() -> None:
+    with pytest.raises(Exception, match="max_steps"):
+        ExtractSettings.from_options(model="expert", max_steps=0)
+
+
+def test_sizes_are_read_as_width_by_height_and_shown_as_typed() -> None:
+    assert Sizes.parse("224x224,560x480") == ((224, 224), (560, 480))
+    assert str(Sizes.parse("560x480")) == "560x480"
+    assert Size.parse("560x480") == (560, 480)
+
+
+@pytest.mark.parametrize("command", sorted(set(LEAVES) - LONG - {"join"}))
+def test_help_is_short_plain_sentences(command: str) -> None:
+    """At most 25 words a sentence, no personified code."""
+    texts = [
+        LEAVES[command].help.split("\b")[0],
+        *(getattr(one, "help", None) or "" for one in LEAVES[command].params),
+    ]
+    for text in texts:
+        assert not re.search(r"\b(hears?|listens?|whoever|somebody|nobody|twins? of|looks? after)\b", text), text
+        for sentence in re.split(r"(?<=[.;:!?])\s", " ".join(text.split())):
+            assert len(sentence.split()) <= 25, sentence
+
+
+@pytest.mark.parametrize("command", [(), ("extract",)])
+def test_help_is_quick_and_loads_nothing_heavy(command: tuple[str, ...]) -> None:
+    heavy = ("torch", "lerobot", "transformers", "pybullet", "sklearn", "pandas", "xarray", "zarr", "matplotlib")
+    code = (
+        "import sys, time\nimport probe_kit.cli as c\n"
+        f"try: c.app({[*command, '--help']})\n"
+        "except SystemExit: pass\n"
+        f"print([m for m in {heavy} if m in sys.modules], file=sys.stderr)\n"
+        "print(time.process_time(), file=sys.stderr)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
+    loaded, cpu = ended.stderr.splitlines()[-2:]
+    assert loaded == "[]"
+    assert float(cpu) < 2  # seconds; 1 is promised, and a loaded machine is slower
