@@ -14,7 +14,7 @@ from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.activation_cache import ActivationCache
-    from probe_kit.hooks.capturing.apply_edits import applied
+    from probe_kit.hooks.capturing.apply_edits import apply_edits
     from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
     from probe_kit.hooks.capturing.capture_context import capture, edit
     from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
@@ -40,7 +40,7 @@ __all__ = [
     "Site",
     "Stream",
     "Tap",
-    "applied",
+    "apply_edits",
     "capture",
     "capture_attention",
     "edit",
@@ -68,7 +68,7 @@ __getattr__, __dir__ = lazy_names(
         "Rows": "contract.model",
         "Tap": "contract.model",
         "ActivationCache": "capturing.activation_cache",
-        "applied": "capturing.apply_edits",
+        "apply_edits": "capturing.apply_edits",
         "capture": "capturing.capture_context",
         "edit": "capturing.capture_context",
         "Roles": "contract.roles",

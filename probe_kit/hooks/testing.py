@@ -132,7 +132,7 @@ class ModelContract:
             assert stream.name == name
             assert stream.part in PARTS
             assert stream.label
-            assert "residual" in stream.quantities or stream is model.memory
+            assert "residual" in stream.quantities or stream is model.prompt_kv
         parts = [stream.part for stream in model.streams.values() if stream.probed]
         assert "backbone" in parts
 

@@ -26,7 +26,7 @@ GLOSSARY = MappingProxyType(
             "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the "
             "decision itself, as a noisy action or as the tokens before."
         ),
-        "follows / against": (
+        "follow / reversal": (
             "With the two pictures exchanged, and nothing else: share of episodes whose action then turns from "
             "the correct picture's side to the other one, and share in which it does the reverse."
         ),
@@ -170,7 +170,7 @@ _ASKED = MappingProxyType(
     }
 )
 """What the same terms mean of a model that was asked."""
-_ACTING_ONLY = ("never moved", "flagged", "follows / against", "used")
+_ACTING_ONLY = ("never moved", "flagged", "follow / reversal", "used")
 """Terms that mean nothing where no policy acted."""
 
 
