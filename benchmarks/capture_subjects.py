@@ -20,8 +20,8 @@ from torch import nn
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.rollout.examples import example_observations
-from probe_kit.hooks import Model, Policy, Reader, load_model
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks import Model, Policy, AnswerModel, load_model
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.roles import Roles
 
 # The tests' folder is no installed package, and an installed one may have its name.
@@ -208,10 +208,10 @@ def subject(
     seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
     if isinstance(model, Policy):
         policy = model  # named, for the closure
-        return Subject(policy, lambda: policy.listen(seen, list(range(len(seen)))), policy.roles(seen))
-    assert isinstance(model, Reader)
+        return Subject(policy, lambda: policy.infer_without_acting(seen, list(range(len(seen)))), policy.roles(seen))
+    assert isinstance(model, AnswerModel)
     reader = model
-    questions = [Question(one, "Which of them is red?", ("a", "b")) for one in seen]
+    questions = [Prompt(one, "Which of them is red?", ("a", "b")) for one in seen]
     return Subject(reader, lambda: reader.read(questions).option_logits, reader.asked_roles(questions))
 
 

@@ -51,7 +51,7 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
     acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
     with capture(policy, [*backbone, *acting]) as donor:
-        policy.listen([other], [0])
+        policy.infer_without_acting([other], [0])
     roles = policy.roles([seen])
 
     def changed(sites: list[Site]) -> Callable[[], object]:
@@ -59,15 +59,15 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
 
         def run() -> object:
             with patched(policy, sites, tokens, Replaced(donor, tokens.count)) as ledger:
-                policy.listen([seen], [0])
+                policy.infer_without_acting([seen], [0])
             assert ledger.fires == len(sites)
             return ledger
 
         return run
 
     return {
-        "plain": lambda: policy.listen([seen], [0]),
-        "plain again": lambda: policy.listen([seen], [0]),
+        "plain": lambda: policy.infer_without_acting([seen], [0]),
+        "plain again": lambda: policy.infer_without_acting([seen], [0]),
         "one backbone site": changed(backbone[2:3]),
         f"all {len(backbone)} backbone sites": changed(backbone),
         f"expert's end, {len(acting)} iterations": changed(acting),

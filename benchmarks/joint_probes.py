@@ -42,9 +42,9 @@ from probe_kit.train.crossval.nested_folds import (
 )
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.mixed_precision import Point
-from probe_kit.train.solver.projection import IN_MEMORY, Coordinates
-from probe_kit.train.solver.row_subset import ChosenRows
+from probe_kit.train.solver.mixed_precision import NewtonState
+from probe_kit.train.solver.projection import IN_MEMORY, Projection
+from probe_kit.train.solver.row_subset import RowSubset
 
 
 def samples_of(episodes: int, tokens: int, width: int, signal: float) -> Samples:
@@ -64,7 +64,7 @@ def samples_of(episodes: int, tokens: int, width: int, signal: float) -> Samples
     features[:, :5] *= 1000
     features.view(np.uint32)[:] &= np.uint32(0xFFFF0000)
     means = features.reshape(episodes, tokens, width).mean(axis=1, dtype=np.float64)
-    return Samples(ChosenRows.all(features), np.full(episodes, tokens), means)
+    return Samples(RowSubset.all(features), np.full(episodes, tokens), means)
 
 
 def processor_seconds(work: Callable[[], object]) -> float:
@@ -93,7 +93,7 @@ class Counted(JointProblems):
 
     work = Work()
 
-    def point(self, weights: object, rows: NDArray[np.intp], *, exact: bool) -> Point:
+    def point(self, weights: object, rows: NDArray[np.intp], *, exact: bool) -> NewtonState:
         """As of JointProblems."""
         if exact:
             self.work.double += self._products(rows)
@@ -122,7 +122,7 @@ def alone_seconds(
 
     def one_inner() -> None:
         train = samples.of(inner.train)
-        for _ in LogisticSolver(Coordinates.fit(train.features).train).path(
+        for _ in LogisticSolver(Projection.fit(train.features).train).path(
             train.repeat(labels[inner.train]), STRENGTHS
         ):
             pass

@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import Fold, grouped_folds
-from probe_kit.statistics.label_permutations import family_p, flip_groups, flip_items, site_p
+from probe_kit.statistics.label_permutations import max_statistic_p, flip_groups, flip_items, pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import OUTER_FOLDS, nested_folds, probe_site
@@ -110,7 +110,7 @@ def p_values(world: World, seed: int, by_item: bool = False, nested: bool = Fals
         outer = grouped_folds(labels, groups, OUTER_FOLDS, seed + OTHER)
         scores = np.stack([correctness(discriminant(x, columns, outer), columns).mean(axis=0) for x in layers])
         accuracy, null = scores[:, 0], scores[:, 1:]
-    return float(site_p(accuracy, null)[0]), float(family_p(accuracy, null).min())
+    return float(pointwise_p(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
 
 
 def correlated(generator: np.random.Generator, sites: int, accuracy: float) -> NDArray[np.bool_]:

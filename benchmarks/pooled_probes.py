@@ -5,7 +5,7 @@
 One inner training set on the whole grid of C and one outer set at the C that was chosen are timed (`--folds`: as
 many of each as outer folds), in processor time and on one thread, and scaled to the 20 and 5 of a site. Work is
 counted as it is done: a product of N samples in R coordinates with k columns is 2·N·R·k, whole Hessians are
-2·N·R²·k. Coordinates are N·D² for moments, of which one half is computed, and 2·N·D² for turning training samples,
+2·N·R²·k. Projection are N·D² for moments, of which one half is computed, and 2·N·D² for turning training samples,
 as much for every test sample; where eigenvectors are found in float32, D³ in float64 and 2·D³ in float32 make them
 orthogonal again. The eigenvectors of D × D, about 9·D³, are shown apart and are no part of the share. The rate is
 that of square products, 2,048 wide, in the same process.
@@ -30,7 +30,7 @@ from probe_kit.train.crossval.nested_folds import INNER_FOLDS, OUTER_FOLDS, nest
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.design_matrix import DenseDesign
 from probe_kit.train.solver.principal_axes import WORTH_NARROWING
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 
 @dataclass
@@ -98,14 +98,14 @@ def main() -> None:
     labels = np.column_stack([real, flip_items(real, items, asked.relabellings, seed=0)])
     folds = nested_folds(real, items, seed=0)
     spent, done = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}, {"inner": Work(), "outer": Work()}
-    fit, turn, work, setting = Coordinates.fit.__func__, Coordinates.__call__, Work(), Work()  # type: ignore[attr-defined]
+    fit, turn, work, setting = Projection.fit.__func__, Projection.__call__, Work(), Work()  # type: ignore[attr-defined]
 
     def total() -> Work:
         return Work(work.single + setting.single, work.double + setting.double)
 
-    def timed_fit(cls: type[Coordinates], features: object) -> Coordinates:
+    def timed_fit(cls: type[Projection], features: object) -> Projection:
         start = time.process_time()
-        made: Coordinates = fit(cls, features)
+        made: Projection = fit(cls, features)
         spent["coordinates"] += time.process_time() - start
         count, width = samples_shape(features)
         if count >= width >= WORTH_NARROWING:
@@ -115,7 +115,7 @@ def main() -> None:
             setting.double += 3 * count * width**2 / 1e9
         return made
 
-    def timed_turn(self: Coordinates, features: NDArray[np.float64]) -> object:
+    def timed_turn(self: Projection, features: NDArray[np.float64]) -> object:
         start = time.process_time()
         turned = turn(self, features)
         spent["coordinates"] += time.process_time() - start
@@ -125,8 +125,8 @@ def main() -> None:
     with (
         threadpool_limits(1),
         patch.multiple(DenseDesign, **counting(work)),
-        patch.object(Coordinates, "fit", classmethod(timed_fit)),
-        patch.object(Coordinates, "__call__", timed_turn),
+        patch.object(Projection, "fit", classmethod(timed_fit)),
+        patch.object(Projection, "__call__", timed_turn),
     ):
         single, double = rate(np.float32), rate(np.float64)
         for fold in folds[: asked.folds]:

@@ -24,7 +24,7 @@ from probe_kit.extract.store.format.rows import TokenBlock
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval.site_probe import INNER_FOLDS, OUTER_FOLDS, STRENGTHS, nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 WIDTH = 2048
 SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold
@@ -77,7 +77,7 @@ def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
     """Seconds per site of probe_kit, by numpy and by torch, and of three ways to use scikit-learn."""
     labels, items = labels_of(n_episodes)
     fold = nested_folds(labels, items, seed=0)[0].inner[0]
-    coordinates = Coordinates.fit(features(n_episodes)[fold.train])
+    coordinates = Projection.fit(features(n_episodes)[fold.train])
     raw = coordinates.standardise(features(n_episodes)[fold.train])
     columns = flip_items(labels, items, SUBSET, seed=0)[fold.train]
     problems = OUTER_FOLDS * (INNER_FOLDS * STRENGTHS.size + 1) * (permutations + 1)

@@ -27,7 +27,7 @@ from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, re
 from probe_kit.retention.estimators.cross_fit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimators.retention import retention_interval
 from probe_kit.statistics.fieller import Interval
-from probe_kit.statistics.label_permutations import family_p, flip_items, site_p
+from probe_kit.statistics.label_permutations import max_statistic_p, flip_items, pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
@@ -207,7 +207,7 @@ def false_alarm(seed: int) -> tuple[float, float]:
     probes = [probe_site(Samples.pooled(layer), labels, relabellings, folds) for layer in layers]
     accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
     null = np.stack([probe.null for probe in probes])
-    return float(site_p(accuracy, null)[0]), float(family_p(accuracy, null).min())
+    return float(pointwise_p(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
 
 
 def false_alarms(draws: int, keep: Path | None) -> str:

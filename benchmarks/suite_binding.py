@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeSettings
-from probe_kit.train.controls.random_features import LAYERS, BindingInputs
+from probe_kit.train.controls.random_features import LAYERS, RandomFeatureInputs
 from probe_kit.train.crossval.category_problem import category_problem
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.data.samples import Samples
@@ -57,7 +57,7 @@ def main() -> None:
 def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     """By category, the accuracy of the best random layer and the mean of all."""
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
-    inputs = BindingInputs.of(run, suite.folder)
+    inputs = RandomFeatureInputs.of(run, suite.folder)
     settings = ProbeSettings(
         model="none", random_weights=True, weights=None, suite=suite.identity, run_settings=run.settings_sha256,
         episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",

@@ -14,8 +14,8 @@ import typer
 import typer.core
 
 from probe_kit._terminal.console import marked, out, say
-from probe_kit._terminal.error_reporting import tell
-from probe_kit._terminal.plain_text import visible
+from probe_kit._terminal.error_reporting import report_error
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
 from probe_kit.extract.ask_commands import ask
@@ -68,7 +68,7 @@ class Commands(typer.core.TyperGroup):
         except _FOR_TYPER:
             raise
         except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last to hear of it
-            raise typer.Exit(tell(error)) from error
+            raise typer.Exit(report_error(error)) from error
 
     def _run(self, ctx: Any) -> Any:
         try:
@@ -83,7 +83,7 @@ class Commands(typer.core.TyperGroup):
         if homes:
             named = ", ".join(f"`probe-kit {path}`" for path in homes)
             error.message, error.possibilities = f"{option} is no option here, but one of {named}.", None
-        error.message = visible(str(error.message))
+        error.message = terminal_safe(str(error.message))
         found: Exception = error
         return found
 

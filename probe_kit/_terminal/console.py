@@ -26,7 +26,7 @@ from rich.progress import (
 from rich.segment import Segment
 from rich.text import Text
 
-from probe_kit._terminal.plain_text import UNSAFE, visible
+from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit._terminal.progress_log import Heartbeat
 
 PAGE = 120
@@ -46,7 +46,7 @@ class SafeConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """What is drawn, with visible signs in place of what the terminal would obey."""
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=visible(segment.text))
+            yield segment if segment.control else segment._replace(text=terminal_safe(segment.text))
 
 
 def marked(template: str, *values: object) -> Text:
@@ -99,7 +99,7 @@ def print_json_text(text: str) -> None:
 
 def print_text(text: str) -> None:
     """Print text of a format of its own, such as CSV, on stdout."""
-    typer.echo(visible(text))
+    typer.echo(terminal_safe(text))
 
 
 def say(renderable: RenderableType) -> None:

@@ -23,7 +23,7 @@ _LONGEST = 300
 """Characters of an unforeseen error's message that are shown; all of it is in the file."""
 
 
-def tell(error: BaseException) -> int:
+def report_error(error: BaseException) -> int:
     """Say on stderr what ended a command; the exit code it ends with.
 
     1: the result is not what was asked, or nobody foresaw this, and then the traceback is in a file that is named.
@@ -52,7 +52,7 @@ def tell(error: BaseException) -> int:
                 "must raise an error instead. What was finished before is kept"
             )
         )
-    return last_words(error)
+    return report_unexpected(error)
 
 
 def _complain(error: ProbeKitError) -> int:
@@ -64,7 +64,7 @@ def _path(name: str | bytes | int) -> str:
     return os.fsdecode(name) if isinstance(name, str | bytes) else f"file descriptor {name}"
 
 
-def last_words(error: BaseException) -> int:
+def report_unexpected(error: BaseException) -> int:
     """Say in one line that nobody foresaw `error`, and where its traceback was written; the exit code."""
     first = (str(error).strip().splitlines() or ["no message"])[0][:_LONGEST]
     hint = "Use fewer --batch, --workers or --items. " if isinstance(error, MemoryError) else ""

@@ -7,7 +7,7 @@ UNSAFE = re.compile(f"[\x00-\x08\x0b-\x1f\x7f-\x9f{_BIDI}\u2028\u2029\ufeff\ud80
 """Control characters but tab and newline, bidirectional marks, foreign line ends, halves of surrogate pairs."""
 
 
-def visible(text: str) -> str:
+def terminal_safe(text: str) -> str:
     """`text` without anything that a terminal obeys; what was there shows as a sign of its own, such as ␛."""
     return UNSAFE.sub(_sign, text)
 

@@ -56,7 +56,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class FittingTable:
+class ResponsiveTable:
     """A table that is as wide as the console allows: one, or several that each repeat the names of the rows.
 
     A row that has nothing to say in one of several tables, all its cells there being empty, is left out of it.

@@ -24,7 +24,7 @@ from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
 Truth = Said
@@ -194,12 +194,12 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
 
 
-def to_rich(findings: Sequence[Finding]) -> "FittingTable":
+def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
     """One line per organism and category: the truth, the verdict, and the numbers behind it."""
-    from probe_kit._terminal.responsive_table import FittingTable, Part
+    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
 
     agree = sum(finding.agrees for finding in findings)
-    return FittingTable(
+    return ResponsiveTable(
         title="Model organisms",
         caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention bounded",
         name="policy",

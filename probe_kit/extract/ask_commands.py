@@ -65,10 +65,10 @@ def ask(
             rich_help_panel=CONTROLS,
         ),
     ] = "frame",
-    asked: Annotated[
+    query: Annotated[
         str,
         typer.Option(
-            "--ask",
+            "--query",
             help="target; distractor: what the other picture shows; absent: what neither shows (with seen; right: "
             "no).",
             rich_help_panel=CONTROLS,
@@ -144,14 +144,14 @@ def ask(
         "ray": ray,
         "allow_mixed": allow_mixed,
         "picture": picture,
-        "asked": asked,
+        "query": query,
     }
     wanted = [
         AskSettings(model, prompt=template, scene=scene_of(model, None, scene, picture_size=size), **shared)  # type: ignore[arg-type]
         for template in templates
         for size in sizes
     ]
-    _refuse_doubles(wanted)
+    _check_doubles(wanted)
     places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{own.short_name}" for own in wanted]
     runs: list[Run] = []
     prepared = prepare_asks(wanted, places)
@@ -174,7 +174,7 @@ def _several(text: str, option: str) -> tuple[str, ...]:
     return parts
 
 
-def _refuse_doubles(wanted: "Sequence[AskSettings]") -> None:
+def _check_doubles(wanted: "Sequence[AskSettings]") -> None:
     names = [own.short_name for own in wanted]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UsageError(

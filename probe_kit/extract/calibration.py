@@ -137,7 +137,7 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
     from torch.cuda import OutOfMemoryError
 
     try:
-        controller.rehearse([example] * batch, list(range(batch)))
+        controller.run_preflight([example] * batch, list(range(batch)))
     except OutOfMemoryError as error:
         raise MemoryError(str(error)) from error
 

@@ -100,9 +100,9 @@ def extract(
     execute: Annotated[
         int | None, typer.Option(help="Actions executed per inference; default the model's.")
     ] = None,
-    listen: Annotated[
+    capture_only: Annotated[
         bool,
-        typer.Option("--listen", help="Hear the first inference of every episode, do not act; no success rate."),
+        typer.Option("--no-act", help="Hear the first inference of every episode, do not act; no success rate."),
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of cube places and policy noise.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
@@ -176,7 +176,7 @@ def extract(
         tokens=tokens,
         captured_calls=captured_calls,
         execute=execute,
-        listen=listen,
+        capture_only=capture_only,
         codec=codec,
         device=device,
         dtype=dtype,
@@ -235,7 +235,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
-        **({"acts": "no: it is listened to once per episode; no success rate"} if identity.get("listen") else {}),
+        **({"acts": "no: it is listened to once per episode; no success rate"} if identity.get("capture_only") else {}),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.settings import AskSettings, RunSettings, refuse_other_settings
+from probe_kit.extract.settings import AskSettings, RunSettings, check_other_settings
 from probe_kit.hashing import canonical_json
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
             return
         stored: dict[str, Any] = read_root(location).card["settings"]
     known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
-    refuse_other_settings({name: stored[name] for name in known}, known, str(location))
+    check_other_settings({name: stored[name] for name in known}, known, str(location))
 
 
 def _known_settings(settings: RunSettings, suite: "Suite") -> dict[str, Any]:

@@ -13,7 +13,7 @@ from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, l
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
-from probe_kit.extract.store.locations.disk import refuse_if_full
+from probe_kit.extract.store.locations.disk import check_if_full
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
@@ -25,7 +25,7 @@ from probe_kit.extract.workers.ray import run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Reader
+    from probe_kit.hooks import AnswerModel
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
@@ -50,7 +50,7 @@ class Extraction(Prepared):
         """
         location = locate(out)
         if not force and not location.exists(RUN_FILE):
-            refuse_if_full(space_needed(self.plan, self.settings), location)
+            check_if_full(space_needed(self.plan, self.settings), location)
         with location.in_words():
             writer = self.writer(location)
             with writer.owned():
@@ -76,7 +76,7 @@ class Extraction(Prepared):
         scheduler = Scheduler(remaining)
         total = len(self.plan.episodes)
 
-        def heard(event: Event) -> None:
+        def on_event(event: Event) -> None:
             if progress and isinstance(event, Done):
                 progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
             if event.number in scheduler.given_up:
@@ -85,11 +85,11 @@ class Extraction(Prepared):
                 raise self._failure(scheduler)
 
         if self.settings.ray:
-            run_on_ray(self.settings, writer.location.address, scheduler, heard)
+            run_on_ray(self.settings, writer.location.address, scheduler, on_event)
         elif self.settings.workers:
-            run_in_processes(self.settings, writer.location.address, scheduler, heard)
+            run_in_processes(self.settings, writer.location.address, scheduler, on_event)
         else:
-            run_here(self, writer, scheduler, heard)
+            run_here(self, writer, scheduler, on_event)
         if scheduler.given_up:
             seal(writer.location)
             raise self._failure(scheduler)
@@ -105,7 +105,7 @@ class Extraction(Prepared):
 
 
 def prepare(
-    settings: RunSettings, out: Path | str | Location | None = None, reader: "Reader | None" = None
+    settings: RunSettings, out: Path | str | Location | None = None, reader: "AnswerModel | None" = None
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 

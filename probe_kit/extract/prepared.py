@@ -9,11 +9,11 @@ from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import check_model, check_place
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
-from probe_kit.extract.rollout.answer_controller import AskController
+from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
-from probe_kit.extract.rollout.examples import example_observations, refuse_unfit
-from probe_kit.extract.rollout.preflight import rehearse
-from probe_kit.extract.rollout.settings_checks import refuse_meaningless, refuse_misfit, refuse_unreachable
+from probe_kit.extract.rollout.examples import example_observations, check_unfit
+from probe_kit.extract.rollout.preflight import run_preflight
+from probe_kit.extract.rollout.settings_checks import check_meaningless, check_embodiment, check_unreachable
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -23,7 +23,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Reader
+    from probe_kit.hooks import AnswerModel
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Prepared:
     settings: RunSettings
     plan: Plan
     card: dict[str, Any]
-    controller: ActingController | AskController | None
+    controller: ActingController | AnswerController | None
     calibration: Calibration | None = None
 
     def identity(self) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def load(
     settings: RunSettings,
     rehearsed: bool = False,
     location: Location | None = None,
-    reader: "Reader | None" = None,
+    reader: "AnswerModel | None" = None,
 ) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
@@ -90,13 +90,13 @@ def load(
     settings = as_protocol(settings)
     suite = check_run(settings, location, loaded=reader is not None)
     if not rehearsed:
-        rehearse(settings.scene, plan_episodes(suite, settings.seed))
+        run_preflight(settings.scene, plan_episodes(suite, settings.seed))
     wordings = settings.asked_wordings
     asked = list(plan_episodes(suite, settings.seed, wordings))
     if wordings is not None:
         skipped_items(suite, asked, wordings)
     if isinstance(settings, AskSettings):
-        controller: ActingController | AskController = _asking(settings, suite, reader)
+        controller: ActingController | AnswerController = _asking(settings, suite, reader)
     else:
         controller = _acting(settings, instructions_of(asked))
     with_tokens = settings.tokens == "all"
@@ -119,7 +119,7 @@ def check_run(settings: RunSettings, location: Location | None = None, loaded: b
     """
     if not loaded:
         check_model(settings, tuple(SCRIPTED))
-    refuse_meaningless(settings)
+    check_meaningless(settings)
     suite = _suite(settings)
     if isinstance(settings, AskSettings):
         phrases(suite, settings.asked, settings.seed)
@@ -135,16 +135,16 @@ def _suite(settings: RunSettings) -> Suite:
     return load_suite(settings.suite).select(settings.categories, settings.items)
 
 
-def _asking(settings: AskSettings, suite: Suite, reader: "Reader | None") -> AskController:
+def _asking(settings: AskSettings, suite: Suite, reader: "AnswerModel | None") -> AnswerController:
     blank = example_observations(settings.scene, [min(item.instruction for item in suite.items)])[0]
     model = load_reader(settings) if reader is None else reader
-    refuse_unfit(model.card, settings.batch, blank)
-    return AskController(model, settings, suite, blank)
+    check_unfit(model.card, settings.batch, blank)
+    return AnswerController(model, settings, suite, blank)
 
 
-def load_reader(settings: AskSettings) -> "Reader":
+def load_reader(settings: AskSettings) -> "AnswerModel":
     """The model that is asked. Raises UsageError if it answers no questions, and what `load_model` raises."""
-    from probe_kit.hooks import Reader, load_model
+    from probe_kit.hooks import AnswerModel, load_model
 
     model = load_model(
         settings.model,
@@ -155,8 +155,8 @@ def load_reader(settings: AskSettings) -> "Reader":
         settings.weights_seed,
         **settings.options,
     )
-    if not isinstance(model, Reader):
-        raise UsageError(f"{settings.model} gave a {type(model).__name__}, which is no Reader; mend its loader")
+    if not isinstance(model, AnswerModel):
+        raise UsageError(f"{settings.model} gave a {type(model).__name__}, which is no AnswerModel; mend its loader")
     return model
 
 
@@ -176,9 +176,9 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         **settings.options,
     )
     examples = example_observations(settings.scene, instructions)
-    refuse_misfit(settings, policy)
-    refuse_unfit(policy.card, settings.batch, examples[0])
-    refuse_unreachable(settings, policy.card)
+    check_embodiment(settings, policy)
+    check_unfit(policy.card, settings.batch, examples[0])
+    check_unreachable(settings, policy.card)
     return PolicyController(
         policy,
         settings.model,
@@ -188,5 +188,5 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         settings.tokens == "all",
         settings.edits,
         settings.vectors,
-        settings.listen,
+        settings.capture_only,
     )

@@ -44,7 +44,7 @@ class Asked(Protocol):
         """Of the network."""
 
     @property
-    def listen(self) -> bool:
+    def capture_only(self) -> bool:
         """Whether nothing is carried out."""
 
     @property
@@ -93,7 +93,7 @@ def protocol_identity(settings: Asked) -> dict[str, Any]:
     row, used = protocol_row(settings.model, settings.protocol), _used(settings)
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
     default = {**({} if row is None else _defaults(settings, row)), **_scene(scene_of(settings.model))}
-    if settings.listen:
+    if settings.capture_only:
         protocol.pop("execute", None)
         default.pop("execute", None)
     return {
@@ -140,7 +140,7 @@ def _used(settings: Asked) -> dict[str, str]:
     used = {f"-M {name}": _told(as_text(value)) for name, value in settings.options.items()}
     plain = {"checkpoint": settings.checkpoint, "execute": settings.execute, "dtype": settings.dtype}
     used |= {name: _told(str(value)) for name, value in plain.items() if value is not None}
-    return {**used, **({"acts": "listened to"} if settings.listen else {}), **_scene(settings.scene)}
+    return {**used, **({"acts": "listened to"} if settings.capture_only else {}), **_scene(settings.scene)}
 
 
 def _told(value: str) -> str:

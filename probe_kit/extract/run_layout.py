@@ -38,7 +38,7 @@ INTERVENTIONS = "interventions"
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """Pictures for people, which a run can do without."""
 CODECS = ("zstd", "fast", "none")
-LISTENED = "listened"
+CAPTURE_ONLY = "capture_only"
 """Outcome of an episode in which the model was heard and did not act: there is no success rate."""
 
 

@@ -10,7 +10,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.protocols import deviations, protocol_row, scene_of
 from probe_kit.extract.run_layout import CODECS
-from probe_kit.extract.vqa.phrases import ASKED, Asked
+from probe_kit.extract.vqa.phrases import QUERIES, Query
 from probe_kit.extract.vqa.templates import P1, Template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.capturing.edits import Edit, Vectors
@@ -33,7 +33,7 @@ _ELSEWHERE = {
     "scene",
     "edits",
     "vectors",
-    "listen",
+    "capture_only",
     "protocol",
 }
 _MOST = {
@@ -164,7 +164,7 @@ class ExtractSettings(RunSettings):
     execute: actions executed per inference; None for the policy's own.
     protocol: a published one, such as `act2answer`: what is not given is as it has it, see `protocols`; its scene
     takes the place of the default one.
-    listen: capture the first inference of every episode and do not act; for checkpoints of other arms.
+    capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
     edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
     """
@@ -172,7 +172,7 @@ class ExtractSettings(RunSettings):
     wordings: tuple[Wording, ...] | None = None
     captured_calls: int = 1
     execute: int | None = None
-    listen: bool = False
+    capture_only: bool = False
     protocol: str | None = None
     edits: tuple[Edit, ...] = ()
     vectors: Vectors = field(default_factory=dict)
@@ -188,7 +188,7 @@ class ExtractSettings(RunSettings):
 
     def choices(self) -> dict[str, Any]:
         """As of every run, and what was not always there: whether it is listened to, and the edits."""
-        listening = {"listen": True} if self.listen else {}
+        listening = {"capture_only": True} if self.capture_only else {}
         edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
         return super().choices() | listening | edits
 
@@ -204,7 +204,7 @@ class ExtractSettings(RunSettings):
             self,
             checkpoint=self.checkpoint or row.checkpoint,
             options={**row.options_for(self.checkpoint), **self.options},
-            execute=self.execute if self.execute or self.listen else row.execute,
+            execute=self.execute if self.execute or self.capture_only else row.execute,
             dtype=self.dtype or row.dtype,
         )
 
@@ -237,14 +237,14 @@ class AskSettings(RunSettings):
 
     The size of the picture is that of `scene`. tokens may also be `none`, which stores no activations.
     picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none` nothing.
-    asked: for what, see `ASKED`.
+    query: the object asked for, see `QUERIES`.
     Raises UsageError for an absent object with a prompt that takes no no.
     """
 
     tokens: str = "none"
     prompt: Template = P1
     picture: str = "frame"
-    asked: Asked = "target"
+    query: Query = "target"
 
     tokens_allowed: ClassVar[tuple[str, ...]] = ("none", *TOKENS)
 
@@ -255,10 +255,10 @@ class AskSettings(RunSettings):
                 "batch and processes are chosen for runs that act; ask with a number, such as batch=8"
             )
         self._check_one_of("picture", PICTURES)
-        self._check_one_of("asked", ASKED)
-        if self.asked == "absent" and not self.prompt.yes_or_no:
+        self._check_one_of("query", QUERIES)
+        if self.query == "absent" and not self.prompt.yes_or_no:
             raise UsageError(
-                f"--ask absent needs a prompt that can be answered no; {self.prompt.name} does not ask for yes or "
+                f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask for yes or "
                 "no. Use --prompt seen"
             )
 
@@ -266,7 +266,7 @@ class AskSettings(RunSettings):
     def short_name(self) -> str:
         """Prompt, size of the picture and what is unusual, as a folder is called."""
         height, width = self.scene.picture_shape
-        parts = [self.prompt.name, f"{width}x{height}", self.picture, self.asked]
+        parts = [self.prompt.name, f"{width}x{height}", self.picture, self.query]
         return "-".join(part for part in parts if part not in ("frame", "target"))
 
     def choices(self) -> dict[str, Any]:
@@ -278,7 +278,7 @@ class AskSettings(RunSettings):
             "prompt": prompt.name,
             "template": prompt.text,
             "template_sha256": prompt.sha256,
-            "object": plain.pop("asked"),
+            "object": plain.pop("query"),
             "picture": plain.pop("picture"),
             "picture_size": f"{width}x{height}",
             "max_new_tokens": prompt.tokens,
@@ -292,7 +292,7 @@ class AskSettings(RunSettings):
             self.prompt.name,
             f"{width}×{height}" if self.picture != "none" else "no picture",
             *(["side by side"] if self.picture == "side-by-side" else []),
-            *([f"asks for the {self.asked}"] if self.asked != "target" else []),
+            *([f"asks for the {self.query}"] if self.query != "target" else []),
         ]
 
 
@@ -312,7 +312,7 @@ def run_label(settings: RunSettings) -> str:
     return " · ".join([*parts, *settings.marks()])
 
 
-def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
+def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
     """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
     was, now = _flat(stored), _flat(asked)
     different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]
@@ -324,7 +324,7 @@ def refuse_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: 
         )
 
 
-def refuse_other_plan(stored: Sequence[Mapping[str, Any]], asked: Sequence[Mapping[str, Any]], where: str) -> None:
+def check_other_plan(stored: Sequence[Mapping[str, Any]], asked: Sequence[Mapping[str, Any]], where: str) -> None:
     """Raise SettingsMismatchError unless a stored plan has the same episodes, as far as both describe them.
 
     The settings decide the plan, but only within one version of probe_kit.

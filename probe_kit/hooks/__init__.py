@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit._system.lazy import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.family import Family
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.observation import Observation
@@ -13,16 +13,16 @@ from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.capturing.activation_cache import Tape
+    from probe_kit.hooks.capturing.activation_cache import ActivationCache
     from probe_kit.hooks.capturing.apply_edits import applied
     from probe_kit.hooks.capturing.attention import AttentionMass
     from probe_kit.hooks.capturing.capture_context import capture, edit
-    from probe_kit.hooks.contract.model import Model, Policy, Question, Reader, Reading, Rows, Tap
+    from probe_kit.hooks.contract.model import Model, Policy, Prompt, AnswerModel, Reading, Rows, Tap
     from probe_kit.hooks.contract.roles import Roles, pool
 
 __all__ = [
     "AttentionMass",
-    "Card",
+    "ModelCard",
     "Edit",
     "Family",
     "Interventions",
@@ -30,15 +30,15 @@ __all__ = [
     "Observation",
     "Option",
     "Policy",
-    "Question",
-    "Reader",
+    "Prompt",
+    "AnswerModel",
     "Reading",
     "Roles",
     "Rows",
     "Site",
     "Stream",
     "Tap",
-    "Tape",
+    "ActivationCache",
     "applied",
     "capture",
     "edit",
@@ -55,12 +55,12 @@ __getattr__ = lazy_names(
         "AttentionMass": "capturing.attention",
         "Model": "contract.model",
         "Policy": "contract.model",
-        "Question": "contract.model",
-        "Reader": "contract.model",
+        "Prompt": "contract.model",
+        "AnswerModel": "contract.model",
         "Reading": "contract.model",
         "Rows": "contract.model",
         "Tap": "contract.model",
-        "Tape": "capturing.activation_cache",
+        "ActivationCache": "capturing.activation_cache",
         "applied": "capturing.apply_edits",
         "capture": "capturing.capture_context",
         "edit": "capturing.capture_context",

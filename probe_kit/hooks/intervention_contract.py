@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
-from probe_kit.hooks.capturing.activation_cache import Tape
+from probe_kit.hooks.capturing.activation_cache import ActivationCache
 from probe_kit.hooks.capturing.apply_edits import applied
-from probe_kit.hooks.capturing.attention import attention
+from probe_kit.hooks.capturing.attention import capture_attention
 from probe_kit.hooks.capturing.capture_context import capture, edit
 from probe_kit.hooks.capturing.edits import Edit, Vectors, vector_hash
 from probe_kit.hooks.contract.interventions import InterventionKind
@@ -113,7 +113,7 @@ class InterventionContract:
         one = observations[0]
         other = replace(one, image=255 - one.image)
         acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
-        early = [site for site in acting if (site.iteration or 0) < policy.interventions.heard_from]
+        early = [site for site in acting if (site.iteration or 0) < policy.interventions.first_affected_token]
         late = [site for site in acting if site not in early]
         plain, donor = (_heard(policy, [own], [*_all(memory), *acting]) for own in (one, other))
         edits, vectors = _donated(donor, [*_all(memory), *early])
@@ -181,12 +181,12 @@ class InterventionContract:
         self, policy: Policy, observations: list[Observation]
     ) -> None:
         if not policy.interventions.attention:
-            with pytest.raises(UnsupportedInterventionError), attention(policy):
+            with pytest.raises(UnsupportedInterventionError), capture_attention(policy):
                 pass
             return
         seen = observations[: policy.card.batch]
         plain = policy.act(seen, range(len(seen)))
-        with attention(policy) as mass:
+        with capture_attention(policy) as mass:
             told = policy.act(seen, range(len(seen)))
         np.testing.assert_array_equal(plain, told)
         backbone = next(own for own in policy.streams.values() if own.part == "backbone" and own.probed)
@@ -213,7 +213,7 @@ class InterventionContract:
             return policy.act([seen], [0])
 
 
-def _heard(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -> Tape:
+def _heard(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -> ActivationCache:
     """What one inference leaves at `sites`."""
     with capture(policy, sites) as tape:
         policy.act(seen, range(len(seen)))
@@ -228,7 +228,7 @@ def _all(memory: Stream) -> list[Site]:
     return [site for quantity in MEMORY for site in memory.sites(quantity)]
 
 
-def _donated(donor: Tape, sites: Sequence[Site]) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
+def _donated(donor: ActivationCache, sites: Sequence[Site]) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
     """Edits that put in the first row of `donor`, and the arrays they name."""
     rows = {site: donor[site][0].float().cpu().numpy() for site in sites}
     vectors = {vector_hash(row): row for row in rows.values()}

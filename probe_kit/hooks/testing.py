@@ -38,7 +38,7 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.capturing.capture_context import capture, edit
 from probe_kit.hooks.contract.family import SIZE, Family
-from probe_kit.hooks.contract.model import Model, Policy, Question, Reader, Reading
+from probe_kit.hooks.contract.model import Model, Policy, Prompt, AnswerModel, Reading
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles, pool
 from probe_kit.hooks.contract.sites import PARTS, Site, Stream
@@ -439,13 +439,13 @@ class AdapterContract(InterventionContract, ModelContract):
         self, policy: Policy, observations: list[Observation]
     ) -> None:
         """Site by site, bit by bit; and what acts fits the arm."""
-        assert policy.misfit() is None
+        assert policy.embodiment_mismatch() is None
         seen = self.shown(policy, observations)[:1]
         sites = policy.sites()
         with capture(policy, sites) as acting:
             policy.act(seen, [5])
         with capture(policy, sites) as listening:
-            heard = policy.listen(seen, [5])
+            heard = policy.infer_without_acting(seen, [5])
         assert heard.shape[0] == 1
         for site in sites:
             torch.testing.assert_close(acting[site], listening[site], rtol=0, atol=0)
@@ -456,29 +456,29 @@ class AdapterContract(InterventionContract, ModelContract):
 
 
 class ReaderContract(ModelContract):
-    """What the rest of probe_kit relies on in a `Reader`."""
+    """What the rest of probe_kit relies on in a `AnswerModel`."""
 
     letters: ClassVar[tuple[str, ...]] = ("A", "B")
     other_words: ClassVar[str] = " please"
     """What makes a question longer, in words that the tokenizer knows."""
 
     @pytest.fixture
-    def reader(self, checkpoint: Path) -> Reader:
+    def reader(self, checkpoint: Path) -> AnswerModel:
         """The adapter under test; override it to load it once per module."""
         model = self.load(checkpoint)
-        assert isinstance(model, Reader)
+        assert isinstance(model, AnswerModel)
         return model
 
     @pytest.fixture
-    def model(self, reader: Reader) -> Reader:
+    def model(self, reader: AnswerModel) -> AnswerModel:
         """The same, as the tests of every model know it."""
         return reader
 
-    def questions(self, seen: Sequence[Observation]) -> list[Question]:
+    def questions(self, seen: Sequence[Observation]) -> list[Prompt]:
         """The observations' instructions as questions."""
-        return [Question(own, own.instruction, self.letters) for own in seen]
+        return [Prompt(own, own.instruction, self.letters) for own in seen]
 
-    def led(self, reader: Reader, questions: Sequence[Question]) -> list[Question]:
+    def led(self, reader: AnswerModel, questions: Sequence[Prompt]) -> list[Prompt]:
         """With options as they stand behind the frame."""
         return [
             own if own.begun else replace(own, options=tuple(reader.lead + letter for letter in own.options))
@@ -491,18 +491,18 @@ class ReaderContract(ModelContract):
 
     def roles_of(self, model: Model, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the questions asked about them."""
-        assert isinstance(model, Reader)
+        assert isinstance(model, AnswerModel)
         return model.asked_roles(self.led(model, self.questions(seen)))
 
     def _read(self, model: Model, seen: Sequence[Observation]) -> Reading:
-        assert isinstance(model, Reader)
+        assert isinstance(model, AnswerModel)
         return model.read(self.led(model, self.questions(seen)))
 
-    def _ask(self, reader: Reader, questions: Sequence[Question]) -> NDArray[np.float32]:
+    def _ask(self, reader: AnswerModel, questions: Sequence[Prompt]) -> NDArray[np.float32]:
         return reader.read(self.led(reader, questions)).option_logits
 
     def test_a_reading_has_a_logit_per_option_and_their_mass_is_a_share(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         seen = self.shown(reader, observations)
         reading = self._read(reader, seen)
@@ -511,7 +511,7 @@ class ReaderContract(ModelContract):
         assert ((reading.option_mass > 0) & (reading.option_mass <= 1)).all()
 
     def test_what_is_spoken_repeats_and_is_as_long_as_asked(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         seen = self.shown(reader, observations)
         first = reader.speak(self._read(reader, seen), 4)
@@ -519,13 +519,13 @@ class ReaderContract(ModelContract):
         assert len(first) == len(seen)
         assert all(isinstance(text, str) for text in first)
 
-    def test_speaking_does_not_use_a_reading_up(self, reader: Reader, observations: list[Observation]) -> None:
+    def test_speaking_does_not_use_a_reading_up(self, reader: AnswerModel, observations: list[Observation]) -> None:
         reading = self._read(reader, self.shown(reader, observations))
         assert reader.speak(reading, 4) == reader.speak(reading, 4)
         assert reader.speak(reading, 0) == [""] * len(reading.option_logits)
 
     def test_rows_in_another_order_are_answered_alike(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         if reader.card.batch == 1:
             pytest.skip(f"{reader.card.family} reads one question at a time")
@@ -533,7 +533,7 @@ class ReaderContract(ModelContract):
         forth, back = self._ask(reader, questions), self._ask(reader, questions[::-1])
         np.testing.assert_allclose(forth, back[::-1], atol=self.tolerance)
 
-    def test_a_far_longer_neighbour_changes_nothing(self, reader: Reader, observations: list[Observation]) -> None:
+    def test_a_far_longer_neighbour_changes_nothing(self, reader: AnswerModel, observations: list[Observation]) -> None:
         if reader.card.batch == 1:
             pytest.skip(f"{reader.card.family} reads one question at a time")
         short = self.questions(observations)[0]
@@ -544,7 +544,7 @@ class ReaderContract(ModelContract):
         assert spoken[0] == spoken[1]
 
     def test_without_a_picture_nothing_of_it_is_left(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         """Also right behind questions about pictures: no state may stay from call to call."""
         asked = [replace(own, pictured=False) for own in self.questions(self.shown(reader, observations))]
@@ -556,19 +556,19 @@ class ReaderContract(ModelContract):
             assert not any(row.mask("image").any() for row in rows)
 
     def test_questions_with_and_without_a_picture_do_not_go_together(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         first, second = self.questions(observations)
         with pytest.raises((UsageError, ObservationError)):
             self._ask(reader, [first, replace(second, pictured=False)])
 
-    def test_options_that_begin_alike_are_refused(self, reader: Reader, observations: list[Observation]) -> None:
+    def test_options_that_begin_alike_are_refused(self, reader: AnswerModel, observations: list[Observation]) -> None:
         twice = replace(self.questions(observations)[0], options=(self.letters[0], self.letters[0]))
         with pytest.raises(UsageError, match="same token"):
             self._ask(reader, [twice])
 
     def test_a_choice_that_rounding_decides_is_a_near_tie(
-        self, reader: Reader, observations: list[Observation]
+        self, reader: AnswerModel, observations: list[Observation]
     ) -> None:
         reading = self._read(reader, self.shown(reader, observations))
         rows = len(reading.option_logits)

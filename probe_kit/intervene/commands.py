@@ -115,9 +115,9 @@ def intervene(
     from probe_kit.extract import open_run
     from probe_kit.hooks.contract.options import read_pairs
     from probe_kit.intervene import Source, intervene_on
-    from probe_kit.intervene.runner import refuse_unsupported
+    from probe_kit.intervene.runner import check_unsupported
     from probe_kit.intervene.store.answers import is_stored
-    from probe_kit.intervene.store.settings import key_of, readout_of, refuse_unfit, settings_of
+    from probe_kit.intervene.store.settings import key_of, readout_of, check_unfit, settings_of
 
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
@@ -132,8 +132,8 @@ def intervene(
          "doses": None if doses is None else tuple(map(_dose, split(doses) or ())), "toward": toward,
          "seed": seed or None},
     )  # fmt: skip
-    refuse_unfit(opened)
-    refuse_unsupported(opened, asked)
+    check_unfit(opened)
+    check_unsupported(opened, asked)
     asked.chosen(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
     source = Source(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)

@@ -13,7 +13,7 @@ from probe_kit.extract.store.format.resume_pieces import Pieces
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.registry import known_families
 from probe_kit.intervene.edits.patching import LEDGER
-from probe_kit.intervene.edits.sites import places, refuse_unplayed
+from probe_kit.intervene.edits.sites import places, check_unplayed
 from probe_kit.intervene.kinds.closed_loop.intervention import CELL
 from probe_kit.intervene.kinds.image_swap.intervention import Follow
 from probe_kit.intervene.kinds.interchange.intervention import ROLES
@@ -23,7 +23,7 @@ from probe_kit.intervene.replay.per_step import shadowed
 from probe_kit.intervene.replay.session import Bench, Progress, Source, open_bench
 from probe_kit.intervene.results.results import Effects, effects_csv, load_effects
 from probe_kit.intervene.store.answers import EXCHANGED, Answers, is_stored, save
-from probe_kit.intervene.store.settings import SHADOW, items_of, key_of, refuse_unfit, settings_of
+from probe_kit.intervene.store.settings import SHADOW, items_of, key_of, check_unfit, settings_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -49,8 +49,8 @@ def intervene_on(
     `open_bench` raises.
     """
     asked = asked or Follow()
-    refuse_unfit(run)
-    refuse_unsupported(run, asked)
+    check_unfit(run)
+    check_unsupported(run, asked)
     settings = settings_of(asked, run)
     key = key_of(settings)
     if is_stored(run.location, key):
@@ -74,7 +74,7 @@ def _carry_out(
     wanted = items_of(run, asked)
     with open_bench(run, source, load) as bench, bench.ready():
         bench.learning = learning or notebook_progress("items learnt from")
-        _refuse_unplayed_roles(bench, settings)
+        _check_unplayed_roles(bench, settings)
         items = asked.playable(bench, wanted)
         conditions = asked.conditions(bench)
         parts = _replayed(bench, asked, items, conditions, pieces, progress or notebook_progress("items replayed"))
@@ -94,17 +94,17 @@ def _carry_out(
     pieces.discard()
 
 
-def _refuse_unplayed_roles(bench: Bench, settings: Mapping[str, Any]) -> None:
+def _check_unplayed_roles(bench: Bench, settings: Mapping[str, Any]) -> None:
     """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it."""
     roles, sites = settings.get("roles"), settings.get("sites")
     asked = [(sites, roles)] if roles and sites else []
     asked += [([pattern], [role]) for pattern, role in (cell.split(CELL) for cell in settings.get("cells", ()))]
     for patterns, wanted in asked:
         found = [place.stream for pattern in patterns for place in places(pattern, bench.policy)]
-        refuse_unplayed(bench.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
+        check_unplayed(bench.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
 
 
-def refuse_unsupported(run: Run, asked: Intervention) -> None:
+def check_unsupported(run: Run, asked: Intervention) -> None:
     """Raise UnsupportedInterventionError, before anything is loaded, for what the run's family does not do."""
     if (family := known_families().get(run.model)) is not None:
         for kind in asked.needs:

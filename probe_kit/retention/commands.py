@@ -95,7 +95,7 @@ def retention(
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
-    _refuse_doubles([path for paths in grouped.values() for path in paths])
+    _check_doubles([path for paths in grouped.values() for path in paths])
     steps = _iterations(iterations)
     radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
     _check_places(html, figures)
@@ -133,10 +133,10 @@ def _check_places(html: Path | None, figures: Path | None) -> None:
     """Refuse places that cannot be written to before anything is computed."""
     if html is not None and html.is_dir():
         raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
-    refuse_file(figures)
+    check_file(figures)
 
 
-def refuse_file(figures: Path | None) -> None:
+def check_file(figures: Path | None) -> None:
     """Raise UsageError if figures should go to what is a file."""
     if figures is not None and figures.exists() and not figures.is_dir():
         raise UsageError(f"--figures {figures} is a file; give a folder")
@@ -165,7 +165,7 @@ def _place(path: str) -> str:
     return path.rstrip("/") if "://" in path else str(Path(path).resolve())
 
 
-def _refuse_doubles(paths: Sequence[str]) -> None:
+def _check_doubles(paths: Sequence[str]) -> None:
     """Said before anything is opened; `retention` also knows copies of a run."""
     for at, path in enumerate(paths):
         if _place(path) in map(_place, paths[:at]):

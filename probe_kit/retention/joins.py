@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.known_used import KnownUsed, join
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
@@ -39,4 +39,4 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
 
 
 def _judged(run: RunReader, table: RetentionTable) -> bool:
-    return not listened(run.episodes) and can_be_judged(run, table.rule, table.last_steps)
+    return not capture_only(run.episodes) and can_be_judged(run, table.rule, table.last_steps)

@@ -7,7 +7,7 @@ import typer
 
 from probe_kit._terminal.console import out, print_json, say
 from probe_kit.errors import NoProbesError, UsageError
-from probe_kit.retention.commands import refuse_file
+from probe_kit.retention.commands import check_file
 
 if TYPE_CHECKING:
     from probe_kit.retention.compare.known_used import KnownUsed
@@ -49,7 +49,7 @@ def join(
         if view is not None:
             raise UsageError(f"--view {view}: {acted} has no probes. Run `probe-kit train {acted}`") from None
         results = None
-    refuse_file(figures)
+    check_file(figures)
     joined = join_runs(reader, policy, results, view)
     if as_json:
         print_json(joined.to_json())

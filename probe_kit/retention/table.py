@@ -9,7 +9,7 @@ from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_episodes, mixed_settings
 from probe_kit.retention.behaviour.run_labels import distinct_labels
-from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
 from probe_kit.retention.behaviour.wordings import WordingPair, wording_pairs
 from probe_kit.retention.columns.text_table import ANSWERS, PlainTable, answer_table, gap_tables, size_table
@@ -180,7 +180,7 @@ def retention(
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
-    _refuse_doubles([run for _, run in listed])
+    _check_doubles([run for _, run in listed])
     chosen = list(keys or [None] * len(listed))
     order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
     listed, chosen = [listed[at] for at in order], [chosen[at] for at in order]
@@ -243,10 +243,10 @@ def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:
 
 
 def _heard(run: RunReader) -> bool:
-    return listened(run.episodes)
+    return capture_only(run.episodes)
 
 
-def _refuse_doubles(runs: Sequence[RunReader]) -> None:
+def _check_doubles(runs: Sequence[RunReader]) -> None:
     """A run that counts twice makes every interval too narrow; a copy of its folder is the same run."""
     seen: dict[str, str] = {}
     for run in runs:

@@ -117,7 +117,7 @@ def smallest_p(relabellings: int) -> float:
     return 1 / (1 + relabellings)
 
 
-def site_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
+def pointwise_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
     """p-value of every site on its own, (S,), from observed scores (S,) and null scores (S, P).
 
     NaN without a null.
@@ -125,7 +125,7 @@ def site_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[
     return p_value(observed, null)
 
 
-def family_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
+def max_statistic_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
     """p-value of every site (S,) against the best of all: how often the maximum of a null curve is as high.
 
     The probability that any site without signal falls below 0.05 is then at most 0.05. NaN without a null.

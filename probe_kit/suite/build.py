@@ -18,7 +18,7 @@ from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUIT
 from probe_kit.suite.generators.twins import draw_twins
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
-from probe_kit.suite.manifest import load_suite, refuse_foreign_folder, save_suite
+from probe_kit.suite.manifest import load_suite, check_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 
 Progress = Callable[[int, int], None]
@@ -45,7 +45,7 @@ def build_suite(
         known = " or ".join(map(str, SUITE_VERSIONS))
         raise UsageError(f"suite version {version}; expected {known}")
     options = _options(categories, items_per_category, seed)
-    refuse_foreign_folder(folder)
+    check_foreign_folder(folder)
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     for category in options["categories"]:

@@ -25,7 +25,7 @@ class Picture:
         return picture_file_name(self.pixels_sha256)
 
 
-class Question(TypedDict):
+class ItemDraft(TypedDict):
     """What whoever makes an item has to know of its question; see `Item`."""
 
     transfer_type: str
@@ -55,7 +55,7 @@ def make_item(
     side: Side,
     pictures: tuple[Picture, Picture],
     content: Mapping[str, Any],
-    **question: Unpack[Question],
+    **question: Unpack[ItemDraft],
 ) -> Item:
     """An item whose group is not known yet.
 

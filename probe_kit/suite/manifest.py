@@ -52,7 +52,7 @@ def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, 
     return _load_same(suite, folder)
 
 
-def refuse_foreign_folder(folder: Path) -> None:
+def check_foreign_folder(folder: Path) -> None:
     """Raises SuiteError if `folder` is in use for something that is not a suite."""
     if _is_taken(folder) and not (folder / CARD).is_file():
         raise SuiteError(
@@ -73,7 +73,7 @@ def _rename_unless_taken(draft: Path, folder: Path) -> None:
 
 
 def _load_same(suite: Suite, folder: Path) -> Suite:
-    refuse_foreign_folder(folder)
+    check_foreign_folder(folder)
     found = load_suite(folder)
     if found.identity != suite.identity:
         raise SuiteError(

@@ -74,10 +74,10 @@ def decode_picture(path: Path) -> Image.Image:
         raise SuiteError(f"{path}: there is no such picture. Restore the suite's files or build it again.")
     try:
         with _headers_of_bombs(), Image.open(path) as image:
-            _refuse_huge(image, path)
+            _check_huge(image, path)
             image.verify()  # decoding alone does not compare the checksums
         with Image.open(path) as image:
-            _refuse_deep(image, path)
+            _check_deep(image, path)
             return on_white(ImageOps.exif_transpose(image))
     except _DECODING_ERRORS as error:
         raise SuiteError(
@@ -93,7 +93,7 @@ def _headers_of_bombs() -> Iterator[None]:
         yield
 
 
-def _refuse_huge(image: Image.Image, path: Path) -> None:
+def _check_huge(image: Image.Image, path: Path) -> None:
     if max(image.size) > LARGEST_PICTURE:
         width, height = image.size
         raise SuiteError(
@@ -101,7 +101,7 @@ def _refuse_huge(image: Image.Image, path: Path) -> None:
         )
 
 
-def _refuse_deep(image: Image.Image, path: Path) -> None:
+def _check_deep(image: Image.Image, path: Path) -> None:
     if image.mode.startswith(("I", "F")):  # Pillow would clip these at 255
         raise SuiteError(f"{path}: has more than 8 bits per channel ({image.mode}). Convert it to 8-bit RGB.")
 

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from probe_kit.train.data.labels import INCOMPLETE, TARGETS, Incomplete, Target
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
-    from probe_kit.train.results.by_call import load_calls
-    from probe_kit.train.results.control_scores import BaselineScore, Controls, Excess, TwinScore
-    from probe_kit.train.results.probe_curve import Curve
+    from probe_kit.train.results.by_call import load_results_by_call
+    from probe_kit.train.results.control_scores import BaselineScore, Controls, ControlComparison, TwinScore
+    from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
     from probe_kit.train.results.store import load_results, save_results
@@ -31,9 +31,9 @@ __all__ = [
     "Baseline",
     "BaselineScore",
     "Controls",
-    "Curve",
+    "ProbeCurve",
     "Direction",
-    "Excess",
+    "ControlComparison",
     "FoldUnit",
     "Incomplete",
     "ProbeResults",
@@ -42,7 +42,7 @@ __all__ = [
     "RunReader",
     "Target",
     "TwinScore",
-    "load_calls",
+    "load_results_by_call",
     "load_results",
     "save_results",
     "train_probes",
@@ -57,9 +57,9 @@ __getattr__ = lazy_names(
         "Baseline": "controls.baselines",
         "BaselineScore": "results.control_scores",
         "Controls": "results.control_scores",
-        "Curve": "results.probe_curve",
+        "ProbeCurve": "results.probe_curve",
         "Direction": "results.probe_directions",
-        "Excess": "results.control_scores",
+        "ControlComparison": "results.control_scores",
         "FOLD_UNITS": "probe_kit.statistics.folds",
         "FoldUnit": "probe_kit.statistics.folds",
         "INCOMPLETE": "data.labels",
@@ -71,7 +71,7 @@ __getattr__ = lazy_names(
         "TARGETS": "data.labels",
         "Target": "data.labels",
         "TwinScore": "results.control_scores",
-        "load_calls": "results.by_call",
+        "load_results_by_call": "results.by_call",
         "load_results": "results.store",
         "save_results": "results.store",
         "train_probes": "probe_sweep",

@@ -8,7 +8,7 @@ import typer
 from rich.text import Text
 
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
-from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
     for view in results.settings.views:
         best = [row for _, row in peaks[peaks["view"] == view].iterrows()]
         headings = (*SITE_HEADINGS, "beats", "n")
-        table = FittingTable(
+        table = ResponsiveTable(
             title=f"Best site per stream, view {view}{mark}",
             caption="+: as many other sites tie with it",
             name="category",

@@ -66,7 +66,7 @@ def power(
 
 
 def _print(found: "list[Power]") -> None:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
     from probe_kit.statistics.significance import detectable
 
     headings = (
@@ -78,7 +78,7 @@ def _print(found: "list[Power]") -> None:
     )
     rows = [(one.above, one.chance, one.binding, one.twin, detectable(one.items)) for one in found]
     out.print(
-        FittingTable(
+        ResponsiveTable(
             title="Power: how often a signal is seen",
             caption="binding and twin at chance; a leaking control of that accuracy is red in 80 % of suites",
             name="items",

@@ -12,16 +12,16 @@ from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.controls.baselines import Baseline
 from probe_kit.train.controls.fit_controls import add_baselines, add_twin, check_twin, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
-from probe_kit.train.data.captured_call import at_call
+from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.labels import Incomplete, Target
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
-from probe_kit.train.execution.executor import CrewSettings, Key, Probed
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
-from probe_kit.train.results.resume import Unfinished
+from probe_kit.train.results.resume import SweepCheckpoint
 from probe_kit.train.results.store import is_stored, load_results, save_results, stamp_of_run
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.solver.backend import check_device
@@ -76,10 +76,10 @@ def train_probes(
     ProbeNotConvergedError, UsageError, and SuiteError for another suite.
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
-    crew = CrewSettings(jobs, device, ray)
+    crew = ExecutionSettings(jobs, device, ray)
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
-    run = at_call(run, call)
+    run = restrict_to_call(run, call)
     asked = _settings(
         run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
     )
@@ -87,7 +87,7 @@ def train_probes(
     prepared = prepare_baselines(run, controls, suite, sweep.stored)
     beside = None
     if twin is not None:
-        twin = at_call(twin, call)
+        twin = restrict_to_call(twin, call)
         other = _settings(
             twin, asked.categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
         )
@@ -134,12 +134,12 @@ class _Sweep:
     stored: ProbeResults | None
     problems: Mapping[str, CategoryProblem]
     keys: tuple[Key, ...]
-    crew: CrewSettings
+    crew: ExecutionSettings
     progress: Progress | None
 
     @classmethod
     def of(
-        cls, run: RunReader, settings: ProbeSettings, crew: CrewSettings, progress: Progress | None
+        cls, run: RunReader, settings: ProbeSettings, crew: ExecutionSettings, progress: Progress | None
     ) -> "_Sweep":
         """Nothing is probed yet, but what can be wrong is found."""
         if is_stored(run.location, settings.key):
@@ -155,7 +155,7 @@ class _Sweep:
     def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
         """Store `results` and give them as they are read back."""
         save_results(results, self.run.location, asked=asked)
-        Unfinished.of(self.run.location, self.settings.key).discard()
+        SweepCheckpoint.of(self.run.location, self.settings.key).discard()
         return load_results(self.run, self.settings.key)
 
 
@@ -213,7 +213,7 @@ def _fit(sweep: _Sweep) -> ProbeResults:
 
 def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
-    keys, unfinished = sweep.keys, Unfinished.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run))
+    keys, unfinished = sweep.keys, SweepCheckpoint.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run))
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
     progress = sweep.progress or notebook_progress("sites probed")
     columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)
@@ -227,12 +227,12 @@ def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
 
 def _curve(
     run: RunReader, problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]
-) -> Curve:
+) -> ProbeCurve:
     found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
     fold_of = np.empty(problem.labels.size, dtype=np.int64)
     for number, fold in enumerate(problem.folds):
         fold_of[fold.outer.test] = number
-    return Curve(
+    return ProbeCurve(
         sites=tuple(found),
         labels=problem.labels,
         episodes=problem.episodes,

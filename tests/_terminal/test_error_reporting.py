@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from probe_kit._terminal.error_reporting import tell
+from probe_kit._terminal.error_reporting import report_error
 from probe_kit.cli import Commands
 from probe_kit.errors import CheckpointError, WeightsError
 
@@ -74,14 +74,14 @@ def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: 
 
 def test_a_traceback_that_cannot_be_written_is_said_to_be_lost(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
-    assert tell(KeyError("x")) == 1
+    assert report_error(KeyError("x")) == 1
     assert "set TMPDIR" in capsys.readouterr().err
 
 
 def test_what_an_error_says_is_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
     error = CheckpointError("[bold]config[/] \x1b[31m")
     error.add_note("in [red]this\u202e")
-    assert tell(error) == 3
+    assert report_error(error) == 3
     said = capsys.readouterr().err
     assert "[bold]config[/] ␛[31m" in said
     assert "in [red]this\ufffd" in said

@@ -2,7 +2,7 @@
 
 import pytest
 
-from probe_kit._terminal.plain_text import visible
+from probe_kit._terminal.plain_text import terminal_safe
 
 
 @pytest.mark.parametrize(
@@ -20,9 +20,9 @@ from probe_kit._terminal.plain_text import visible
     ],
 )
 def test_nothing_is_left_that_a_terminal_obeys(hostile: str, harmless: str) -> None:
-    assert visible(hostile) == harmless
+    assert terminal_safe(hostile) == harmless
 
 
 @pytest.mark.parametrize("text", ["plain", "Δ, π and ×", "two\nlines\tand a tab", "日本語", "[bold]brackets[/]"])
 def test_ordinary_text_stays_as_it_is(text: str) -> None:
-    assert visible(text) == text
+    assert terminal_safe(text) == text

@@ -23,7 +23,7 @@ from probe_kit.intervene import stored_following
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from probe_kit.train.results.resume import Unfinished
+from probe_kit.train.results.resume import SweepCheckpoint
 from tests.support.faults import Stored
 from tests.support.little_run import write_little_run
 from tests.support.reading import readings
@@ -451,7 +451,7 @@ def test_an_interrupted_sweep_is_continued_only_from_what_it_left(run: Path) -> 
     opened = open_run(run)
     settings = train_probes(opened, permutations=3).settings
     expected = load_results(opened, settings.key).scores
-    partial = Unfinished.of(opened.location, settings.key, opened.stamp)
+    partial = SweepCheckpoint.of(opened.location, settings.key, opened.stamp)
     shutil.rmtree(run / "probes" / settings.key)
     stop_after(opened, settings.permutations, 4)
     left = sorted((run / partial.folder).iterdir())

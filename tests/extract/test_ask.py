@@ -23,11 +23,11 @@ from probe_kit.extract import (
 )
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.extract.prepared import load_reader
-from probe_kit.extract.rollout.answer_controller import AskController, AskTurn
+from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
-from probe_kit.hooks import Question, Reader, Reading, Site
+from probe_kit.hooks import Prompt, AnswerModel, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.suite import Suite, load_suite
 from tests.support.position_readers import PositionReader, always, likes
@@ -122,7 +122,7 @@ def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, a
     assert files(ask_run(pooled, tmp_path / "run").path) == files(asked.path)
 
 
-@pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"asked": "distractor"}, {"seed": 1}])
+@pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"query": "distractor"}, {"seed": 1}])
 def test_other_questions_are_another_run(settings: AskSettings, asked: Run, change: dict) -> None:
     with pytest.raises(SettingsMismatchError):
         prepare(replace(settings, tokens="pooled", **change), asked.path)
@@ -146,7 +146,7 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
     settings: AskSettings, tmp_path: Path
 ) -> None:
     class Choosy(PositionReader):
-        def read(self, questions: list[Question]) -> Reading:
+        def read(self, questions: list[Prompt]) -> Reading:
             if any("red" in own.text for own in questions) and any(own.seen.image.any() for own in questions):
                 raise InstructionError("no red, please")
             return super().read(questions)
@@ -160,12 +160,12 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 # -- controls --------------------------------------------------------------------------------------------
 
 
-def answers(settings: AskSettings, reader: Reader | None = None) -> pd.DataFrame:
+def answers(settings: AskSettings, reader: AnswerModel | None = None) -> pd.DataFrame:
     """What the run's episodes would hold, their frames being noise: no scene is needed to see whom a reader is."""
     assert settings.suite is not None
     suite = load_suite(settings.suite).select(settings.categories, settings.items)
     blank = example_observations(settings.scene, [suite.items[0].instruction])[0]
-    controller = AskController(load_reader(settings) if reader is None else reader, settings, suite, blank)
+    controller = AnswerController(load_reader(settings) if reader is None else reader, settings, suite, blank)
     noise = np.random.default_rng(0)
     turns = [
         AskTurn(one, replace(blank, image=noise.integers(0, 256, blank.image.shape, np.uint8)), NOWHERE)
@@ -215,7 +215,7 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
     seen = []
 
     class Watching(PositionReader):
-        def read(self, questions: list[Question]) -> Reading:
+        def read(self, questions: list[Prompt]) -> Reading:
             seen.extend(own.seen.image for own in questions)
             return super().read(questions)
 
@@ -228,14 +228,14 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
 
 
 def test_the_distractor_lies_on_the_other_side(settings: AskSettings) -> None:
-    episodes = answers(replace(settings, asked="distractor"), PositionReader(likes("A"), always("A")))
+    episodes = answers(replace(settings, query="distractor"), PositionReader(likes("A"), always("A")))
     assert episodes["question"][0].startswith("Do you see the red shape?")
     right = episodes["side_correct"] == "right"
     assert (episodes["outcome"] == np.where(right, "correct", "wrong")).all()
 
 
 def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
-    absent = replace(settings, asked="absent", prompt=SEEN, items=4)
+    absent = replace(settings, query="absent", prompt=SEEN, items=4)
     honest = answers(absent, PositionReader(likes("No"), always("No.")))
     assert (honest[["outcome", "outcome_logits", "outcome_debiased"]] == "correct").all().all()
     eager = answers(absent, PositionReader(likes("Yes"), always("Yes, left.")))
@@ -254,9 +254,9 @@ def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
             "acts and does not answer questions; those that do",
         ),
         ({"model": "expert", "checkpoint": None, "options": {}}, "acts and does not answer"),
-        ({"asked": "absent"}, "p1 does not ask for yes or no"),
+        ({"query": "absent"}, "p1 does not ask for yes or no"),
         ({"picture": "video"}, "picture is 'video'; expected one of frame, side-by-side, none"),
-        ({"asked": "both"}, "asked is 'both'"),
+        ({"query": "both"}, "query is 'both'"),
         ({"tokens": "some"}, "expected one of none, pooled, all"),
     ],
 )

@@ -49,7 +49,7 @@ def test_it_says_how_answers_came_and_what_to_do_next(small_suite: Suite, folder
         (("--prompt", "p3"), "no prompt 'p3'; known: seen, p1, p2"),
         (("--prompt", ","), "--prompt is empty"),
         (("--picture-size", "big"), "not WIDTHxHEIGHT"),
-        (("--ask", "absent", "--prompt", "p2"), "p2 does not ask for yes or no"),
+        (("--query", "absent", "--prompt", "p2"), "p2 does not ask for yes or no"),
         (("--batch", "0"), "batch is 0; expected at least 1"),
     ],
 )

@@ -67,13 +67,13 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
     settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, scene=SHORT, items=2, env_workers=0)
     plain = extract_run(settings, tmp_path / "plain")
     asked = replace(settings, env_workers=None, calibrate=True)
-    rehearse, tried = PolicyController.rehearse, set[int]()
+    run_preflight, tried = PolicyController.run_preflight, set[int]()
 
     def counted(controller: PolicyController, observations: list, seeds: list) -> None:  # type: ignore[type-arg]
         tried.add(len(observations))
-        rehearse(controller, observations, seeds)
+        run_preflight(controller, observations, seeds)
 
-    monkeypatch.setattr(PolicyController, "rehearse", counted)
+    monkeypatch.setattr(PolicyController, "run_preflight", counted)
     monkeypatch.setattr(calibration, "largest_batch", lambda _of_card, episodes: largest_batch(1, episodes))
     extraction = prepare(asked, tmp_path / "run")
     assert tried == {1}

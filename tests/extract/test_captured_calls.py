@@ -20,7 +20,7 @@ from probe_kit.retention.displays import gallery
 from probe_kit.retention.estimators.by_call import CallCurves
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from probe_kit.train.results.by_call import load_calls
+from probe_kit.train.results.by_call import load_results_by_call
 
 STREAM = StoredStream("backbone", 2, 8, None, 6, ("mean", "last", "mean:language"))
 CALLS = 3
@@ -120,7 +120,7 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
 def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     first, *_ = [train_probes(run, ("all",), permutations=5, call=call) for call in range(CALLS)]
     train_probes(run, ("all",), permutations=4, call=1)
-    calls = load_calls(run, first)
+    calls = load_results_by_call(run, first)
     assert list(calls) == list(range(CALLS))
     assert {one.settings.permutations for one in calls.values()} == {5}
     line = CallCurves.of(calls, "all", "mean").line("backbone")

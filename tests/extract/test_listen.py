@@ -31,8 +31,8 @@ ACTING = ExtractSettings(
 @pytest.fixture(scope="module")
 def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The random twin again, as in `recorded_run`, but only listened to, of one category; then probed."""
-    settings = replace(ACTING, suite=small_suite.folder, listen=True)
-    run = extract_run(settings, tmp_path_factory.mktemp("listened") / "run")
+    settings = replace(ACTING, suite=small_suite.folder, capture_only=True)
+    run = extract_run(settings, tmp_path_factory.mktemp("capture_only") / "run")
     train_probes(run, views=["mean"], permutations=5, controls=())
     return open_run(run.path)
 
@@ -59,24 +59,24 @@ def test_what_is_heard_is_what_the_acting_model_thought_first(heard: Run, record
 
 
 def test_nothing_moved_and_the_run_says_so(heard: Run) -> None:
-    assert set(heard.episodes["outcome"]) == {"listened"}
+    assert set(heard.episodes["outcome"]) == {"capture_only"}
     assert not {"cube_x", "never_moved", "side_placed", "distance_correct"} & set(heard.episodes)
-    assert heard.listened
+    assert heard.capture_only
     assert not heard.has_trajectories
-    assert "LISTENED TO" in repr(heard)
-    assert heard.settings["listen"] is True
+    assert "CAPTURE_ONLY TO" in repr(heard)
+    assert heard.settings["capture_only"] is True
     assert verify_run(heard.path, deep=True).ok
     assert heard.certificate["hooks_on_equals_hooks_off"]
 
 
 def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run, tmp_path: Path) -> None:
     table = retention([heard, recorded_run])
-    rows = [row for row in json.loads(table.to_json()) if row["listened"]]
+    rows = [row for row in json.loads(table.to_json()) if row["capture_only"]]
     assert {row["category"] for row in rows} == {"color", "mean"}
     for row in rows:
         assert [row[name] for name in ("sr", "sr_ci", "regime", "p_oob", "gap", "normalised_score")] == [None] * 6
         assert row["prefix_accuracy"] is not None
-    acting = [row for row in json.loads(table.to_json()) if not row["listened"]]
+    acting = [row for row in json.loads(table.to_json()) if not row["capture_only"]]
     assert all(row["sr"] is not None for row in acting)
     screen = StringIO()
     Console(file=screen, width=240).print(table.to_rich())
@@ -109,13 +109,13 @@ def test_a_checkpoint_of_another_arm_is_refused_for_acting_with_the_way_out(
     base: Path, small_suite: Suite
 ) -> None:
     settings = ExtractSettings("pi0", str(base), suite=small_suite.folder, items=2)
-    with pytest.raises(CheckpointError, match=r"acts in 32 dimensions.*add --listen"):
+    with pytest.raises(CheckpointError, match=r"acts in 32 dimensions.*add --no-act"):
         prepare(settings)
 
 
 def test_a_checkpoint_of_another_arm_is_listened_to(base: Path, small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings(
-        "pi0", str(base), suite=small_suite.folder, categories=("color",), items=2, listen=True, batch=3
+        "pi0", str(base), suite=small_suite.folder, categories=("color",), items=2, capture_only=True, batch=3
     )
     run = extract_run(settings, tmp_path / "run")
     assert run.settings["zeros_for"] == ["state"]
@@ -125,8 +125,8 @@ def test_a_checkpoint_of_another_arm_is_listened_to(base: Path, small_suite: Sui
 
 def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
     acting = prepare(replace(ACTING, suite=small_suite.folder)).identity()
-    assert "listen" not in acting
-    assert {key: value for key, value in heard.settings.items() if key != "listen"} == json.loads(
+    assert "capture_only" not in acting
+    assert {key: value for key, value in heard.settings.items() if key != "capture_only"} == json.loads(
         json.dumps(acting)
     )
 
@@ -134,9 +134,9 @@ def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        (ExtractSettings("pi0-tiny", listen=True, execute=2), "--execute means nothing"),
-        (ExtractSettings("pi0-tiny", listen=True, captured_calls=2, video="first"), "--captured-calls, --video"),
-        (ExtractSettings("expert", listen=True), "--listen means nothing"),
+        (ExtractSettings("pi0-tiny", capture_only=True, execute=2), "--execute means nothing"),
+        (ExtractSettings("pi0-tiny", capture_only=True, captured_calls=2, video="first"), "--captured-calls, --video"),
+        (ExtractSettings("expert", capture_only=True), "--no-act means nothing"),
     ],
 )
 def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractSettings, complaint: str) -> None:

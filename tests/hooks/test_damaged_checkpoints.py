@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, MissingExtraError, ProbeKitError, WeightsError
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.embedded.folder import embedded_checkpoint
@@ -101,7 +101,7 @@ def act(family: str, checkpoint: Path) -> Any:
     model = load(family, checkpoint)
     cameras = [need.removeprefix("camera.") for need in sorted(model.card.needs) if need.startswith("camera.")]
     told = INSTRUCTIONS.get(family, "Put the cube on the star")
-    with acting(family, model.card.checkpoint):
+    with while_acting(family, model.card.checkpoint):
         return model.act(example_observations([told], cameras), [0])
 
 
@@ -147,8 +147,8 @@ def test_every_family_of_ours_is_looked_at() -> None:
     from probe_kit.hooks.registry import known_families
 
     untouched = {"pi0-tiny-early", "pi0-tiny-state", "prismatic"}
-    acting = {name for name, one in known_families().items() if one.acts and one.loader.startswith("probe_kit.")}
-    assert acting - untouched <= FOLDERS.keys()
+    while_acting = {name for name, one in known_families().items() if one.acts and one.loader.startswith("probe_kit.")}
+    assert while_acting - untouched <= FOLDERS.keys()
 
 
 @pytest.mark.parametrize("kind", [torch.int8, torch.float8_e4m3fn, torch.complex64], ids=str)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.rollout.examples import example_observations
-from probe_kit.hooks import Policy, Reader, capture, load_model
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks import Policy, AnswerModel, capture, load_model
+from probe_kit.hooks.contract.model import Prompt
 from tests.support.every_checkpoint import WRITERS
 
 OF_LARGEST = 2e-3
@@ -42,10 +42,10 @@ def heard(family: str, place: str, device: str, options: dict[str, Any]) -> dict
     (seen,) = example_observations(SceneSpec(), ["Put the cube on the red shape"])
     with capture(model, model.sites()) as tape:
         if isinstance(model, Policy):
-            out = model.listen([seen], [0])
+            out = model.infer_without_acting([seen], [0])
         else:
-            assert isinstance(model, Reader)
-            out = model.read([Question(seen, "Which of them is red?", ("a", "b"))]).option_logits
+            assert isinstance(model, AnswerModel)
+            out = model.read([Prompt(seen, "Which of them is red?", ("a", "b"))]).option_logits
     found = {str(site): tape[site].float().cpu().numpy() for site in model.sites()}
     del model
     gc.collect()

@@ -223,7 +223,7 @@ def test_another_policy_another_suite_another_category_are_refused(
 
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"listen": True}, "listened"),
+    [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"capture_only": True}, "capture_only"),
      ({"edits": [{}]}, "edited"), ({"ask": {}, "weights_sha256": None}, "asked")],
 )  # fmt: skip
 def test_a_policy_that_did_not_act_is_not_intervened_on(copy: Run, changed: dict[str, object], why: str) -> None:

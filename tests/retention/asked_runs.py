@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from probe_kit.hooks import Site
-from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings
+from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, ProbeSettings
 from probe_kit.train.results.probe_results import episodes_sha256
 
 SUITE = "suite@1#0123456789ab"
@@ -88,7 +88,7 @@ def probes(
         own = run.episodes[run.episodes["category"] == category]
         labels = (own["side_correct"] == "left").to_numpy()
         right = draw.random((len(shares), len(own))) < np.array(shares)[:, None]
-        curves[category, "mean"] = Curve(
+        curves[category, "mean"] = ProbeCurve(
             sites=tuple(Site("backbone", layer) for layer in range(len(shares))),
             labels=labels,
             episodes=own["episode_id"].to_numpy(dtype=str),

@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site
-from probe_kit.train import ArrayRun, Curve, ProbeResults, ProbeSettings, save_results
+from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, ProbeSettings, save_results
 from probe_kit.train.results.probe_results import episodes_sha256
 
 
@@ -42,7 +42,7 @@ def curve(
     expert: Sequence[Sequence[float]],
     null_top: float = 0.6,
     action_stream: str = "expert",
-) -> Curve:
+) -> ProbeCurve:
     """One backbone accuracy per layer and one expert accuracy per iteration and layer; nulls up to `null_top`."""
     sites = [Site("backbone", layer) for layer in range(len(backbone))]
     sites += [
@@ -56,7 +56,7 @@ def curve(
     # The same number of right decisions for the same share, so that accuracies are exactly as asked.
     rank = generator.permuted(np.tile(np.arange(len(episodes)), (len(sites), 1)), axis=1)
     right = rank < np.round(share * len(episodes))[:, None]
-    return Curve(
+    return ProbeCurve(
         sites=tuple(sites),
         labels=labels,
         episodes=episodes["episode_id"].to_numpy(dtype=str),
@@ -70,7 +70,7 @@ def curve(
 
 
 @pytest.fixture
-def curve_of() -> Callable[..., Curve]:
+def curve_of() -> Callable[..., ProbeCurve]:
     return curve
 
 

@@ -23,7 +23,7 @@ from probe_kit.retention.estimators.bootstrap_draws import average, probe_estima
 from probe_kit.retention.estimators.combined import area_fit, bounded_fit
 from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
 from probe_kit.statistics.bootstrap import group_bootstrap
-from probe_kit.train import ArrayRun, Curve, load_results
+from probe_kit.train import ArrayRun, ProbeCurve, load_results
 from probe_kit.train.controls.fit_controls import add_twin
 
 ProbedRun = Callable[..., ArrayRun]
@@ -142,7 +142,7 @@ def test_a_band_of_few_relabellings_is_not_drawn(probed_run: ProbedRun) -> None:
 @pytest.mark.parametrize(("backbone", "expert"), [(1.0, 1.0), (0.95, 0.75), (0.8, 0.6)])
 @pytest.mark.parametrize("items", [3, 6, 8, 30])
 def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
-    curve_of: Callable[..., Curve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
+    curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
     expert: float,
 ) -> None:  # fmt: skip
     curve = curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]])
@@ -166,7 +166,7 @@ def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
 
 
 def test_six_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_mean_and_difference_with_them(
-    curve_of: Callable[..., Curve], outcome_table: Callable[..., pd.DataFrame]
+    curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame]
 ) -> None:
     few, many = (curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]) for items in (6, 60))
     scores = [measure_retention(one) for one in (few, many)]

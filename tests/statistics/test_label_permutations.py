@@ -2,10 +2,10 @@ import numpy as np
 
 from probe_kit.statistics.label_permutations import (
     exchange_groups,
-    family_p,
+    max_statistic_p,
     flip_groups,
     flip_items,
-    site_p,
+    pointwise_p,
     smallest_p,
 )
 
@@ -77,14 +77,14 @@ def test_the_same_seed_gives_the_same_relabellings() -> None:
 
 def test_p_counts_the_real_labels_among_the_draws() -> None:
     null = np.array([[0.5, 0.6, 0.7], [0.4, 0.5, 0.5]])
-    assert site_p(np.array([0.65, 0.9]), null).tolist() == [2 / 4, 1 / 4]
+    assert pointwise_p(np.array([0.65, 0.9]), null).tolist() == [2 / 4, 1 / 4]
 
 
 def test_family_wise_p_compares_with_the_best_site() -> None:
     null = np.array([[0.5, 0.6, 0.5], [0.4, 0.5, 0.7]])
-    assert family_p(np.array([0.65, 0.55]), null).tolist() == [2 / 4, 3 / 4]
+    assert max_statistic_p(np.array([0.65, 0.55]), null).tolist() == [2 / 4, 3 / 4]
 
 
 def test_p_is_missing_without_relabellings() -> None:
-    assert np.isnan(site_p(np.array([0.9]), np.empty((1, 0)))).all()
-    assert np.isnan(family_p(np.array([0.9]), np.empty((1, 0)))).all()
+    assert np.isnan(pointwise_p(np.array([0.9]), np.empty((1, 0)))).all()
+    assert np.isnan(max_statistic_p(np.array([0.9]), np.empty((1, 0)))).all()

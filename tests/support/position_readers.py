@@ -5,24 +5,24 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from torch import nn
 
-from probe_kit.hooks import Card, Observation, Question, Reader, Reading, Roles, Site, Stream, Tap
+from probe_kit.hooks import ModelCard, Observation, Prompt, AnswerModel, Reading, Roles, Site, Stream, Tap
 
 Liking = Callable[[str, str], float]
 """The logit of an option (without its lead) behind a question."""
 
 
-class PositionReader(Reader):
+class PositionReader(AnswerModel):
     """Says what it likes best. liking: logit of every option. said: the text that is spoken, by question."""
 
     def __init__(self, liking: Liking, said: Callable[[str], str]) -> None:
-        self.card = Card(
+        self.card = ModelCard(
             "stub", "none", "0" * 64, False, 1, "float32", "cpu", "none", ("primary",), 0, 0, settings={}
         )
         self.streams: Mapping[str, Stream] = {"backbone": Stream("backbone", 1, 1, quantities=("residual",))}
         self.role_names = {"backbone": ("image.primary", "language")}
         self._liking, self._said = liking, said
 
-    def read(self, questions: Sequence[Question]) -> Reading:
+    def read(self, questions: Sequence[Prompt]) -> Reading:
         logits = [[self._liking(own.text, option.strip()) for option in own.options] for own in questions]
         return Reading(np.array(logits, np.float32), np.full(len(logits), 0.9, np.float32), list(questions))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from probe_kit.statistics.label_permutations import family_p, flip_groups, site_p
+from probe_kit.statistics.label_permutations import max_statistic_p, flip_groups, pointwise_p
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
@@ -25,7 +25,7 @@ def p_values(seed: int, sites: int, relabellings: int) -> tuple[np.ndarray, np.n
     ]
     accuracy = np.array([correctness(probe.decisions, LABELS).mean() for probe in probes])
     null = np.stack([probe.null for probe in probes])
-    return site_p(accuracy, null), family_p(accuracy, null)
+    return pointwise_p(accuracy, null), max_statistic_p(accuracy, null)
 
 
 def test_p_values_without_signal_are_uniform_or_larger() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from probe_kit.train.crossval.site_probe import STRENGTHS
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 SHAPES = {"count": st.integers(8, 40), "width": st.integers(1, 60), "seed": st.integers(0, 2**31)}
 
@@ -23,7 +23,7 @@ def problem(count: int, width: int, seed: int, columns: int) -> tuple[np.ndarray
 
 def decisions(samples: np.ndarray | torch.Tensor, labels: np.ndarray) -> np.ndarray:
     """(C, N, K) of the training samples."""
-    coordinates = Coordinates.fit(samples)
+    coordinates = Projection.fit(samples)
     inside = coordinates(samples)
     path = LogisticSolver(coordinates.train).path(labels, STRENGTHS)
     return np.stack([np.asarray(inside @ weights) for weights in path])

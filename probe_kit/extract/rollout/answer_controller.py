@@ -25,7 +25,7 @@ from probe_kit.suite.wording import side_words
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-    from probe_kit.hooks import Question, Reader, Reading, Roles
+    from probe_kit.hooks import Prompt, AnswerModel, Reading, Roles
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,17 @@ class Forced:
     near_tie: bool
 
 
-class AskController:
+class AnswerController:
     """Asks a reader, and captures the first inference of every episode unless nothing is stored.
 
     identity: `begun` is how the answer had begun where sides were forced in words.
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
-    def __init__(self, reader: "Reader", settings: AskSettings, suite: Suite, blank: Observation) -> None:
+    def __init__(self, reader: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
         """blank: an observation as the scene will show them."""
         self.reader, self._settings, self.template = reader, settings, settings.prompt
-        self._phrases = phrases(suite, settings.asked, settings.seed)
+        self._phrases = phrases(suite, settings.query, settings.seed)
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
         card = reader.card
         self.script: str | None = None
@@ -126,14 +126,14 @@ class AskController:
         picture = side_by_side(turn.planned.episode, self._settings.scene.picture_shape)
         return replace(turn.seen, image=picture)
 
-    def _questions(self, shown: Sequence[Observation], named: Sequence[Phrase], order: Order) -> list["Question"]:
+    def _questions(self, shown: Sequence[Observation], named: Sequence[Phrase], order: Order) -> list["Prompt"]:
         """As the answer is spoken; the logits of its options are those of how it begins."""
-        from probe_kit.hooks import Question
+        from probe_kit.hooks import Prompt
 
         pictured = self._settings.picture != "none"
         options = tuple(self._spoken_options(order))
         return [
-            Question(seen, self.template.render(phrase, order), options, pictured=pictured)
+            Prompt(seen, self.template.render(phrase, order), options, pictured=pictured)
             for seen, phrase in zip(shown, named, strict=True)
         ]
 
@@ -145,7 +145,7 @@ class AskController:
         first, second = sides(order)
         return {f"{lead}A": first, f"{lead}B": second}
 
-    def _read(self, questions: Sequence["Question"], buffers: "Mapping[int, EpisodeBuffers]") -> "Reading":
+    def _read(self, questions: Sequence["Prompt"], buffers: "Mapping[int, EpisodeBuffers]") -> "Reading":
         if not buffers:
             return self.reader.read(questions)
         return self._capturer.run(
@@ -155,7 +155,7 @@ class AskController:
             buffers,
         )
 
-    def _forced(self, questions: Sequence["Question"], reading: "Reading", order: Order) -> list[Forced]:
+    def _forced(self, questions: Sequence["Prompt"], reading: "Reading", order: Order) -> list[Forced]:
         """The choice between the admissible answers; one in words takes a prefill of its own."""
         meaning: Mapping[str, Said] = self._spoken_options(order)
         if self._form is not None:
@@ -178,7 +178,7 @@ class AskController:
         self, turn: AskTurn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
     ) -> dict[str, Any]:
         episode = turn.planned.episode
-        expected = side_expected(self._settings.asked, episode.side_correct)
+        expected = side_expected(self._settings.query, episode.side_correct)
         choice = Choice([own.logits for own in forced])
         columns: dict[str, Any] = {}
         for order, text in zip(self.template.orders, spoken, strict=True):
@@ -208,7 +208,7 @@ class AskController:
             "side_word": self._item_has_side_word[episode.item.item_id] or bool(side_words(phrase.text)),
         }
 
-    def _sizes(self, questions: Sequence["Question"]) -> list[dict[str, int]]:
+    def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
         """How long each prompt was; the last position lies outside the backbone's stream."""
         rows = self._backbone_roles(questions)
         return [
@@ -216,13 +216,13 @@ class AskController:
             for row in rows
         ]
 
-    def _backbone_roles(self, questions: Sequence["Question"]) -> "list[Roles]":
+    def _backbone_roles(self, questions: Sequence["Prompt"]) -> "list[Roles]":
         backbone = next(name for name, own in self.reader.streams.items() if own.part == "backbone")
         return self.reader.asked_roles(questions)[backbone]
 
     # -- beforehand --------------------------------------------------------------------------------------
 
-    def _blank_questions(self, blank: Observation) -> list["Question"]:
+    def _blank_questions(self, blank: Observation) -> list["Prompt"]:
         named = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
         return self._questions([blank] * len(named), named, "original")
 
@@ -240,11 +240,11 @@ class AskController:
         """The first form in which the sides differ in their first token; None where options are letters or yes.
 
         One question about a blank picture is asked: what is wrong with prompt and options is said before any
-        episode. Raises UsageError as `Reader.read` does.
+        episode. Raises UsageError as `AnswerModel.read` does.
         """
         questions = self._blank_questions(blank)[:1]
         self.reader.read(questions)
-        if self.template.lettered or self._settings.asked == "absent":
+        if self.template.lettered or self._settings.query == "absent":
             return None
         lead = self.reader.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""

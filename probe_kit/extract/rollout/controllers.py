@@ -15,7 +15,7 @@ from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
@@ -66,10 +66,10 @@ class ActingController(Controller, Protocol):
     """Acts.
 
     flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
-    listens: whether what `act` gives is only to be heard, and episodes end with it.
+    capture_only: whether what `act` gives is only to be heard, and episodes end with it.
     """
 
-    listens: bool
+    capture_only: bool
     flagged: NDArray[np.bool_] | None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -87,7 +87,7 @@ class ScriptedController:
         self.streams: list[StoredStream] = []
         self.script: str | None = name
         self.threads: int | None = None
-        self.on_gpu = self.listens = False
+        self.on_gpu = self.capture_only = False
         self.flagged: NDArray[np.bool_] | None = None
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -105,7 +105,7 @@ class ScriptedController:
 class PolicyController:
     """Infers, executes the head of the chunk, and captures the first inferences of every episode.
 
-    One that listens infers and captures once per episode; nothing is executed.
+    One that capture_only infers and captures once per episode; nothing is executed.
     """
 
     def __init__(
@@ -118,15 +118,15 @@ class PolicyController:
         with_tokens: bool,
         edits: Sequence[Edit] = (),
         vectors: Vectors | None = None,
-        listens: bool = False,
+        capture_only: bool = False,
     ) -> None:
         """examples: an observation per instruction of the suite, as the scene will show them."""
-        self.policy, self.listens = policy, listens
-        self._infer = policy.listen if listens else policy.act
+        self.policy, self.capture_only = policy, capture_only
+        self._infer = policy.infer_without_acting if capture_only else policy.act
         self.execute = execute or policy.card.execute
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
-        with acting(name, policy.card.checkpoint):
+        with while_acting(name, policy.card.checkpoint):
             self.streams = stored_streams(policy, policy.roles(examples))
         self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
         card = policy.card
@@ -143,7 +143,7 @@ class PolicyController:
         }
         if card.settings:
             self.identity["policy"] = dict(card.settings)
-        if listens and (deaf := policy.deaf_to()):
+        if capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._ledger: list[dict[str, Any]] = []
@@ -153,7 +153,7 @@ class PolicyController:
 
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
-        with acting(self.identity["model"], self.policy.card.checkpoint):
+        with while_acting(self.identity["model"], self.policy.card.checkpoint):
             return self._act(turns)
 
     def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
@@ -172,13 +172,13 @@ class PolicyController:
             with self._edited(observations):
                 chunks = self._infer(observations, seeds)
         self.flagged = self.policy.flagged
-        if not self.listens:
+        if not self.capture_only:
             _check_chunks(chunks, len(turns))
         return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
 
-    def rehearse(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
+    def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
-        with acting(self.identity["model"], self.policy.card.checkpoint):
+        with while_acting(self.identity["model"], self.policy.card.checkpoint):
             self._infer(observations, list(seeds))
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
@@ -190,7 +190,7 @@ class PolicyController:
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
         exponent = self.policy.card.ensemble
-        if exponent is None or self.listens:
+        if exponent is None or self.capture_only:
             return chunk[: self.execute]
         turn.past.append(chunk)
         return ensemble(turn.past, exponent)[None]

@@ -119,7 +119,7 @@ def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[A
     return locked.view(dtype).reshape(shape)
 
 
-class Ring:
+class BufferPool:
     """A fixed number of buffers. Waiting for a free one is what keeps a GPU from outrunning the disk."""
 
     def __init__(self, buffers: Sequence[EpisodeBuffers]) -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.controllers import ActingController, Turn
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
-from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, Question
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
+from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
 from probe_kit.hooks.contract.observation import Observation
@@ -51,7 +51,7 @@ class Failure:
     reason: str
 
 
-class Seat:
+class EpisodeSlot:
     """One place in a batch: a stage and the episode on it, if any.
 
     following: what its stage begins by itself when the episode ends, while the policy thinks for others.
@@ -69,7 +69,7 @@ class Seat:
         self.instruction_ids: Sequence[int] | None = None
         self.past: list[NDArray[np.float32]] = []
 
-    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: Question | None) -> None:
+    def start(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
         """Take an episode up; begin: the question that begins it, None if the stage does so already."""
         self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
         self.flagged, self.instruction_ids, self.past = None, None, []
@@ -83,7 +83,7 @@ class Seat:
         assert self.seen is not None
         return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
 
-    def go_on(self, actions: NDArray[np.float32], flagged: bool | None, then: Question | None) -> None:
+    def advance(self, actions: NDArray[np.float32], flagged: bool | None, then: StageRequest | None) -> None:
         """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""
         self.seen = None
         self.calls += 1
@@ -91,7 +91,7 @@ class Seat:
             self.flagged = (self.flagged or 0) + flagged
         self.stage.ask("advance", actions, then=then)
 
-    def hear_out(self, then: Question | None) -> None:
+    def end_without_acting(self, then: StageRequest | None) -> None:
         """The model was heard; the episode ends before anything moves."""
         self.seen = None
         self.calls += 1
@@ -107,103 +107,103 @@ class Seat:
         self.planned, self.seen = None, None
 
 
-class Play:
+class EpisodeLoop:
     """Plays episode after episode on two groups of stages.
 
-    next_episode: what to play next, None for nothing. All seats of a group take their turn in one call of the
-    policy; a seat whose episode ends begins the next one at once.
+    next_episode: what to play next, None for nothing. All slots of a group take their turn in one call of the
+    policy; a slot whose episode ends begins the next one at once.
     """
 
     def __init__(
-        self, stages: Sequence[AskableStage], controller: ActingController, ring: Ring,
+        self, stages: Sequence[AskableStage], controller: ActingController, ring: BufferPool,
         next_episode: Callable[[], PlannedEpisode | None], film: Callable[[PlannedEpisode], bool],
     ) -> None:  # fmt: skip
-        seats = [Seat(stage) for stage in stages]
-        self._groups = [seats[: len(seats) // 2], seats[len(seats) // 2 :]]
-        self._controller, self._ring = controller, ring
+        slots = [EpisodeSlot(stage) for stage in stages]
+        self._groups = [slots[: len(slots) // 2], slots[len(slots) // 2 :]]
+        self._controller, self._pool = controller, ring
         self._next_episode, self._film = next_episode, film
 
     def __iter__(self) -> Iterator[Rollout | Failure]:
         """Rollouts in the order they end."""
         for group in self._groups:
-            for seat in group:
-                self._begin_next(seat)
-        while any(seat.planned for group in self._groups for seat in group):
+            for slot in group:
+                self._begin_next(slot)
+        while any(slot.planned for group in self._groups for slot in group):
             for group in self._groups:
                 yield from self._settle(group)
                 yield from self._infer(group)
 
-    def _begin_next(self, seat: Seat, *, ended: bool = False) -> None:
+    def _begin_next(self, slot: EpisodeSlot, *, ended: bool = False) -> None:
         """ended: whether the stage came to an end by itself, and so began what follows if it knew of any."""
-        planned, begun = seat.following, ended
+        planned, begun = slot.following, ended
         if planned is None:
             planned, begun = self._next_episode(), False
-        seat.following = None
+        slot.following = None
         if planned is None:
-            seat.leave()
+            slot.leave()
         else:
-            seat.sit(planned, self._ring.take(), None if begun else self._beginning(planned))
+            slot.start(planned, self._pool.take(), None if begun else self._beginning(planned))
 
-    def _beginning(self, planned: PlannedEpisode) -> Question:
+    def _beginning(self, planned: PlannedEpisode) -> StageRequest:
         return "begin", (planned, self._film(planned))
 
-    def _then(self, seat: Seat) -> Question | None:
-        """What the seat's stage is to begin if its episode ends now."""
-        if seat.following is None:
-            seat.following = self._next_episode()
-        return None if seat.following is None else self._beginning(seat.following)
+    def _then(self, slot: EpisodeSlot) -> StageRequest | None:
+        """What the slot's stage is to begin if its episode ends now."""
+        if slot.following is None:
+            slot.following = self._next_episode()
+        return None if slot.following is None else self._beginning(slot.following)
 
-    def _settle(self, group: list[Seat]) -> Iterator[Rollout | Failure]:
+    def _settle(self, group: list[EpisodeSlot]) -> Iterator[Rollout | Failure]:
         """Collect answers until the group can take its turn together.
 
         If all its episodes ended at once, and no stage has begun the next one, that is done during the other
         group's turn.
         """
-        while waiting := [seat for seat in group if seat.planned and not seat.seen]:
-            for seat in waiting:
-                assert seat.planned is not None
+        while waiting := [slot for slot in group if slot.planned and not slot.seen]:
+            for slot in waiting:
+                assert slot.planned is not None
                 try:
-                    answer = seat.stage.answer()
+                    answer = slot.stage.answer()
                 except EPISODE_ERRORS as error:
-                    yield self._give_up(seat, error)
+                    yield self._give_up(slot, error)
                     continue
                 if isinstance(answer, Observation):
-                    seat.seen = answer
+                    slot.seen = answer
                 else:
                     assert isinstance(answer, Ending)
-                    outcome = {**answer.outcome, **seat.counts}
+                    outcome = {**answer.outcome, **slot.counts}
                     yield Rollout(
-                        seat.planned, outcome, seat.buffers, answer.frames, answer.ends, answer.trajectory,
-                        seat.instruction_ids,
+                        slot.planned, outcome, slot.buffers, answer.frames, answer.ends, answer.trajectory,
+                        slot.instruction_ids,
                     )  # fmt: skip
-                    self._begin_next(seat, ended=True)
-            if not any(seat.seen or (seat.planned and seat.ahead) for seat in group):
+                    self._begin_next(slot, ended=True)
+            if not any(slot.seen or (slot.planned and slot.ahead) for slot in group):
                 return
 
-    def _infer(self, group: list[Seat]) -> Iterator[Failure]:
-        due = [seat for seat in group if seat.seen]
+    def _infer(self, group: list[EpisodeSlot]) -> Iterator[Failure]:
+        due = [slot for slot in group if slot.seen]
         if not due:
             return
         try:
-            turns = [seat.turn() for seat in due]
+            turns = [slot.turn() for slot in due]
             chunks = self._controller.act(turns)
         except EPISODE_ERRORS as error:
-            for seat in due:
-                yield self._give_up(seat, error)
+            for slot in due:
+                yield self._give_up(slot, error)
             return
-        for seat, turn in zip(due, turns, strict=True):
+        for slot, turn in zip(due, turns, strict=True):
             if turn.call == 0:
-                seat.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
+                slot.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
         flags = self._controller.flagged
-        for row, (seat, actions) in enumerate(zip(due, chunks, strict=True)):
+        for row, (slot, actions) in enumerate(zip(due, chunks, strict=True)):
             if self._controller.listens:
-                seat.hear_out(self._then(seat))
+                slot.end_without_acting(self._then(slot))
             else:
-                seat.go_on(actions, None if flags is None else bool(flags[row]), self._then(seat))
+                slot.advance(actions, None if flags is None else bool(flags[row]), self._then(slot))
 
-    def _give_up(self, seat: Seat, error: ProbeKitError) -> Failure:
-        assert seat.planned is not None
-        failure = Failure(seat.planned, f"{type(error).__name__}: {error}")
-        self._ring.give_back(seat.buffers)
-        self._begin_next(seat)
+    def _give_up(self, slot: EpisodeSlot, error: ProbeKitError) -> Failure:
+        assert slot.planned is not None
+        failure = Failure(slot.planned, f"{type(error).__name__}: {error}")
+        self._pool.give_back(slot.buffers)
+        self._begin_next(slot)
         return failure

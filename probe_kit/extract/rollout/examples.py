@@ -6,7 +6,7 @@ import numpy as np
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.observation import Observation
 
 
@@ -16,7 +16,7 @@ def example_observations(scene: SceneSpec, instructions: Iterable[str]) -> list[
     return [Observation(blank, state, text, scene.intrinsics) for text in instructions]
 
 
-def refuse_unfit(card: Card, batch: int, example: Observation) -> None:
+def check_unfit(card: ModelCard, batch: int, example: Observation) -> None:
     """Raise UsageError if a model takes smaller batches, or needs what the scene does not show."""
     if card.batch is not None and batch > card.batch:
         raise UsageError(

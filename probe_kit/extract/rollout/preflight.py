@@ -11,7 +11,7 @@ EPISODES = 3
 """If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
 
 
-def rehearse(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> None:
+def run_preflight(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> None:
     """Set up the first episode, or the next ones if its start cannot be reached.
 
     Raises SceneError if none of the first episodes can be set up, such as for an arm whose meshes are not

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator, Sequence
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.rollout.answer_controller import AskController, AskTurn
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
+from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 
 
 class _Chair:
@@ -18,7 +18,7 @@ class _Chair:
         self.stage = stage
         self.planned: PlannedEpisode | None = None
 
-    def sit(self, planned: PlannedEpisode, buffers: EpisodeBuffers) -> None:
+    def start(self, planned: PlannedEpisode, buffers: EpisodeBuffers) -> None:
         self.planned, self.buffers = planned, buffers
         self.stage.ask("look", planned)
 
@@ -30,12 +30,12 @@ class Asking:
     """
 
     def __init__(
-        self, stages: Sequence[AskableStage], controller: AskController, ring: Ring,
+        self, stages: Sequence[AskableStage], controller: AnswerController, ring: BufferPool,
         next_episode: Callable[[], PlannedEpisode | None],
     ) -> None:  # fmt: skip
         chairs = [_Chair(stage) for stage in stages]
         self._groups = [chairs[: len(chairs) // 2], chairs[len(chairs) // 2 :]]
-        self._controller, self._ring, self._next_episode = controller, ring, next_episode
+        self._controller, self._pool, self._next_episode = controller, ring, next_episode
 
     def __iter__(self) -> Iterator[Rollout | Failure]:
         """Rollouts in the order they end."""
@@ -51,7 +51,7 @@ class Asking:
         if planned is None:
             chair.planned = None
         else:
-            chair.sit(planned, self._ring.take())
+            chair.start(planned, self._pool.take())
 
     def _ask(self, group: Sequence[_Chair]) -> Iterator[Rollout | Failure]:
         """One round: everything that is set up is asked about in one call, and the next episodes begin."""
@@ -69,7 +69,7 @@ class Asking:
         if not due:
             return
         try:
-            with acting(self._controller.identity["model"], self._controller.reader.card.checkpoint):
+            with while_acting(self._controller.identity["model"], self._controller.reader.card.checkpoint):
                 outcomes = self._controller.ask([turn for _, turn, _ in due])
         except EPISODE_ERRORS as error:
             for chair, turn, _ in due:
@@ -80,6 +80,6 @@ class Asking:
             self._begin_next(chair)
 
     def _give_up(self, chair: _Chair, planned: PlannedEpisode, error: ProbeKitError) -> Failure:
-        self._ring.give_back(chair.buffers)
+        self._pool.give_back(chair.buffers)
         self._begin_next(chair)
         return Failure(planned, f"{type(error).__name__}: {error}")

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.rollout.controllers import SCRIPTED
 from probe_kit.extract.settings import ExtractSettings, RunSettings
-from probe_kit.hooks.checkpoints.third_party import whose
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.checkpoints.third_party import with_origin
+from probe_kit.hooks.contract.card import ModelCard
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-def refuse_meaningless(settings: RunSettings) -> None:
+def check_meaningless(settings: RunSettings) -> None:
     """Raise UsageError for what has no effect: a scripted policy has no weights, no chunks and no activations."""
     if settings.weights_seed and not settings.random_weights:
         raise UsageError(
@@ -21,12 +21,12 @@ def refuse_meaningless(settings: RunSettings) -> None:
         )
     if not isinstance(settings, ExtractSettings):
         return
-    if settings.listen:
-        _refuse_acting(settings)
+    if settings.capture_only:
+        _check_acting(settings)
     if settings.model not in SCRIPTED:
         return
     asked = {
-        "--listen": settings.listen,
+        "--no-act": settings.capture_only,
         "--checkpoint": settings.checkpoint is not None,
         "--random-weights": settings.random_weights,
         "--batch": settings.batch != 1 or settings.calibrate,
@@ -43,7 +43,7 @@ def refuse_meaningless(settings: RunSettings) -> None:
         )
 
 
-def _refuse_acting(settings: ExtractSettings) -> None:
+def _check_acting(settings: ExtractSettings) -> None:
     acting = {
         "--captured-calls": settings.captured_calls != 1,
         "--execute": settings.execute is not None,
@@ -51,24 +51,24 @@ def _refuse_acting(settings: ExtractSettings) -> None:
     }
     if meaningless := [option for option, given in acting.items() if given]:
         raise UsageError(
-            f"--listen hears the first inference of every episode and moves nothing, so {', '.join(meaningless)} "
+            f"--no-act hears the first inference of every episode and moves nothing, so {', '.join(meaningless)} "
             "means nothing. Leave it out"
         )
 
 
-def refuse_misfit(settings: ExtractSettings, policy: "Policy") -> None:
+def check_embodiment(settings: ExtractSettings, policy: "Policy") -> None:
     """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only listened to."""
-    if not settings.listen and (reason := policy.misfit()) is not None:
-        told = whose(reason, settings.model, policy.card.checkpoint)
+    if not settings.capture_only and (reason := policy.embodiment_mismatch()) is not None:
+        told = with_origin(reason, settings.model, policy.card.checkpoint)
         raise CheckpointError(
-            f"{told}. To capture what it thinks without acting, add --listen: the first inference of every "
+            f"{told}. To capture what it thinks without acting, add --no-act: the first inference of every "
             "episode is stored and probed as ever, and there is no success rate"
         )
 
 
-def refuse_unreachable(settings: ExtractSettings, card: Card) -> None:
+def check_unreachable(settings: ExtractSettings, card: ModelCard) -> None:
     """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
-    if settings.listen:
+    if settings.capture_only:
         return
     if settings.execute is not None and settings.execute > card.chunk:
         raise UsageError(

@@ -22,7 +22,7 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.run_layout import LISTENED
+from probe_kit.extract.run_layout import CAPTURE_ONLY
 from probe_kit.extract.store.thumbnails import Ends, shrink
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.items import Side
@@ -122,7 +122,7 @@ class Stage:
     def dismiss(self) -> Answer:
         """End the episode as it began: its model listened and does not act. There is no outcome."""
         ends = None if self._first is None else (self._first,)
-        return Ending({"outcome": LISTENED, **self._facts}, self._frames, ends)
+        return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, ends)
 
     def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
         """(H, W) where in the last picture each tile's own picture is seen."""
@@ -189,14 +189,14 @@ def _record(env: Act2AnswerEnv) -> dict[str, Any]:
     }
 
 
-Question = tuple[str, tuple[Any, ...]]
+StageRequest = tuple[str, tuple[Any, ...]]
 """A method of `Stage` and its arguments."""
 
 
 class AskableStage(Protocol):
     """A stage somewhere: asked first, answered later, so that several can work at a time."""
 
-    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+    def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
         """Start `Stage.begin`, `Stage.advance`, `Stage.dismiss` or `Stage.look`.
 
         then: what to start at once where that ends the episode, and only there; its answer is the next one.
@@ -215,7 +215,7 @@ class LocalStage:
     def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
         self._stage = Stage(scene, script, keep_ends)
 
-    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+    def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
         """Remember the question."""
         self._question, self._then = (method, arguments), then
 

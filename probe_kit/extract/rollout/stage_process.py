@@ -6,7 +6,7 @@ from typing import Any
 from probe_kit._system.child_process import Child
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
-from probe_kit.extract.rollout.stage import Answer, Ending, Question, Stage
+from probe_kit.extract.rollout.stage import Answer, Ending, StageRequest, Stage
 
 
 class ProcessStage:
@@ -20,7 +20,7 @@ class ProcessStage:
         self._child = Child("probe_kit.extract.rollout.stage_process:serve")
         self._child.connection.send(self._settings)
 
-    def ask(self, method: str, *arguments: Any, then: Question | None = None) -> None:
+    def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
         """Send the question; the child works while this process goes on."""
         try:
             self._child.connection.send(((method, arguments), then))
@@ -66,7 +66,7 @@ def serve(connection: Connection) -> None:
         stage.close()
 
 
-def _answered(stage: Stage, question: Question) -> Answer | ProbeKitError:
+def _answered(stage: Stage, question: StageRequest) -> Answer | ProbeKitError:
     method, arguments = question
     try:
         answer: Answer = getattr(stage, method)(*arguments)

@@ -14,10 +14,10 @@ from PIL import Image
 
 from probe_kit.env import save_gif
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.rollout.answer_controller import AskController
+from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, Ring
-from probe_kit.extract.rollout.episode_loop import Failure, Play, Rollout
+from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
+from probe_kit.extract.rollout.episode_loop import Failure, EpisodeLoop, Rollout
 from probe_kit.extract.rollout.events import Done, Event, Failed
 from probe_kit.extract.rollout.question_loop import Asking
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
@@ -42,7 +42,7 @@ class Worker:
     """
 
     def __init__(
-        self, writer: RunWriter, settings: RunSettings, controller: ActingController | AskController, episodes: int
+        self, writer: RunWriter, settings: RunSettings, controller: ActingController | AnswerController, episodes: int
     ) -> None:
         self._writer, self._settings, self._controller = writer, settings, controller
         self._episodes = episodes
@@ -53,7 +53,7 @@ class Worker:
             stack.enter_context(torch_threads(self._controller.threads))
             count = 2 * self._settings.batch
             self._stages = [self._open_stage(position, stack) for position in range(count)]
-            self._ring = Ring([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
+            self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
             self._opened = stack.pop_all()
         return self
@@ -76,7 +76,7 @@ class Worker:
         return EpisodeBuffers(controller.streams, settings.stored_calls, with_tokens, controller.on_gpu)
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
-        """Play what `next_number` gives until it gives None; an event per episode, when it is committed."""
+        """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""
 
         def next_episode() -> PlannedEpisode | None:
             number = next_number()
@@ -84,10 +84,10 @@ class Worker:
 
         controller, stages, ring = self._controller, self._stages, self._ring
         playing: Iterable[Rollout | Failure]
-        if isinstance(controller, AskController):
+        if isinstance(controller, AnswerController):
             playing = Asking(stages, controller, ring, next_episode)
         else:
-            playing = Play(stages, controller, ring, next_episode, self._is_filmed)
+            playing = EpisodeLoop(stages, controller, ring, next_episode, self._is_filmed)
         for played in playing:
             if isinstance(played, Failure):
                 yield Failed(played.planned.index, played.reason)

@@ -115,7 +115,7 @@ def _decisive(provenance: Provenance) -> Iterable[tuple[str, Any]]:
         yield part, provenance.get(outer, {}).get(inner) if inner else provenance.get(outer)
 
 
-def refuse_other_provenance(stored: Iterable[Provenance], here: Provenance, where: str) -> None:
+def check_other_provenance(stored: Iterable[Provenance], here: Provenance, where: str) -> None:
     """Raise SettingsMismatchError naming what differs here from what made the episodes of a run so far."""
     for one in stored:
         if different := differences([one, here]):

@@ -140,9 +140,9 @@ class Run:
         return bool(self.settings["random_weights"])
 
     @property
-    def listened(self) -> bool:
+    def capture_only(self) -> bool:
         """Whether its model was only heard and did not act: it has activations and no success rate."""
-        return bool(self.settings.get("listen"))
+        return bool(self.settings.get("capture_only"))
 
     @property
     def suite(self) -> str:

@@ -17,7 +17,7 @@ from zarr.storage import MemoryStore
 
 from probe_kit.extract.plan import Plan, PlannedEpisode
 from probe_kit.extract.run_layout import DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
-from probe_kit.extract.settings import refuse_other_plan, refuse_other_settings
+from probe_kit.extract.settings import check_other_plan, check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import create_arrays
 from probe_kit.extract.store.format.commits import read_commits, write_commit, write_failure
@@ -32,7 +32,7 @@ from probe_kit.extract.store.provenance import (
     name_of,
     provenance_here,
     read_provenances,
-    refuse_other_provenance,
+    check_other_provenance,
 )
 from probe_kit.hashing import canonical_json
 
@@ -90,7 +90,7 @@ class RunWriter:
             self.settings["tokens"] == "all",
             self.settings["codec"],
         )
-        still = "ask" in self.settings or bool(self.settings.get("listen"))
+        still = "ask" in self.settings or bool(self.settings.get("capture_only"))
         if "scene" in self.settings and not still:  # who is asked or listened to does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
@@ -106,9 +106,9 @@ class RunWriter:
         root = read_root(self.location)
         asked = {"schema_version": SCHEMA_VERSION, **self.settings}
         there = {"schema_version": root.card["schema_version"], **root.card["settings"]}
-        refuse_other_settings(there, asked, str(self.location))
+        check_other_settings(there, asked, str(self.location))
         root.check()
-        refuse_other_plan(root.plan, [episode.to_json() for episode in self.plan.episodes], str(self.location))
+        check_other_plan(root.plan, [episode.to_json() for episode in self.plan.episodes], str(self.location))
         return root
 
     @cached_property
@@ -143,7 +143,7 @@ class RunWriter:
         """
         if not allow_mixed:
             stored = read_provenances(self.root).values()
-            refuse_other_provenance(stored, self.provenance, str(self.location))
+            check_other_provenance(stored, self.provenance, str(self.location))
         self._say_who_plays()
 
     def _say_who_plays(self) -> None:

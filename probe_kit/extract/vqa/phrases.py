@@ -11,8 +11,8 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite import Item, Suite
 
-Asked = Literal["target", "distractor", "absent"]
-ASKED: Mapping[Asked, str] = {
+Query = Literal["target", "distractor", "absent"]
+QUERIES: Mapping[Query, str] = {
     "target": "the object of the instruction",
     "distractor": "the other picture's: right is the other side",
     "absent": "an object that neither picture shows: right is no",
@@ -38,30 +38,30 @@ class Phrase:
         return f"{self.article} {self.text}".strip()
 
 
-def phrases(suite: Suite, asked: Asked, seed: int = 0) -> dict[str, Phrase]:
-    """By item, what is asked for; the same in both layouts, and the same for the same seed.
+def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
+    """By item, what is query for; the same in both layouts, and the same for the same seed.
 
     Raises UsageError naming the first items for which the suite has no such phrase.
     """
-    if asked == "target":
+    if query == "target":
         return {item.item_id: Phrase.of(item) for item in suite.items}
     by_category: dict[str, list[Item]] = {}
     for item in suite.items:
         by_category.setdefault(item.category, []).append(item)
-    choose = _distractor if asked == "distractor" else _absent
+    choose = _distractor if query == "distractor" else _absent
     found = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}
     missing = [item for item in suite.items if found[item.item_id] is None]
     if missing:
         categories = ", ".join(sorted({item.category for item in missing}))
         some = ", ".join(item.item_id for item in missing[:_MOST_NAMED])
         raise UsageError(
-            f"--ask {asked}: {len(missing)} of {len(suite.items)} items, in {categories}, have no phrase for it "
-            f"({some} …): {_WHY[asked]}. Choose other --categories, or more --items of these"
+            f"--query {query}: {len(missing)} of {len(suite.items)} items, in {categories}, have no phrase for it "
+            f"({some} …): {_WHY[query]}. Choose other --categories, or more --items of these"
         )
     return {name: phrase for name, phrase in found.items() if phrase is not None}
 
 
-_WHY: Mapping[Asked, str] = {
+_WHY: Mapping[Query, str] = {
     "distractor": "no item of the category names what their other picture shows",
     "absent": "every object of the category is named by one of their pictures, or may be seen on it",
 }

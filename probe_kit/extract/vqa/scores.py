@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from probe_kit.extract.vqa.parsing import Said
-from probe_kit.extract.vqa.phrases import Asked
+from probe_kit.extract.vqa.phrases import Query
 from probe_kit.suite import Side
 from probe_kit.suite.items import other_side
 
@@ -18,11 +18,11 @@ def side_said(said: Said) -> Placed:
     return said if said in ("left", "right") else "none"
 
 
-def side_expected(asked: Asked, side_correct: Side) -> Side | None:
-    """Where what is asked for lies; None for an object that is not there."""
-    if asked == "absent":
+def side_expected(query: Query, side_correct: Side) -> Side | None:
+    """Where what is query for lies; None for an object that is not there."""
+    if query == "absent":
         return None
-    return side_correct if asked == "target" else other_side(side_correct)
+    return side_correct if query == "target" else other_side(side_correct)
 
 
 def outcome_of(said: Said, expected: Side | None) -> Outcome:

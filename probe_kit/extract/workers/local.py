@@ -9,12 +9,12 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.workers.scheduler import Scheduler
 
 
-def run_here(prepared: Prepared, writer: RunWriter, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def run_here(prepared: Prepared, writer: RunWriter, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     """Play every episode in this process, with the model that is loaded."""
     assert prepared.controller is not None
     episodes = len(writer.remaining())
     with Worker(writer, prepared.settings, prepared.controller, episodes) as worker:
         while not scheduler.finished:
             for event in worker.run(lambda: scheduler.take(0)):
-                scheduler.hear(0, event)
-                heard(event)
+                scheduler.record(0, event)
+                on_event(event)

@@ -17,7 +17,7 @@ MORE = "more"
 
 
 def run_in_processes(
-    settings: RunSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]
+    settings: RunSettings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]
 ) -> None:
     """Play the episodes in `settings.workers` processes; one that dies is replaced.
 
@@ -31,7 +31,7 @@ def run_in_processes(
             ready = wait([hand.connection for hand in crew])
             for hand in crew:
                 if hand.connection in ready:
-                    _hear(hand, scheduler, heard)
+                    _receive(hand, scheduler, on_event)
     finally:
         for hand in crew:
             hand.connection.close()  # all of them, so that they end side by side
@@ -72,22 +72,22 @@ class _Hand:
         return self._child.close()
 
 
-def _hear(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def _receive(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     try:
         message = hand.connection.recv()
     except (EOFError, ConnectionResetError):
-        _replace(hand, scheduler, heard)
+        _replace(hand, scheduler, on_event)
         return
     if isinstance(message, ProbeKitError):
         raise message
     if message == MORE:
         hand.waiting = hand.began = True
     else:
-        scheduler.hear(hand.slot, message)
-        heard(message)
+        scheduler.record(hand.slot, message)
+        on_event(message)
 
 
-def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def _replace(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     code = hand.close()
     if not hand.began:
         raise WorkerDiedError(
@@ -96,7 +96,7 @@ def _replace(hand: _Hand, scheduler: Scheduler, heard: Callable[[Event], None]) 
         )
     tell_lost(f"worker {hand.slot} ended with code {code}", len(scheduler.holds(hand.slot)))
     for event in scheduler.lose(hand.slot, f"the worker playing it ended with code {code}"):
-        heard(event)
+        on_event(event)
     hand.start()
 
 

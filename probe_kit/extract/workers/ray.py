@@ -29,17 +29,17 @@ class ClusterFullWarning(UserWarning):
     """No node of the cluster has room for a worker; the extraction waits for one."""
 
 
-def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, heard: Callable[[Event], None]) -> None:
+def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
 
     An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
     Raises MissingExtraError without Ray, UsageError if no cluster answers, and what an actor raises.
     """
-    with RayCrew(settings, run) as crew:
+    with RayWorkers(settings, run) as crew:
         while not scheduler.finished:
             crew.hand_out(scheduler)
             for event in crew.collect(scheduler):
-                heard(event)
+                on_event(event)
 
 
 class RayActor:
@@ -72,7 +72,7 @@ class RayActor:
             return error
 
 
-class RayCrew:
+class RayWorkers:
     """Actors on a cluster, as many as GPUs, or as `settings.workers` says. A context manager.
 
     Each holds a GPU, if there are any, and a core, so that nodes share them; an actor gets episodes once it has
@@ -144,7 +144,7 @@ class RayCrew:
             self._nodes[slot] = answer
             return []
         for event in answer:
-            scheduler.hear(slot, event)
+            scheduler.record(slot, event)
         return answer
 
     def _next_answer(self) -> Any:
@@ -177,7 +177,7 @@ class RayCrew:
         self._start(slot)
         events = self._committed(scheduler.holds(slot))
         for event in events:
-            scheduler.hear(slot, event)
+            scheduler.record(slot, event)
         where = "that had not begun yet" if node is None else f"on node {node}"
         why = " ".join(line for line in str(error).splitlines() if not line.startswith("\t"))  # but Ray's numbers
         tell_lost(f"a worker {where} of the Ray cluster is lost: {why}", len(scheduler.holds(slot)))

@@ -42,7 +42,7 @@ class Scheduler:
         held.add(number)
         return number
 
-    def hear(self, worker: int, event: Event) -> None:
+    def record(self, worker: int, event: Event) -> None:
         """Note what became of an episode."""
         self._held[worker].discard(event.number)
         if isinstance(event, Done):
@@ -69,5 +69,5 @@ class Scheduler:
         """Note that `worker` died with everything it held."""
         events = [Failed(number, reason) for number in sorted(self._held[worker])]
         for event in events:
-            self.hear(worker, event)
+            self.record(worker, event)
         return events

@@ -12,7 +12,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import Site
 
 
-class Tape(Mapping[Site, Tensor]):
+class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
     `tape[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the name of a
@@ -100,7 +100,7 @@ class Tape(Mapping[Site, Tensor]):
         )
 
     def __repr__(self) -> str:
-        return f"<Tape of {len(self)} sites{': ' if self._kept else ''}{self._held()}>"
+        return f"<ActivationCache of {len(self)} sites{': ' if self._kept else ''}{self._held()}>"
 
     def _repr_html_(self) -> str:
         rows = [
@@ -109,4 +109,4 @@ class Tape(Mapping[Site, Tensor]):
         ]
         columns = ("stream", "quantity", "layers", "iterations", "each (B × T × D)", "")
         note = "tape[site] or tape['backbone.03.residual'] for one of them, tape.stack(stream) for all layers"
-        return rows_html(f"Tape of {len(self)} sites", columns, rows, note)
+        return rows_html(f"ActivationCache of {len(self)} sites", columns, rows, note)

@@ -62,7 +62,7 @@ class AttentionMass:
 
 
 @contextmanager
-def attention(policy: Policy) -> Iterator[AttentionMass]:
+def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
     """Note the attention of what acts while `policy` acts once; its actions stay the same, bit for bit.
 
     Raises UnsupportedInterventionError for a family that does not tell it, CaptureError if nothing was weighed.
@@ -77,7 +77,7 @@ def attention(policy: Policy) -> Iterator[AttentionMass]:
             )
         found.by_head[block, iteration] = weights.detach().float().mean(dim=2).cpu().numpy()
 
-    with policy.weighing(note):
+    with policy.record_attention(note):
         yield found
     if not found.by_head:
         raise CaptureError(f"{policy.card.family} paid no attention in this context; act once inside of it")

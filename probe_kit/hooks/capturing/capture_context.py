@@ -19,11 +19,11 @@ from probe_kit.errors import (
     SiteFiredTooOftenError,
     SiteNeverFiredError,
 )
-from probe_kit.hooks.capturing.activation_cache import Tape
+from probe_kit.hooks.capturing.activation_cache import ActivationCache
 from probe_kit.hooks.contract.model import Model, Tap
 from probe_kit.hooks.contract.sites import Site
 
-__all__ = ["Edit", "Reduce", "Tape", "capture", "edit"]
+__all__ = ["Edit", "Reduce", "ActivationCache", "capture", "edit"]
 
 Reduce = Callable[[Site, Tensor], Tensor]
 Edit = Callable[[Tensor], Tensor]
@@ -32,7 +32,7 @@ _listening: WeakSet[Model] = WeakSet()
 
 
 @contextmanager
-def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[Tape]:
+def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[ActivationCache]:
     """Listen to `sites` while the model runs once.
 
     reduce: what to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as a
@@ -43,7 +43,7 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     """
     if model in _listening:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
-    tape = Tape()
+    tape = ActivationCache()
 
     def keep(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing).detach()
@@ -57,7 +57,7 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     for listener in listeners:
         listener.check_count()
         tape.fires[listener.name] = listener.count
-    _refuse_non_finite(tape)
+    _check_non_finite(tape)
 
 
 @contextmanager
@@ -148,7 +148,7 @@ class _Listener:
         )
 
 
-def _refuse_non_finite(tape: Tape) -> None:
+def _check_non_finite(tape: ActivationCache) -> None:
     """One question to the device for all sites, not one each: every answer waits for what it has in hand."""
     finite = [torch.isfinite(kept).all() for kept in tape._kept.values()]
     if not finite or bool(torch.stack([one.to(finite[0].device) for one in finite]).all()):

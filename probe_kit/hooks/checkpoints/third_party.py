@@ -14,7 +14,7 @@ _LONGEST = 300
 
 
 @contextmanager
-def of_checkpoint(model: str, place: str) -> Iterator[None]:
+def naming_checkpoint(model: str, place: str) -> Iterator[None]:
     """Put the model and the checkpoint's folder or hub id into the body's errors about weights, files and words.
 
     What a message already names is not said twice.
@@ -22,11 +22,11 @@ def of_checkpoint(model: str, place: str) -> Iterator[None]:
     try:
         yield
     except (CheckpointError, WeightsError, InstructionError) as error:  # the last of a tokenizer that lacks words
-        error.args = (whose(str(error), model, place),)
+        error.args = (with_origin(str(error), model, place),)
         raise
 
 
-def whose(reason: str, model: str, place: str) -> str:
+def with_origin(reason: str, model: str, place: str) -> str:
     """A reason why a checkpoint cannot be used, with the names of its model and place unless it holds them."""
     places = {place, str(Path(place))}
     rest = reason
@@ -39,13 +39,13 @@ def whose(reason: str, model: str, place: str) -> str:
 
 
 @contextmanager
-def acting(model: str, place: str) -> Iterator[None]:
+def while_acting(model: str, place: str) -> Iterator[None]:
     """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
 
     place: where its checkpoint lies, for what is found out about it this late.
     """
     try:
-        with of_checkpoint(model, place):
+        with naming_checkpoint(model, place):
             yield
     except ProbeKitError:
         raise
@@ -57,13 +57,13 @@ def acting(model: str, place: str) -> Iterator[None]:
 
 
 @contextmanager
-def loading(model: str, place: str) -> Iterator[None]:
+def while_loading(model: str, place: str) -> Iterator[None]:
     """Errors of a loader's code in the body. Raises CheckpointError naming model and checkpoint, or one of ours.
 
     A loader that ends the process raises PolicyFailedError.
     """
     try:
-        with of_checkpoint(model, place):
+        with naming_checkpoint(model, place):
             yield
     except ProbeKitError:
         raise

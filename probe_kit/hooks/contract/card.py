@@ -6,7 +6,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Card:
+class ModelCard:
     """What was really loaded.
 
     settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and

@@ -7,7 +7,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Home:
+class DefaultScene:
     """preset: of `SceneSpec.preset`. changes: its fields that differ, also when other fields are asked for."""
 
     preset: str = "bridge"
@@ -18,7 +18,7 @@ class Home:
         return ", ".join([self.preset, *(f"{name} {value}" for name, value in self.changes.items())])
 
 
-BRIDGE = Home()
+BRIDGE = DefaultScene()
 """The default scene."""
-RELEASED = Home("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
+RELEASED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
 """Of the embedded models: the released protocol's scene. Their demonstrations took at most 40 actions."""

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
-from probe_kit.hooks.checkpoints.third_party import loading, of_checkpoint
-from probe_kit.hooks.contract.default_scene import BRIDGE, Home
+from probe_kit.hooks.checkpoints.third_party import while_loading, naming_checkpoint
+from probe_kit.hooks.contract.default_scene import BRIDGE, DefaultScene
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options
 from probe_kit.hooks.contract.protocol import ProtocolRow
@@ -75,7 +75,7 @@ class Family:
     source: str | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
-    home: Home = BRIDGE
+    home: DefaultScene = BRIDGE
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -107,13 +107,13 @@ class Family:
         chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         place = self.place(checkpoint, chosen.pop(SIZE, None))
         check_machine(device, dtype)
-        with loading(self.name, self.loader):
+        with while_loading(self.name, self.loader):
             load = imported(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
-        with loading(self.name, str(place or "what it brings")):
+        with while_loading(self.name, str(place or "what it brings")):
             model: Model = load(place, device, dtype, random_weights, **chosen)
             _check_streams(model, str(place))
         # What an adapter does not say of its options itself is part of the identity all the same.
@@ -149,7 +149,7 @@ class Family:
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if place is not None and self.config_types:
-            with of_checkpoint(self.name, place):
+            with naming_checkpoint(self.name, place):
                 check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
         return chosen
 
@@ -182,7 +182,7 @@ class Family:
         path = getattr(self, purpose)
         if path is None:
             raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
-        with loading(self.name, path):
+        with while_loading(self.name, path):
             found: Callable[..., Any] = imported(path)
         return found
 

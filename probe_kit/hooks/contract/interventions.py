@@ -29,7 +29,7 @@ class Interventions:
     unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
     the actions bit for bit, which makes it a control.
     memory: whether it keeps keys and values of the prompt that what acts reads, see `Model.memory`.
-    heard_from: the first output that an edit of backbone or memory reaches through the memory: 0, or 1 where the
+    first_affected_token: the first output that an edit of backbone or memory reaches through the memory: 0, or 1 where the
     prompt's own pass already chooses the first token.
     attention: whether it tells how much attention what acts pays to every token of the prompt.
     tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
@@ -42,7 +42,7 @@ class Interventions:
     edits: Mapping[str, tuple[str, ...]] | None = None
     unread: tuple[str, ...] = ()
     memory: bool = False
-    heard_from: int = 0
+    first_affected_token: int = 0
     attention: bool = False
     tiles: bool = False
     readout: Readout = "chunk"
@@ -69,7 +69,7 @@ class Interventions:
             "kinds": [kind for kind in get_args(InterventionKind) if self.supports(kind)],
             "edits": None if self.edits is None else {name: list(own) for name, own in self.edits.items()},
             "unread": list(self.unread),
-            "heard_from": self.heard_from,
+            "first_affected_token": self.first_affected_token,
             "readout": self.readout,
             "instead": dict(self.instead),
         }

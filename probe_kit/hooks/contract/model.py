@@ -1,4 +1,4 @@
-"""The contract every model family fulfils: `Model`, and what it does: act (`Policy`), answer (`Reader`)."""
+"""The contract every model family fulfils: `Model`, and what it does: act (`Policy`), answer (`AnswerModel`)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.interventions import ALL_EDITS, Interventions
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -109,7 +109,7 @@ class Model(ABC):
     role_names: per stream, every role its tokens can play.
     """
 
-    card: Card
+    card: ModelCard
     streams: Mapping[str, Stream]
     further_streams: Mapping[str, Stream] = MappingProxyType({})
     memory: Stream | None = None
@@ -217,22 +217,22 @@ class Policy(Model):
     interventions: ClassVar[Interventions] = ALL_EDITS
     flagged: NDArray[np.bool_] | None = None
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """Why its actions cannot move this arm; None if they can. Such a policy is listened to all the same."""
         return None
 
-    def deaf_to(self) -> tuple[str, ...]:
-        """What of an observation `listen` gives it as zeros, because it reads something else in that place."""
+    def zero_filled_inputs(self) -> tuple[str, ...]:
+        """What of an observation `infer_without_acting` gives it as zeros, because it reads something else in that place."""
         return ()
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
 
-        For a policy with a `misfit`, which `act` refuses.
+        For a policy with an `embodiment_mismatch`, which `act` refuses.
         """
         return self.act(seen, seeds)
 
-    def weighing(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
+    def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
         """A context in which `note` is given what attention what acts pays; see `hooks.attention`.
 
         note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
@@ -253,13 +253,13 @@ class Policy(Model):
 
 
 @dataclass(frozen=True)
-class Question:
+class Prompt:
     """A question about an observation.
 
     text: the whole question as a person would ask it; the family puts its frame around it.
     options: how the admissible answers begin, such as letters; the logits of their first tokens are compared. They
-    stand directly behind the frame, so an option in front begins with `Reader.lead`.
-    begun: how the answer has begun already, put behind the frame; it begins with `Reader.lead` too.
+    stand directly behind the frame, so an option in front begins with `AnswerModel.lead`.
+    begun: how the answer has begun already, put behind the frame; it begins with `AnswerModel.lead` too.
     pictured: whether the picture is shown; False asks in words alone.
     """
 
@@ -276,7 +276,7 @@ class Reading:
 
     option_logits: (B, options) float32, one column per option of the questions, in their order.
     option_mass: (B,) float32 share of the next token's probability that lies on the options together.
-    state: what `Reader.speak` goes on from; nobody else looks into it.
+    state: what `AnswerModel.speak` goes on from; nobody else looks into it.
     """
 
     option_logits: NDArray[np.float32]
@@ -310,16 +310,16 @@ Measured on small models, batches against single rows: logits move by 1e-5 in fl
 """
 
 
-class Reader(Model):
+class AnswerModel(Model):
     """A model that answers questions in text. Being asked is one inference, as `capture` counts it."""
 
     @property
     def lead(self) -> str:
-        """What stands between the frame and the first word of an answer, such as a space; see `Question`."""
+        """What stands between the frame and the first word of an answer, such as a space; see `Prompt`."""
         return ""
 
     @abstractmethod
-    def read(self, questions: Sequence[Question]) -> Reading:
+    def read(self, questions: Sequence[Prompt]) -> Reading:
         """One prefill of all questions, which must have equally many options: every tap fires as promised.
 
         Questions with and without a picture do not go together in one call.
@@ -334,14 +334,14 @@ class Reader(Model):
         return np.asarray(best[:, -1] - best[:, 0] < limit) if best.shape[1] == 2 else np.zeros(len(best), bool)
 
     @staticmethod
-    def shows_pictures(questions: Sequence[Question]) -> bool:
+    def shows_pictures(questions: Sequence[Prompt]) -> bool:
         """Whether the questions are asked about their pictures. Raises UsageError if only some are."""
         shown = {question.pictured for question in questions}
         if len(shown) > 1:
             raise UsageError("some of these questions come with a picture and some without; ask them in two calls")
         return shown != {False}
 
-    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+    def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Like `roles`, of the sequences that `read` makes of these questions.
 
         A family whose prompt depends on more than a question's text, or that also acts, says so itself.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from probe_kit._terminal.notebook import facts_html
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.contract.card import Card
+    from probe_kit.hooks.contract.card import ModelCard
     from probe_kit.hooks.contract.sites import Stream
 
 
@@ -26,7 +26,7 @@ def parameters_text(parameters: int) -> str:
     return f"{parameters / 1e9:.1f} billion" if parameters >= 1e9 else f"{parameters / 1e6:.2f} million"
 
 
-def model_text(name: str, card: "Card", streams: "Mapping[str, Stream]") -> str:
+def model_text(name: str, card: "ModelCard", streams: "Mapping[str, Stream]") -> str:
     """One line: family, size, where it runs, streams; random weights in capitals."""
     random = ", RANDOM WEIGHTS" if card.random_weights else ""
     size = f"{parameters_text(card.parameters)} parameters"
@@ -35,7 +35,7 @@ def model_text(name: str, card: "Card", streams: "Mapping[str, Stream]") -> str:
     )
 
 
-def model_html(card: "Card", streams: "Mapping[str, Stream]") -> str:
+def model_html(card: "ModelCard", streams: "Mapping[str, Stream]") -> str:
     """The card's facts as a table."""
     facts = {
         "checkpoint": card.checkpoint,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import UsageError
-from probe_kit.hooks.checkpoints.third_party import in_words, loading
+from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.naming import renamed
 
@@ -113,7 +113,7 @@ def verify_reference(family: str, folder: Path) -> Verification:
     if not file.is_file():
         raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
     recorded = _read_arrays(file)
-    with loading(family, str(folder)):
+    with while_loading(family, str(folder)):
         return Verification(family, str(folder), run(folder, recorded))
 
 

@@ -110,7 +110,7 @@ def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Erase
     _check(tokens, left)
     centred, means = tokens.centred()
     usable = tokens.usable(left)
-    _refuse_more(method, min(centred.shape[2], len(left)))
+    _check_more(method, min(centred.shape[2], len(left)))
     if method.way == "leace":
         removed, read = _leace(centred, tokens.present, _answer(tokens, left), usable)
     elif method.way == "inlp":
@@ -118,7 +118,7 @@ def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Erase
     else:
         removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank)
     fitted = usable if len(removed) == usable.size else slice(None)
-    _refuse_more(method, int((np.linalg.norm(removed[fitted], axis=-1) > 0).sum(axis=1).min()))
+    _check_more(method, int((np.linalg.norm(removed[fitted], axis=-1) > 0).sum(axis=1).min()))
     return Eraser(means, removed, read, usable)
 
 
@@ -199,7 +199,7 @@ def _check(tokens: Tokens, left: NDArray[np.bool_]) -> None:
         )
 
 
-def _refuse_more(method: Method, there: int) -> None:
+def _check_more(method: Method, there: int) -> None:
     """A name says how many directions there are: it is not kept for fewer."""
     if method.rank > there:
         raise UsageError(

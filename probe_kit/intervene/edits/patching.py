@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from probe_kit.hooks import Policy, Tape
+    from probe_kit.hooks import Policy, ActivationCache
 
 
 @dataclass
@@ -90,7 +90,7 @@ class Change(Protocol):
 class Replaced:
     """By the same tokens of another inference."""
 
-    donor: "Tape"
+    donor: "ActivationCache"
     tokens: int
 
     def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
@@ -108,7 +108,7 @@ class Replaced:
 class ReplacedAlong:
     """By another inference's component along some directions; the rest stays. basis: (K, D) orthonormal."""
 
-    donor: "Tape"
+    donor: "ActivationCache"
     tokens: int
     basis: NDArray[np.float32]
 

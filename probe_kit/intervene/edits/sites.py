@@ -110,7 +110,7 @@ def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
     return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]
 
 
-def refuse_unplayed(policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]) -> None:
+def check_unplayed(policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]) -> None:
     """Raise UsageError for a wanted role that no token of these streams plays.
 
     usual: the roles that are tried if nothing is said, of which one that is there will do.

@@ -9,7 +9,7 @@ from probe_kit.intervene.kinds.instruction_swap.effects import Sensitivity
 from probe_kit.intervene.kinds.site_effects import Passing
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 
 _LEGEND = (
     "follows: goes to the correct picture, and to the other side once the two are exchanged; against: the "
@@ -17,12 +17,12 @@ _LEGEND = (
 )
 
 
-def following_table(rows: Sequence[Following], verdicts: Mapping[str, Judgement], of: str) -> "FittingTable":
+def following_table(rows: Sequence[Following], verdicts: Mapping[str, Judgement], of: str) -> "ResponsiveTable":
     """One line per category. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 
     reasons = dict.fromkeys(f"{name}: {one.reason}" for name, one in verdicts.items() if one.reason)
-    return FittingTable(
+    return ResponsiveTable(
         title=f"Is it used? {of}, pictures exchanged",
         caption="; ".join([_LEGEND, *reasons]),
         name="category",
@@ -48,11 +48,11 @@ _WORDS_LEGEND = (
 )
 
 
-def words_table(rows: Sequence[Following], steps: Sequence[Sensitivity], of: str) -> "FittingTable":
+def words_table(rows: Sequence[Following], steps: Sequence[Sensitivity], of: str) -> "ResponsiveTable":
     """One line per category. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 
-    return FittingTable(
+    return ResponsiveTable(
         title=f"Is the question read? {of}",
         caption=_WORDS_LEGEND,
         name="category",
@@ -103,12 +103,12 @@ _CHANGE_LEGEND = (
 )
 
 
-def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "FittingTable":
+def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "ResponsiveTable":
     """One line per category and change; controls stand beside what they are held against. of: model, suite."""
-    from probe_kit._terminal.responsive_table import FittingTable, Part
+    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
 
     shown = [row for row in rows if not row.is_control]
-    return FittingTable(
+    return ResponsiveTable(
         title=f"Where is it used? {of}, {kind}",
         caption=_CHANGE_LEGEND,
         name="category · change",

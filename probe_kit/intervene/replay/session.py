@@ -24,7 +24,7 @@ from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.third_party import acting
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.counterparts import twins_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
@@ -171,7 +171,7 @@ class Bench:
 
     def act(self, seen: Observation, seed: int) -> Chunk:
         """(chunk, 7): one inference, alone in its batch. Raises PolicyFailedError for what the policy raises."""
-        with acting(self.run.model, self.policy.card.checkpoint):
+        with while_acting(self.run.model, self.policy.card.checkpoint):
             return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
 
     def apart(self, question: Question, chunk: Chunk) -> float:

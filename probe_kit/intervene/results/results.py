@@ -38,7 +38,7 @@ from probe_kit.train.results.store import load_results
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit._terminal.responsive_table import FittingTable
+    from probe_kit._terminal.responsive_table import ResponsiveTable
 
 
 FOLLOW, WORDS = "follow", "words"
@@ -234,7 +234,7 @@ class Effects:
         """The table as comma-separated values with a header."""
         return self.table.to_csv(index=False)
 
-    def to_rich(self) -> "FittingTable":
+    def to_rich(self) -> "ResponsiveTable":
         """The table for a console."""
         of = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
         from probe_kit.intervene.kinds.site_table import following_table, passing_table, words_table

@@ -88,7 +88,7 @@ def key_of(settings: Mapping[str, Any]) -> str:
     return sha256_json(settings)[:12]
 
 
-def refuse_unfit(run: Run) -> None:
+def check_unfit(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
     why = None
@@ -96,7 +96,7 @@ def refuse_unfit(run: Run) -> None:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
-    elif run.listened:
+    elif run.capture_only:
         why = f"{run.model} was only listened to, because its actions cannot move this arm"
     elif settings.get("edits"):
         why = "its streams were edited already, and the stored run does not hold the vectors"

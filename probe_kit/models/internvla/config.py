@@ -97,7 +97,7 @@ class InternVLAConfig:
             cot=data.get("CoT_prompt"),
             picture=(int(size[0]), int(size[1])) if size else None,
         )
-        _refuse_unfit(config, source)
+        _check_unfit(config, source)
         return config
 
 
@@ -183,7 +183,7 @@ def _named(name: str, table: Mapping[str, tuple[int, int, int]], field: str, sou
     return table[name]
 
 
-def _refuse_unfit(config: InternVLAConfig, source: str) -> None:
+def _check_unfit(config: InternVLAConfig, source: str) -> None:
     query, head, text = config.query, config.head, config.vlm.text_config
     wrong = []
     if query.inputs != text.hidden_size:

@@ -90,10 +90,10 @@ class SpatialVLAConfig:
             padding=int(values.get("pad_token_id") or 0),
             dtype=values.get("torch_dtype") or values.get("dtype"),
         )
-        config._refuse_contradictions(int(values["projection_dim"]), source)
+        config._check_contradictions(int(values["projection_dim"]), source)
         return config
 
-    def _refuse_contradictions(self, projected: int, source: str) -> None:
+    def _check_contradictions(self, projected: int, source: str) -> None:
         width, vocabulary = int(self.text.hidden_size), int(self.text.vocab_size)
         last, patch = self.first_action + self.actions, int(self.vision.patch_size)
         wrong = {

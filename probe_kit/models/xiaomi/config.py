@@ -69,7 +69,7 @@ class XiaomiConfig:
             action_dim=int(values["action_dim"]),
             dtype=values.get("torch_dtype") or values.get("dtype"),
         )
-        _refuse_unfit(config, source)
+        _check_unfit(config, source)
         return config
 
 
@@ -83,7 +83,7 @@ def _flow(values: Mapping[str, Any]) -> FlowConfig:
     )
 
 
-def _refuse_unfit(config: XiaomiConfig, source: str) -> None:
+def _check_unfit(config: XiaomiConfig, source: str) -> None:
     """The flow transformer reads the cache of the VLM's last layers, head by head."""
     flow, text = config.flow, config.vlm.text_config
     pairs = (

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.train.data.run_reader import RunReader
 
 _MARKS: Sequence[Callable[[RunReader, int], str]] = (
@@ -38,7 +38,7 @@ def distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
 def full_names(runs: Sequence[RunReader], labels: Mapping[str, str] | None = None) -> list[str]:
     """The full names of runs, in order; labels: by location, distinct ones by default."""
     called = distinct_labels(runs) if labels is None else labels
-    return [full_name(called[str(run.location)], run.random_weights, listened(run.episodes)) for run in runs]
+    return [full_name(called[str(run.location)], run.random_weights, capture_only(run.episodes)) for run in runs]
 
 
 def _doubles(runs: Sequence[RunReader], labels: Mapping[str, str]) -> set[str]:

@@ -11,10 +11,10 @@ import numpy as np
 
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import LISTENED
+from probe_kit.extract.run_layout import CAPTURE_ONLY
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.statistics.significance import chance_margin
-from probe_kit.train.data.run_reader import refuse_several_wordings
+from probe_kit.train.data.run_reader import check_several_wordings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -102,15 +102,15 @@ def normalised_score(success_rates: Sequence[float]) -> float:
     return (100 * fmean(success_rates) - 50) / 50 * 100
 
 
-def listened(episodes: "pd.DataFrame") -> bool:
+def capture_only(episodes: "pd.DataFrame") -> bool:
     """Whether the model of these episodes was only listened to: it did not act, and there is no success rate."""
-    return not episodes.empty and bool((episodes["outcome"] == LISTENED).all())
+    return not episodes.empty and bool((episodes["outcome"] == CAPTURE_ONLY).all())
 
 
-def _refuse_listened(episodes: "pd.DataFrame") -> None:
-    if listened(episodes):
+def _check_listened(episodes: "pd.DataFrame") -> None:
+    if capture_only(episodes):
         raise UsageError(
-            "this run's model was listened to (extract --listen) and did not act: there is no success rate. Its "
+            "this run's model was listened to (extract --no-act) and did not act: there is no success rate. Its "
             "probes are as ever"
         )
 
@@ -135,8 +135,8 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     averaged, which items' pairs take no notice of. Raises UsageError for a table that is
     empty or of several wordings, and for episodes in which the model did not act.
     """
-    refuse_several_wordings(episodes)
-    _refuse_listened(episodes)
+    check_several_wordings(episodes)
+    _check_listened(episodes)
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
     correct = _correct(episodes)
@@ -213,7 +213,7 @@ def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_R
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:
     """Items that ran in both layouts, by outcome; others are left out. Raises UsageError if nothing was acted."""
-    _refuse_listened(episodes)
+    _check_listened(episodes)
     outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
     outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
     right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)

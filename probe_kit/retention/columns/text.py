@@ -27,7 +27,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def model_name(row: RetentionRow) -> str:
     """The model, marked if its weights are random or it was only listened to, and its group if there is one."""
-    return full_name(row.label or row.model, row.random_weights, row.listened, row.group)
+    return full_name(row.label or row.model, row.random_weights, row.capture_only, row.group)
 
 
 def with_limits(value: str, limits: Limits | None, write: Callable[[float | None], str]) -> str:
@@ -250,7 +250,7 @@ def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
 def title(what: str, rows: Sequence[RetentionRow]) -> str:
     """Title of a table: what it shows, on which suites, and whether any weights are random."""
     marked = "; random weights" if any(row.random_weights for row in rows) else ""
-    marked += "; listened to: no success rate" if any(row.listened for row in rows) else ""
+    marked += "; listened to: no success rate" if any(row.capture_only for row in rows) else ""
     return f"{what} ({', '.join(dict.fromkeys(row.suite for row in rows))}{marked})"
 
 

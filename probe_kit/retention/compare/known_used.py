@@ -28,8 +28,8 @@ from probe_kit.statistics.paired_tests import (
     overlap_p,
 )
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import signal
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.control_scores import has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Joined:
     counts: Mapping[str, int]
     guessed: Mapping[str, float]
     episodes: Mapping[str, int]
-    signal: bool | None
+    has_signal: bool | None
     comparisons: tuple[Comparison, ...]
     known_and_encoded: int | None = None
     not_used: int | None = None
@@ -143,7 +143,7 @@ def join(
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
     """
-    _refuse_kinds(asked, acted)
+    _check_kinds(asked, acted)
     pairs = _same_questions(asked, acted)
     chosen = None if results is None else view or results.settings.views[0]
     if results is not None and chosen not in results.settings.views:
@@ -163,7 +163,7 @@ def join(
 # -- the same questions ----------------------------------------------------------------------------------
 
 
-def _refuse_kinds(asked: RunReader, acted: RunReader) -> None:
+def _check_kinds(asked: RunReader, acted: RunReader) -> None:
     if ask_of(asked) is None or ask_of(acted) is not None:
         raise UsageError(
             f"{asked.location} and {acted.location} are not an asked and an acting run, in this order; make them "
@@ -221,7 +221,7 @@ def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str, seed: int)
     return np.array([found.get(episode, np.nan) for episode in pairs["episode_id"]], np.float64)
 
 
-def encoded_decisions(curve: Curve, seed: int = 0) -> Bools:
+def encoded_decisions(curve: ProbeCurve, seed: int = 0) -> Bools:
     """(E,) held-out decisions of the backbone's probe, at a site that was chosen on other groups.
 
     The groups are halved; in each half decisions are those of the site that is most often right in the other, the
@@ -248,7 +248,7 @@ def _signals(results: ProbeResults, view: str) -> dict[str, bool]:
         stream = curve.backbone_stream
         peak = None if stream is None or name != view else best_site(curve, stream)
         if peak is not None:
-            found[category] = signal(results.controls.beats(category, view, str(peak.site), peak.p_fwe))
+            found[category] = has_signal(results.controls.beats(category, view, str(peak.site), peak.p_fwe))
     return found
 
 
@@ -315,7 +315,7 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
         counts={code: codes.count(code) for code in every},
         guessed={code: len(items) * _by_coin(code) for code in every},
         episodes={code: singles.count(code) for code in every},
-        signal=clear if probed else None,
+        has_signal=clear if probed else None,
         comparisons=tuple(_comparisons(known, encoded, used, items["group"].to_numpy(str))),
         **_kept(sets, encoded),
     )

@@ -61,7 +61,7 @@ class CallCurveDisplay(Shown):
         view: str | None = None,
         events: EventCalls | None = None,
     ) -> Self:
-        """From probes by call (`load_calls`). events: what `event_calls` reads from a run's trajectories.
+        """From probes by call (`load_results_by_call`). events: what `event_calls` reads from a run's trajectories.
 
         Raises UnknownSiteError for a view that was not probed, UsageError for fewer than two calls.
         """

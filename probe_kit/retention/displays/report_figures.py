@@ -11,7 +11,7 @@ from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.attention.attention_mass import stored_attention
 from probe_kit.intervene.results.site_maps import stored_steering
-from probe_kit.retention.behaviour.success_rate import listened
+from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.known_used import KnownUsed
 from probe_kit.retention.displays.attention import attention_curve
@@ -41,7 +41,7 @@ from probe_kit.retention.joins import joins_of
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.by_call import load_calls
+from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ def _of_rules(runs: Sequence[RunReader]) -> list[Exhibit]:
 
 
 def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
-    if listened(run.episodes):
+    if capture_only(run.episodes):
         return []
     exhibits = [
         Exhibit(
@@ -358,7 +358,7 @@ def _of_attention(name: str, position: int, run: RunReader) -> list[Exhibit]:
 
 def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
     """Only where a later inference was probed as well."""
-    calls = load_calls(run, results)
+    calls = load_results_by_call(run, results)
     if len(calls) < 2:
         return []
     views, events = results.settings.views, event_calls(run)

@@ -23,7 +23,7 @@ from probe_kit.statistics.bootstrap import (
     units_seed,
     widened,
 )
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_curve import ProbeCurve
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,7 +135,7 @@ def sr_estimate(episodes: "pd.DataFrame", suite: str) -> Estimate:
 
 
 def probe_estimates(
-    curve: Curve, peaks: Mapping[str, Peak], retention: Retention | None, suite: str
+    curve: ProbeCurve, peaks: Mapping[str, Peak], retention: Retention | None, suite: str
 ) -> dict[str, Estimate]:
     """Accuracy of the best sites, and retention's three estimates where it is defined, whole groups drawn."""
     units = units_seed(curve.groups, suite)

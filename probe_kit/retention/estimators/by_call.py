@@ -11,8 +11,8 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.errors import UsageError
 from probe_kit.retention.estimators.retention import best_site
 from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
-from probe_kit.train.results.control_scores import signal
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.control_scores import has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 Shares = NDArray[np.float64]
@@ -87,7 +87,7 @@ class CallCurves:
     def of(
         cls, results: Mapping[int, ProbeResults], category: str, view: str, events: EventCalls | None = None
     ) -> Self:
-        """From probes by call, as `load_calls` gives them. events: as `event_calls` gives them.
+        """From probes by call, as `load_results_by_call` gives them. events: as `event_calls` gives them.
 
         Raises UsageError for probes of a single call, or without that category and view.
         """
@@ -151,7 +151,7 @@ class CallCurves:
         return found
 
     @property
-    def _curves(self) -> dict[int, Curve]:
+    def _curves(self) -> dict[int, ProbeCurve]:
         return {call: one.curves[self.category, self.view] for call, one in self.results.items()}
 
     def _part(self, stream: str) -> str:
@@ -164,7 +164,7 @@ class CallCurves:
         low, high = group_bootstrap(right[:, None], names, units_seed(names, suite))
         return float(right.mean()), float(low[0]), float(high[0])
 
-    def _point(self, call: int, curve: Curve, stream: str) -> tuple[float, float, float, bool, float, int]:
+    def _point(self, call: int, curve: ProbeCurve, stream: str) -> tuple[float, float, float, bool, float, int]:
         peak = best_site(curve, stream)
         assert peak is not None, "the stream was probed at every call"
         row = curve.sites.index(peak.site)
@@ -173,7 +173,7 @@ class CallCurves:
         null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= _ENOUGH else np.nan
         return (
             *self._interval(curve.correct[row], list(curve.groups)),
-            signal(beats),
+            has_signal(beats),
             float(null),
             curve.labels.size,
         )

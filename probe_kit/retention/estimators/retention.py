@@ -16,8 +16,8 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.estimators.combined import area_fit, bounded_fit
 from probe_kit.retention.estimators.cross_fit import HALVINGS, Crossfit, GroupScores, crossfit
 from probe_kit.statistics.fieller import Interval, fieller_interval
-from probe_kit.train.results.control_scores import BINDING, TWIN, Beats, Controls, signal
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.control_scores import BINDING, TWIN, Beats, Controls, has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
 
 Iterations = Literal["all", "best", "last"] | int
 """Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
@@ -76,7 +76,7 @@ class Retention:
     area_fit: Crossfit
 
 
-def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak | None:
+def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") -> Peak | None:
     """The most accurate site of `stream`, the first one on ties; None if the curve has no such stream.
 
     Raises UsageError if the stream has no such iteration.
@@ -91,7 +91,7 @@ def best_site(curve: Curve, stream: str, iterations: Iterations = "all") -> Peak
 
 
 def measure_retention(
-    curve: Curve, iterations: Iterations = "all", seed: int = 0, beats: Beats | None = None
+    curve: ProbeCurve, iterations: Iterations = "all", seed: int = 0, beats: Beats | None = None
 ) -> Retention | None:
     """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
@@ -116,7 +116,7 @@ def measure_retention(
         backbone=backbone,
         expert=expert,
         plain=_ratio(expert.accuracy - curve.chance, backbone.accuracy - curve.chance),
-        defined=signal(beats),
+        defined=has_signal(beats),
         note=_note(beats),
         debiased=_ratio(fit.expert, fit.backbone),
         interval=retention_interval(fit),
@@ -147,7 +147,7 @@ def _degrees(fit: Crossfit) -> int:
     return min(fit.sizes.size - 1, HALVINGS)  # a variance is no better known than by the halvings it is from
 
 
-def _rows(curve: Curve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
+def _rows(curve: ProbeCurve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
     rows = curve.stream(stream)
     steps = {curve.sites[row].iteration for row in rows} - {None}
     if iterations in ("all", "best") or not steps:

@@ -158,7 +158,7 @@ def _twice(row: RetentionRow) -> str:
 
 
 def _reading(row: RetentionRow) -> str:
-    if row.listened:
+    if row.capture_only:
         return "did not act"
     return _REGIMES.get(row.regime) or f"score {number(row.normalised_score, 1)}"
 

@@ -131,7 +131,7 @@ def _of_both(heading: str) -> str:
 
 def _regime(row: RetentionRow) -> str:
     if row.sr is None:
-        return "did not act" if row.listened else "n/a"
+        return "did not act" if row.capture_only else "n/a"
     return row.regime or _score(row)
 
 

@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
@@ -79,7 +79,7 @@ def rich_tables(
     from rich.text import Text
 
     called = _letters(rows)
-    tables: list[FittingTable | Rule | Text] = []
+    tables: list[ResponsiveTable | Rule | Text] = []
     for kind, of_kind in groupby(rows, key=lambda row: row.kind):
         if tables and kind != "asks":
             tables.append(Rule("asked above, acting below", style="dim"))
@@ -92,7 +92,7 @@ def rich_tables(
 
 def _of_kind(
     rows: Sequence[RetentionRow], differences: Sequence[Difference], called: "_Letters"
-) -> "list[FittingTable]":
+) -> "list[ResponsiveTable]":
     """Of asked, or of acting runs."""
     once = once_per_category(rows)
     lines = behaviour_lines(once, differences)
@@ -114,10 +114,10 @@ def _of_kind(
     return tables
 
 
-def _plain(table: PlainTable) -> FittingTable:
+def _plain(table: PlainTable) -> ResponsiveTable:
     """Its first columns name the rows."""
     fixed = 1 if table.columns[0] == "category" else 2
-    return FittingTable(
+    return ResponsiveTable(
         title=table.title,
         caption=table.note,
         name=" · ".join(table.columns[:fixed]),
@@ -143,7 +143,7 @@ def _judged(rows: Sequence[RetentionRow]) -> list[str]:
 
 def _regime(row: RetentionRow) -> str:
     if row.sr is None:
-        return "did not act" if row.listened else "n/a"
+        return "did not act" if row.capture_only else "n/a"
     return f"score {number(row.normalised_score, 1)}" if row.regime is None else _REGIMES[row.regime]
 
 
@@ -237,7 +237,7 @@ def _of_runs(
     parts: Mapping[str, Sequence[Column]],
     notes: Sequence[str],
     called: _Letters,
-) -> FittingTable:
+) -> ResponsiveTable:
     """One run by its name, several by their letters."""
     rows = [line for line in lines if isinstance(line, RetentionRow)]
     runs = {(row.group, row.run): row for row in reversed(rows)}
@@ -275,7 +275,7 @@ def _fitting(
     names: Sequence[str],
     lines: Sequence[Line],
     parts: Mapping[str, Sequence[Column]],
-) -> FittingTable:
+) -> ResponsiveTable:
     """Columns in which no line has anything to show are left out."""
     found = []
     for question, columns in parts.items():
@@ -283,7 +283,7 @@ def _fitting(
         cells = tuple(tuple(_coloured(cell_of(cell, line)) for _, cell in shown) for line in lines)
         if shown:
             found.append(Part(question, tuple(heading for heading, _ in shown), cells))
-    return FittingTable(
+    return ResponsiveTable(
         title=title,
         caption=caption,
         name=name,

@@ -11,7 +11,7 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import FittingTable
+    from probe_kit._terminal.responsive_table import ResponsiveTable
 
 Said = Verdict | Literal["known", "unknown"]
 
@@ -95,9 +95,9 @@ class Story:
     reader: str
     chapters: tuple[Chapter, ...]
 
-    def to_rich(self) -> "FittingTable":
+    def to_rich(self) -> "ResponsiveTable":
         """A line per category: known, encoded and used, with the share each rests on."""
-        from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+        from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 
         marks = {True: "yes", False: "no", None: "not asked"}
         cells = tuple(
@@ -108,7 +108,7 @@ class Story:
             )
             for one in self.chapters
         )
-        return FittingTable(
+        return ResponsiveTable(
             title=f"Known, encoded, used: {' · '.join(name for name in (self.reader, self.policy) if name)}",
             caption="known: share of answers the reader gets right, %; encoded: of held-out decisions of the best "
             "probe; used: the verdict, and the share of episodes that end on the right picture",
@@ -128,7 +128,7 @@ def stories(rows: Sequence[RetentionRow]) -> list[Story]:
     asked = [row for row in rows if row.category != MEAN and _asks_for_the_answer(row)]
     acted: dict[str, list[RetentionRow]] = {}
     for row in rows:
-        if row.kind == "acts" and row.category != MEAN and not row.listened and row.prefix_accuracy is not None:
+        if row.kind == "acts" and row.category != MEAN and not row.capture_only and row.prefix_accuracy is not None:
             acted.setdefault(row.run, []).append(row)
     return [_story([row for row in own if row.view == own[0].view], asked) for own in acted.values()]
 

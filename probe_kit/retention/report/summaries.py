@@ -52,7 +52,7 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
     rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
-    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
+    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.capture_only else rate]
     if mean.prefix_accuracy is not None:
         found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
     if mean.action_accuracy is not None:
@@ -92,7 +92,7 @@ def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    if mean.listened:
+    if mean.capture_only:
         return "The model was listened to at the first picture of every episode and did not act: no success rate."
     knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
     fails = [row for row in rows if row.regime == Regime.FAILURE]
@@ -165,7 +165,7 @@ def read_row(row: RetentionRow) -> list[str]:
     if row.sr is None:
         found = [
             f"Listened to in {row.n_episodes} episodes; it did not act."
-            if row.listened
+            if row.capture_only
             else f"Success rate {row.regime_reason}."
         ]
     else:

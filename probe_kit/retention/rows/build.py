@@ -10,7 +10,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap.effects import stored_following
 from probe_kit.intervene.results.site_maps import stored_carriers, stored_places
-from probe_kit.retention.behaviour.success_rate import SuccessRate, listened, sensitivity, success_rate, units_of
+from probe_kit.retention.behaviour.success_rate import SuccessRate, capture_only, sensitivity, success_rate, units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.bootstrap_draws import (
     UNBOUNDED,
@@ -29,7 +29,7 @@ from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls, TwinScore
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _row(
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> Drawn:
-    run, heard = judged.run, listened(episodes)
+    run, heard = judged.run, capture_only(episodes)
     parts: list[Part] = [_source(run, results, heard), _asked(run, episodes)]
     estimates: dict[str, Estimate] = {}
     success = None
@@ -132,7 +132,7 @@ def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> Source
         run_settings=run.settings_sha256,
         probe_settings=None if results is None else results.key,
         call=None if results is None else results.settings.call,
-        listened=heard,
+        capture_only=heard,
     )
 
 
@@ -195,7 +195,7 @@ def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviou
     )
 
 
-def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
+def _peaks(curve: ProbeCurve, iterations: Iterations) -> dict[str, Peak]:
     found = {"prefix": best_site(curve, "backbone")}
     if curve.action_stream is not None:
         found["action"] = best_site(curve, curve.action_stream, iterations)
@@ -209,7 +209,7 @@ class _Probed:
     controls: Controls
     category: str
     view: str
-    curve: Curve
+    curve: ProbeCurve
     peaks: dict[str, Peak]
 
     @property

@@ -47,7 +47,7 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         action_stream=first.action_stream,
         n_episodes=sum(row.n_episodes for row in rows),
         n_items=sum(row.n_items for row in rows),
-        listened=first.listened,
+        capture_only=first.capture_only,
         normalised_score=normalised_score([row.sr for row in rows if row.sr is not None]) if acted else None,
         sr=_mean(rows, "sr"),
         **vars(mean_part(rows, {name: _limits(estimates, name) for name in ("sr_answered", "sr_grasped")})),

@@ -9,7 +9,7 @@ import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import listened, shares_of, units_of
+from probe_kit.retention.behaviour.success_rate import capture_only, shares_of, units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits
 from probe_kit.statistics.bootstrap import bootstrap_ratios, group_means, units_seed
@@ -235,7 +235,7 @@ def rule_sentence(row: Ruled) -> str:
 
 def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
     """Whether there are outcomes of a run by this rule; those by `disc` at the last step are always stored."""
-    if (rule, last_steps) == (DEFAULT_RULE, 1) or ask_of(run) is not None or listened(run.episodes):
+    if (rule, last_steps) == (DEFAULT_RULE, 1) or ask_of(run) is not None or capture_only(run.episodes):
         return True
     return bool(getattr(run, "has_trajectories", False))
 

@@ -13,7 +13,7 @@ class Source:
     """Whose numbers a row holds.
 
     label: what the run is called in tables and legends. action_stream: `expert`, or `action` in a policy without
-    one, whose iterations are action tokens. call: the captured inference that was probed, from 0. listened: the
+    one, whose iterations are action tokens. call: the captured inference that was probed, from 0. capture_only: the
     model was only heard and did not act.
     """
 
@@ -27,7 +27,7 @@ class Source:
     label: str = ""
     action_stream: str | None = None
     call: int | None = None
-    listened: bool = False
+    capture_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from probe_kit.retention.rows.parts import (
     Kept,
     Source,
 )
-from probe_kit.train.results.control_scores import signal
+from probe_kit.train.results.control_scores import has_signal
 
 MEAN = "mean"
 """Category of the rows that average over categories."""
@@ -45,12 +45,12 @@ class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Fol
     @property
     def prefix_signal(self) -> bool:
         """Whether the backbone knows the answer: better than chance and every control that was run."""
-        return bool(self.prefix_beats) and signal(self.prefix_beats)
+        return bool(self.prefix_beats) and has_signal(self.prefix_beats)
 
     @property
     def action_signal(self) -> bool:
         """The same of the stream the action is made in."""
-        return bool(self.action_beats) and signal(self.action_beats)
+        return bool(self.action_beats) and has_signal(self.action_beats)
 
     @property
     def action_name(self) -> str:

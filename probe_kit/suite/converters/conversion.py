@@ -35,7 +35,7 @@ from probe_kit.suite.converters.pairing import Bundle, Proposal, pair_candidates
 from probe_kit.suite.converters.rewriting import rewrite
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
-from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.validation.near_duplicates import Look, look_of
 from probe_kit.suite.wording import instruction_for
@@ -114,7 +114,7 @@ def convert(
     wanted = kind.categories if categories is None else check_categories(categories, kind.categories)
     if not root.exists():
         raise UsageError(f"{source}: {root} does not exist. Name the folder the benchmark was unpacked to.")
-    refuse_foreign_folder(out)
+    check_foreign_folder(out)
     conversion = _Conversion(kind, chosen, kind.read(root, wanted, chosen), n, seed)
     bundles = {category: conversion.propose(category) for category in wanted}
     if emit_curation is not None:

@@ -15,10 +15,10 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_slug
-from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, refuse_broken, shown, statistics_of
+from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, check_broken, shown, statistics_of
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item, Side
-from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 
 COLUMNS = ("instruction", "correct", "wrong")
@@ -66,7 +66,7 @@ def suite_from_csv(
     """
     table, folder = Path(table), Path(folder)
     rows = list(read_rows(table, category))
-    refuse_foreign_folder(folder)
+    check_foreign_folder(folder)
     name = name or table.stem
     pictures: dict[str, bytes] = {}
     drawn: list[tuple[Row, Shown, Shown]] = []
@@ -77,7 +77,7 @@ def suite_from_csv(
     items = list(_items(name, version, drawn, terms))
     groups = {item.item_id: row.group for item, row in zip(items, rows, strict=True) if row.group}
     suite = new_suite(name, version, with_groups(items, groups), {"rows": len(rows)})
-    refuse_broken(suite)
+    check_broken(suite)
     return save_suite(suite, pictures, statistics_of(suite), folder)
 
 

@@ -127,7 +127,7 @@ def _of_side(side: Side, picture: Shown) -> dict[str, str]:
     }
 
 
-def refuse_broken(suite: Suite) -> None:
+def check_broken(suite: Suite) -> None:
     """Raise SuiteError for a broken rule of the format; rules about files are left out, none is written yet."""
     findings = [finding for rule in LOADING_RULES if rule is not pictures_unchanged for finding in rule(suite)]
     if findings:

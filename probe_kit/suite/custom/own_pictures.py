@@ -12,10 +12,10 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_slug
-from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, refuse_broken, shown, statistics_of
+from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, check_broken, shown, statistics_of
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item, Side
-from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.wording import instruction_for
 
@@ -60,7 +60,7 @@ def suite_from_pictures(
     """
     folder = Path(folder)
     _check(pairs)
-    refuse_foreign_folder(folder)
+    check_foreign_folder(folder)
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     terms = Terms(license, attribution, redistributable, contains_real_face)
@@ -69,7 +69,7 @@ def suite_from_pictures(
         pictures |= {picture.file_name: picture.png for picture in both}
         items += _twins(name, version, pair.category, both if number % 2 == 0 else both[::-1], terms)
     suite = new_suite(name, version, with_groups(items), {"pairs": len(pairs)})
-    refuse_broken(suite)
+    check_broken(suite)
     return save_suite(suite, pictures, statistics_of(suite), folder)
 
 

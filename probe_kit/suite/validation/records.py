@@ -5,7 +5,7 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit._terminal.plain_text import visible
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
 from probe_kit.suite.ladder import WORDINGS
@@ -92,8 +92,8 @@ def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
     longest = LONGEST_NAME if name in _NAMES else LONGEST_FIELD
     if len(text.encode(errors="replace")) > longest:
         yield error("E02", where, f"field {name!r} has {len(text)} characters; expected at most {longest}")
-    elif visible(text) != text or (name in _NAMES and not text.isprintable()):
-        shown = visible(text[:80])
+    elif terminal_safe(text) != text or (name in _NAMES and not text.isprintable()):
+        shown = terminal_safe(text[:80])
         yield error("E02", where, f"field {name!r} holds characters that cannot be printed ({shown!r})")
 
 

@@ -10,32 +10,32 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
-from probe_kit.statistics.label_permutations import site_p
+from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.controls.baselines import Baseline, baseline_features, needed
-from probe_kit.train.controls.random_features import BindingInputs, binding_scores
+from probe_kit.train.controls.random_features import RandomFeatureInputs, random_feature_scores
 from probe_kit.train.crossval.category_problem import POOLED, category_problem
 from probe_kit.train.crossval.metrics import chance_level, correctness
 from probe_kit.train.data.labels import target_labels
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, Excess, TwinScore
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, ControlComparison, TwinScore
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedControls:
     """Baselines that are still to be probed: features (E, D) by name, and what `binding` sees if it is one."""
 
     features: Mapping[Baseline, NDArray[np.float32]]
-    binding: BindingInputs | None
+    binding: RandomFeatureInputs | None
 
 
 def prepare_baselines(
     run: RunReader, names: Sequence[Baseline], suite: Path | None, stored: ProbeResults | None
-) -> Prepared:
+) -> PreparedControls:
     """Features of the baselines `names` that `stored` does not have yet.
 
     Before anything is probed, so that what is wrong with them is said first. Raises what `baseline_features`
@@ -43,17 +43,17 @@ def prepare_baselines(
     """
     missing = [name for name in names if stored is None or not _has(stored, name)]
     features = {name: baseline_features(run, name, suite) for name in missing if name != BINDING}
-    binding = BindingInputs.of(run, needed(suite, BINDING)) if BINDING in missing else None
-    return Prepared(features, binding)
+    binding = RandomFeatureInputs.of(run, needed(suite, BINDING)) if BINDING in missing else None
+    return PreparedControls(features, binding)
 
 
-def add_baselines(results: ProbeResults, run: RunReader, prepared: Prepared) -> ProbeResults:
+def add_baselines(results: ProbeResults, run: RunReader, prepared: PreparedControls) -> ProbeResults:
     """`results` with these baselines for every category; all sites are held against binding if it is one."""
     controls = results.controls
     for name, features in prepared.features.items():
         controls = controls.with_baselines(_baseline_scores(results, run, name, features))
     if prepared.binding is not None:
-        scores, excess = binding_scores(results, run, prepared.binding)
+        scores, excess = random_feature_scores(results, run, prepared.binding)
         controls = controls.with_baselines(scores).with_excess(excess)
     return replace(results, controls=controls)
 
@@ -72,7 +72,7 @@ def _baseline_scores(
         probe = problem.probe(samples)
         right = correctness(probe.decisions, problem.labels)
         low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, settings.suite))
-        p = float(site_p(right.mean(keepdims=True), probe.null[None, :])[0])
+        p = float(pointwise_p(right.mean(keepdims=True), probe.null[None, :])[0])
         yield BaselineScore(
             name=name,
             category=category,
@@ -125,8 +125,8 @@ def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
 
 
 def _twin_excess(
-    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
-) -> Iterator[Excess]:
+    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, twin: ProbeResults
+) -> Iterator[ControlComparison]:
     """Every site of a stream against the best of the twin's."""
     other = twin.curves[place]
     for stream in dict.fromkeys(site.stream for site in curve.sites):
@@ -137,11 +137,11 @@ def _twin_excess(
         p = better_than_best(curve.correct[rows], others, curve.groups, seed)
         best = float(others.mean(axis=1).max())
         for row, of_site in zip(rows, p, strict=True):
-            yield Excess(TWIN, *place, str(curve.sites[row]), best, float(of_site))
+            yield ControlComparison(TWIN, *place, str(curve.sites[row]), best, float(of_site))
 
 
 def _twin_scores(
-    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
+    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, twin: ProbeResults
 ) -> Iterator[TwinScore]:
     other = twin.curves[place]
     if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():

@@ -20,7 +20,7 @@ from probe_kit.train.crossval.category_problem import CategoryProblem, category_
 from probe_kit.train.crossval.metrics import chance_level, correctness
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.control_scores import BINDING, BaselineScore, Excess
+from probe_kit.train.results.control_scores import BINDING, BaselineScore, ControlComparison
 from probe_kit.train.results.probe_results import ProbeResults
 
 SIDE = 12
@@ -30,14 +30,14 @@ LAYERS = 5
 
 
 @dataclass(frozen=True)
-class BindingInputs:
+class RandomFeatureInputs:
     """What the random layers see, one row per episode of the run: (E, P) pixels and (E, W) word counts."""
 
     pixels: Features
     words: Features
 
     @classmethod
-    def of(cls, run: RunReader, suite: Path) -> "BindingInputs":
+    def of(cls, run: RunReader, suite: Path) -> "RandomFeatureInputs":
         """From the run's suite. Raises SuiteError for another one, UsageError without instructions."""
         return cls(tile_pixels(run.episodes, suite_of(run, suite), SIDE), word_counts(run))
 
@@ -50,9 +50,9 @@ class BindingInputs:
         return outputs
 
 
-def binding_scores(
-    results: ProbeResults, run: RunReader, inputs: BindingInputs
-) -> tuple[list[BaselineScore], list[Excess]]:
+def random_feature_scores(
+    results: ProbeResults, run: RunReader, inputs: RandomFeatureInputs
+) -> tuple[list[BaselineScore], list[ControlComparison]]:
     """The control's accuracy per category, as wide as the backbone, and every site held against it.
 
     A site is held against layers of its own stream's width, on the same folds.
@@ -70,7 +70,7 @@ def binding_scores(
     return scores, found
 
 
-def _reference(inputs: BindingInputs, problem: CategoryProblem, width: int, seed: int) -> NDArray[np.bool_]:
+def _reference(inputs: RandomFeatureInputs, problem: CategoryProblem, width: int, seed: int) -> NDArray[np.bool_]:
     """(E,) where the best of the random layers is right."""
     nothing = np.empty((problem.labels.size, 0), bool)
     layers = (inputs.layer(problem.rows, width, derive_seed("binding", seed, number)) for number in range(LAYERS))
@@ -95,7 +95,7 @@ def _score(right: NDArray[np.bool_], problem: CategoryProblem, category: str, su
 
 def _held_against(
     results: ProbeResults, category: str, references: dict[str, NDArray[np.bool_]]
-) -> Iterator[Excess]:
+) -> Iterator[ControlComparison]:
     for (name, view), curve in results.curves.items():
         if name != category:
             continue
@@ -104,7 +104,7 @@ def _held_against(
             seed = derive_seed(BINDING, results.settings.seed, category, view, stream)
             p = better_than_reference(curve.correct[rows], reference.astype(float), curve.groups, seed)
             for row, of_site in zip(rows, p, strict=True):
-                yield Excess(
+                yield ControlComparison(
                     BINDING, category, view, str(curve.sites[row]), float(reference.mean()), float(of_site)
                 )
 

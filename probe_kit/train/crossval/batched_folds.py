@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.metrics import log_loss
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, least_loss
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.backend import Array, namespace, to_device_of, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_device_of, to_numpy
 from probe_kit.train.solver.design_matrix import StackedDesign
-from probe_kit.train.solver.logistic import LogisticSolver, refuse_single_class
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
+from probe_kit.train.solver.projection import Projection
 
 FEW_COLUMNS, SMALL_HESSIAN = 32, 2**20
 """Up to so many label columns, each of so many multiplications (N · R²), whole Hessians cost less than the many
@@ -40,7 +40,7 @@ def cross_validate_together(
     inner = _at_once([one for nested in folds for one in nested.inner], labels)
     loss = np.concatenate([_Together.of(samples, labels, some).losses() for some in inner], axis=1)
     begins = np.cumsum([0, *(len(nested.inner) for nested in folds[:-1])])
-    strengths: Matrix = STRENGTHS[least_loss(np.add.reduceat(loss, begins, axis=1))]
+    strengths: Matrix = STRENGTHS[select_c(np.add.reduceat(loss, begins, axis=1))]
     outer = zip(_at_once([one.outer for one in folds], labels), _at_once(strengths, labels), strict=True)
     return [
         fitted for some, chosen in outer for fitted in _Together.of(samples, labels, some).fitted(np.array(chosen))
@@ -61,19 +61,19 @@ class _Together:
 
     folds: Sequence[Fold]
     labels: NDArray[np.bool_]
-    coordinates: list[Coordinates]
+    coordinates: list[Projection]
     held_out: list[Array]
     solver: LogisticSolver
     signs: Array
 
     @classmethod
     def of(cls, samples: Samples, labels: NDArray[np.bool_], folds: Sequence[Fold]) -> "_Together":
-        coordinates = [Coordinates.fit(samples.of(fold.train).features) for fold in folds]
+        coordinates = [Projection.fit(samples.of(fold.train).features) for fold in folds]
         held_out = [one(samples.of(fold.test).means) for one, fold in zip(coordinates, folds, strict=True)]
         design = StackedDesign.of_folds([one.train for one in coordinates], labels.shape[1])
         signs = np.zeros((design.shape[0], len(folds), labels.shape[1]))
         for number, fold in enumerate(folds):
-            refuse_single_class(labels[fold.train])
+            check_single_class(labels[fold.train])
             signs[: fold.train.size, number] = 2.0 * labels[fold.train] - 1.0
         columns = to_device_of(design.samples, signs.reshape(len(signs), -1))
         return cls(folds, labels, coordinates, held_out, LogisticSolver(design), columns)
@@ -105,4 +105,4 @@ class _Together:
         for number, coordinates in enumerate(self.coordinates):
             own = weights[:, number * count : (number + 1) * count]
             rank = coordinates.train.shape[1]
-            yield namespace(own).concatenate([own[: rank - 1], own[-1:]])
+            yield array_namespace(own).concatenate([own[: rank - 1], own[-1:]])

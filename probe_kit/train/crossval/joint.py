@@ -15,9 +15,9 @@ from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.joint_objective import JointProblems
 from probe_kit.train.crossval.metrics import log_loss
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, least_loss
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.backend import Array, namespace, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.mixed_precision import solve
 from probe_kit.train.solver.projection import IN_MEMORY
 
@@ -113,12 +113,12 @@ class _Columns:
             for (number, inner), found in zip(sets, decided, strict=True):
                 loss[step, number] += log_loss(found[:, inner.test].T, self.labels[inner.test]) * inner.test.size
             starts.append([weights[of_fold == number].mean(axis=0) for number in range(len(self.folds))])
-        xp = namespace(self.site.mean)
-        return least_loss(loss), xp.stack([xp.stack(by_fold) for by_fold in starts])
+        xp = array_namespace(self.site.mean)
+        return select_c(loss), xp.stack([xp.stack(by_fold) for by_fold in starts])
 
     def _along_grid(self, sets: int) -> Iterator[tuple[Array, Matrix]]:
         """For each C, weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
-        xp, columns = namespace(self.site.mean), self.labels.shape[1]
+        xp, columns = array_namespace(self.site.mean), self.labels.shape[1]
         width = len(self.site.mean) + 1
         for some in batched(STRENGTHS, _times_at_once(self.site, self.folds)):
             grid, set_of, column = (part.ravel() for part in np.indices((len(some), sets, columns)))

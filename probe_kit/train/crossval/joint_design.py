@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from probe_kit.train.crossval.nested_folds import NestedFold
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.backend import Array, namespace, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.principal_axes import narrow_axes
-from probe_kit.train.solver.row_subset import ChosenRows
+from probe_kit.train.solver.row_subset import RowSubset
 
 ROWS_PER_BLOCK = 512
 """8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
@@ -61,7 +61,7 @@ class JointSite:
     turned: (M, D) float32, standardised samples along the axes: they shape steps, never a gradient that counts.
     """
 
-    features: ChosenRows
+    features: RowSubset
     blocks: tuple[Block, ...]
     mean: Array
     scale: Array
@@ -75,7 +75,7 @@ class JointSite:
     def of(cls, samples: Samples, folds: Sequence[NestedFold]) -> "JointSite":
         """The site of `samples`. Memory: their copy in float32, D × D a few times, and a block in float64."""
         features, blocks = _sorted(samples, folds)
-        xp, count = namespace(features.matrix), len(features)
+        xp, count = array_namespace(features.matrix), len(features)
         mean = sum(rows.sum(axis=0, dtype=xp.float64) for rows in features.blocks()) / count
         scale = xp.sqrt(sum(xp.square(rows - mean).sum(axis=0) for rows in features.blocks()) / count)
         rounding = 10 * xp.finfo(features.matrix.dtype).eps * abs(mean)  # as for `Standardiser`
@@ -123,7 +123,7 @@ class _Moments:
 
     def standard(self, counts: NDArray[np.float64]) -> tuple[Array, Array]:
         """(F, D) mean and deviation of every training set."""
-        xp = namespace(self.sums)
+        xp = array_namespace(self.sums)
         size = xp.asarray(counts, device=self.sums.device)[:, None]
         mean = self.sums / size
         return mean, xp.sqrt((self.squares / size - mean**2).clip(0.0))
@@ -149,12 +149,12 @@ def _members(folds: Sequence[NestedFold], episodes: int) -> NDArray[np.float64]:
     return member
 
 
-def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[ChosenRows, tuple[Block, ...]]:
+def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
     """Rows and blocks, the episodes that an outer fold tests together."""
-    rows = samples.features if isinstance(samples.features, ChosenRows) else ChosenRows.all(samples.features)
+    rows = samples.features if isinstance(samples.features, RowSubset) else RowSubset.all(samples.features)
     order = np.concatenate([fold.outer.test for fold in folds])
     sorted_ = Samples(rows, samples.counts, samples.means).of(order)
-    assert isinstance(sorted_.features, ChosenRows)
+    assert isinstance(sorted_.features, RowSubset)
     episode = np.repeat(order, sorted_.counts)
     sizes = [samples.counts[fold.outer.test].sum() for fold in folds]
     return sorted_.features, tuple(_blocks(sizes, episode))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.train.crossval.joint_design import Block, JointSite
-from probe_kit.train.solver.backend import Array, namespace
-from probe_kit.train.solver.mixed_precision import Point
+from probe_kit.train.solver.backend import Array, array_namespace
+from probe_kit.train.solver.mixed_precision import NewtonState
 
 Inside = Callable[[Array, Block, NDArray[np.intp]], Array]
 """What stands between a product with the samples and one with their transpose: from (k, B) decisions, their block,
@@ -45,9 +45,9 @@ class JointProblems:
         scale = 1e-15 * self.site.sets.counts.max() * self.site.turned.shape[1] ** 0.5
         return scale * self._strength(rows, self.site.mean)[:, 0]
 
-    def point(self, weights: Array, rows: NDArray[np.intp], *, exact: bool) -> Point:
+    def point(self, weights: Array, rows: NDArray[np.intp], *, exact: bool) -> NewtonState:
         """Objective of `rows`: in float32, at `weights` (k, D + 1) along axes, or exactly, of ones on features."""
-        xp, sets = namespace(weights), self.set_of[rows]
+        xp, sets = array_namespace(weights), self.set_of[rows]
         loss = xp.zeros(len(rows), dtype=xp.float64, device=weights.device)
         curvature = xp.zeros((len(rows), len(self.site.features)), dtype=xp.float32, device=weights.device)
 
@@ -62,27 +62,27 @@ class JointProblems:
         if exact:
             mean, v = self.site.sets.mean[sets], weights[:, :-1]
             shrunk = self.site.sets.scale[sets] ** 2 * v
-            pulled, total = self._swept(v / self.site.scale, weights[:, -1] - (mean * v).sum(axis=1), sets, inside)
+            pulled, total = self._blockwise_products(v / self.site.scale, weights[:, -1] - (mean * v).sum(axis=1), sets, inside)
             by_feature = shrunk + strength * (pulled / self.site.scale - mean * total[:, None])
             by_axis, measured = by_feature @ self._wide_axes, by_feature / self._divisor[sets]
         else:
             mean, left = self._turned_mean[sets], xp.asarray(weights, dtype=xp.float32)
             v, shift = left[:, :-1] @ self.site.axes.T, left[:, -1] - (mean * left[:, :-1]).sum(axis=1)
             shrunk = self._square_scale[sets] * v
-            pulled, total = self._swept(left[:, :-1], shift, sets, inside)
+            pulled, total = self._blockwise_products(left[:, :-1], shift, sets, inside)
             by_axis = shrunk @ self.site.axes + strength * (pulled - mean * total[:, None])
             measured = by_axis  # as long as by features, but for their scales: nothing is accepted by it
         gradient = xp.hstack([by_axis, strength * total[:, None]])
         penalty = (shrunk * v).sum(axis=1, dtype=xp.float64)
         size = (measured**2).sum(axis=1) + gradient[:, -1] ** 2
-        return Point(strength[:, 0] * loss + 0.5 * penalty, gradient, size**0.5, penalty**0.5, curvature)
+        return NewtonState(strength[:, 0] * loss + 0.5 * penalty, gradient, size**0.5, penalty**0.5, curvature)
 
     def curved(self, directions: Array, curvature: Array, rows: NDArray[np.intp]) -> Array:
         """Hessian times `directions` (k, D + 1), by a point's curvature; all float32."""
-        xp, sets = namespace(directions), self.set_of[rows]
+        xp, sets = array_namespace(directions), self.set_of[rows]
         mean, along = self._turned_mean[sets], directions[:, :-1]
         shift = directions[:, -1] - (mean * along).sum(axis=1)
-        pulled, total = self._swept(along, shift, sets, lambda f, block, use: f * curvature[use, block.rows])
+        pulled, total = self._blockwise_products(along, shift, sets, lambda f, block, use: f * curvature[use, block.rows])
         penalty = (self._square_scale[sets] * (along @ self.site.axes.T)) @ self.site.axes
         strength = self._strength(rows, directions)
         inner = penalty + strength * (pulled - mean * total[:, None])
@@ -90,14 +90,14 @@ class JointProblems:
 
     def diagonal(self, curvature: Array, rows: NDArray[np.intp]) -> Array:
         """(k, D + 1) float32, about the Hessian's diagonal: as if all samples were curved alike."""
-        xp = namespace(curvature)
+        xp = array_namespace(curvature)
         weight = self._strength(rows, curvature) * curvature.sum(axis=1)[:, None]
         share = xp.asarray(self.site.variances / len(self.site.features), dtype=xp.float32)
         return xp.hstack([self._penalty_diagonal[self.set_of[rows]] + weight * share, weight])
 
     def exact_step(self, gradient: Array, curvature: Array, row: int) -> Array:
         """(D + 1,) Newton step of one problem, by its whole Hessian."""
-        xp, number, axes = namespace(gradient), self.set_of[row], self._wide_axes
+        xp, number, axes = array_namespace(gradient), self.set_of[row], self._wide_axes
         hessian = xp.zeros((len(gradient), len(gradient)), dtype=xp.float64, device=gradient.device)
         for block in self.site.blocks:
             centred = self.site.turned[block.rows] - self._turned_mean[number]
@@ -109,11 +109,11 @@ class JointProblems:
 
     def turned(self, weights: Array) -> Array:
         """(k, D + 1) weights on features, along axes."""
-        return namespace(weights).hstack([weights[:, :-1] @ self._wide_axes, weights[:, -1:]])
+        return array_namespace(weights).hstack([weights[:, :-1] @ self._wide_axes, weights[:, -1:]])
 
     def turned_back(self, weights: Array) -> Array:
         """(k, D + 1) weights along axes, on features."""
-        return namespace(weights).hstack([weights[:, :-1] @ self._wide_axes.T, weights[:, -1:]])
+        return array_namespace(weights).hstack([weights[:, :-1] @ self._wide_axes.T, weights[:, -1:]])
 
     def raw(self, weights: Array) -> tuple[Array, Array]:
         """Weights (K, D) and intercepts (K,) on raw features."""
@@ -130,7 +130,7 @@ class JointProblems:
 
     def deviations(self, weights: Array) -> Array:
         """(K,) deviation of every problem's decisions over its training samples."""
-        xp = namespace(weights)
+        xp = array_namespace(weights)
         v = weights[:, :-1]
         square, total = (xp.zeros(len(self), dtype=xp.float64, device=weights.device) for _ in range(2))
         for block in self.site.blocks:
@@ -141,12 +141,12 @@ class JointProblems:
         count = xp.asarray(self.site.sets.counts[self.set_of], device=weights.device)
         return xp.sqrt((square / count - (total / count) ** 2).clip(0.0))
 
-    def _swept(self, left: Array, shift: Array, sets: NDArray[np.intp], inside: Inside) -> tuple[Array, Array]:
+    def _blockwise_products(self, left: Array, shift: Array, sets: NDArray[np.intp], inside: Inside) -> tuple[Array, Array]:
         """Σ inside(f)·x (k, D) and Σ inside(f) (k,) over samples x, with f = left·x + shift.
 
         float64: x are raw samples without the site's mean; float32: samples along the axes.
         """
-        xp = namespace(left)
+        xp = array_namespace(left)
         exact = left.dtype == xp.float64
         pulled, total = xp.zeros_like(left), xp.zeros_like(shift)
         for fold, blocks in groupby(self.site.blocks, key=lambda block: block.outer):
@@ -193,22 +193,22 @@ class JointProblems:
     @cached_property
     def _divisor(self) -> Array:
         """(F, D) the training sets' scales; 1 for a feature that never varies, whose gradient is 0."""
-        xp = namespace(self.site.scale)
+        xp = array_namespace(self.site.scale)
         return xp.where(xp.isinf(self.site.scale), 1.0, self.site.sets.scale)
 
 
 def _as(array: Array, dtype: str) -> Array:
-    xp = namespace(array)
+    xp = array_namespace(array)
     return xp.asarray(array, dtype=getattr(xp, dtype))
 
 
 def _like(array: NDArray[Any], like: Array) -> Array:
-    return namespace(like).asarray(array, dtype=like.dtype, device=like.device)
+    return array_namespace(like).asarray(array, dtype=like.dtype, device=like.device)
 
 
 def _losses(margins: Array) -> tuple[Array, Array, Array]:
     """log(1 + exp(−m)), its negative slope and its curvature."""
-    xp = namespace(margins)
+    xp = array_namespace(margins)
     small = xp.exp(-abs(margins))
     slope = xp.where(margins > 0, small, xp.ones_like(small)) / (1 + small)
     return xp.log1p(small) + (-margins).clip(0.0), slope, small / (1 + small) ** 2

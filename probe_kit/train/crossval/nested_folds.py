@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.statistics.folds import Fold, grouped_folds
 from probe_kit.train.solver.backend import Array, to_numpy
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 Matrix = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class FittedFold:
     spread: float
 
     @classmethod
-    def of(cls, coordinates: Coordinates, weights: Array, decisions: Matrix, strengths: Matrix) -> "FittedFold":
+    def of(cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix) -> "FittedFold":
         """With the first column of `weights` (R, K), found in `coordinates`."""
         raw, intercept = coordinates.raw_weights(weights[:, 0])
         along = float(np.std(to_numpy(coordinates.train @ weights[:, 0])))
@@ -66,7 +66,7 @@ class FittedFold:
         return cls(decisions, strengths, raw, intercept, along / length if length else 0.0)
 
 
-def least_loss(loss: Matrix) -> NDArray[np.intp]:
+def select_c(loss: Matrix) -> NDArray[np.intp]:
     """(...) position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
     chosen: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
     return chosen

@@ -18,13 +18,13 @@ from probe_kit.train.crossval.nested_folds import (
     FittedFold,
     Matrix,
     NestedFold,
-    least_loss,
+    select_c,
     nested_folds,
 )
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import to_numpy
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 __all__ = [
     "INNER_FOLDS",
@@ -36,7 +36,7 @@ __all__ = [
     "cross_validate",
     "nested_folds",
     "probe_site",
-    "refuse_non_finite",
+    "check_non_finite",
 ]
 
 
@@ -69,7 +69,7 @@ def probe_site(
 
     Raises ProbeNotConvergedError, and NonFiniteActivationError for NaN or infinity.
     """
-    refuse_non_finite(samples)
+    check_non_finite(samples)
     columns = np.column_stack([labels, relabellings])
     fitted = cross_validate(samples, columns, folds)
     decisions = _out_of_fold(fitted, folds)
@@ -83,7 +83,7 @@ def probe_site(
     )
 
 
-def refuse_non_finite(samples: Samples) -> None:
+def check_non_finite(samples: Samples) -> None:
     """Raise NonFiniteActivationError, naming the first broken episode by its number, if there is any."""
     broken = samples.broken()
     if broken.size:
@@ -112,18 +112,18 @@ def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fo
     loss = np.zeros((STRENGTHS.size, labels.shape[1]))
     for fold in folds:
         train = samples.of(fold.train)
-        coordinates = Coordinates.fit(train.features)
+        coordinates = Projection.fit(train.features)
         held_out, truth = coordinates(samples.of(fold.test).means), labels[fold.test]
         solver = LogisticSolver(coordinates.train)
         for step, weights in enumerate(solver.path(train.repeat(labels[fold.train]), STRENGTHS)):
             loss[step] += log_loss(to_numpy(held_out @ weights), truth) * fold.test.size
-    chosen: Matrix = STRENGTHS[least_loss(loss)]
+    chosen: Matrix = STRENGTHS[select_c(loss)]
     return chosen
 
 
 def _fit_fold(samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix) -> FittedFold:
     train = samples.of(fold.train)
-    coordinates = Coordinates.fit(train.features)
+    coordinates = Projection.fit(train.features)
     solver = LogisticSolver(coordinates.train)
     held_out, training_labels = coordinates(samples.of(fold.test).means), train.repeat(labels[fold.train])
     decisions = np.empty((fold.test.size, labels.shape[1]))

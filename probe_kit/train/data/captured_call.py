@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def at_call(run: RunReader, call: int) -> RunReader:
+def restrict_to_call(run: RunReader, call: int) -> RunReader:
     """`run` at captured inference `call`, counted from 0; episodes that ended before it are left out.
 
     Raises UsageError if no such inference was captured, and for a run that does not keep them apart.

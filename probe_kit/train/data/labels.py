@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.data.run_reader import refuse_several_wordings
+from probe_kit.train.data.run_reader import check_several_wordings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,7 @@ def target_labels(episodes: "pd.DataFrame", target: Target, seed: int) -> NDArra
 
     Raises UsageError for an unknown target, and for episodes of several wordings.
     """
-    refuse_several_wordings(episodes)
+    check_several_wordings(episodes)
     if target == "chosen":
         return _left_is_one(episodes["side_placed"])
     labels = _left_is_one(episodes["side_correct"])

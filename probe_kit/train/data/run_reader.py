@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def refuse_several_wordings(episodes: "pd.DataFrame") -> None:
+def check_several_wordings(episodes: "pd.DataFrame") -> None:
     """Raise UsageError for episodes of several wordings: probes and success rates are of one."""
     if "wording" in episodes and episodes["wording"].nunique() > 1:
         there = ", ".join(dict.fromkeys(episodes["wording"].astype(str)))

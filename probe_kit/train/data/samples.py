@@ -12,7 +12,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
 from probe_kit.train.data.run_reader import RunReader, Tokens
 from probe_kit.train.solver.backend import Array, to_device, to_numpy
-from probe_kit.train.solver.row_subset import ChosenRows, Features
+from probe_kit.train.solver.row_subset import RowSubset, Features
 
 TOKENS = "tokens"
 """View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""
@@ -52,7 +52,7 @@ class Samples:
             features[rows] = block.values[block.mask]
         assert features is not None, "every episode has a token"
         sums = np.add.reduceat(features, _starts(counts), axis=0, dtype=np.float64)
-        return cls(ChosenRows.all(features), counts, sums / counts[:, None])
+        return cls(RowSubset.all(features), counts, sums / counts[:, None])
 
     @property
     def pools(self) -> bool:
@@ -77,7 +77,7 @@ class Samples:
 
     def to(self, device: str | None) -> "Samples":
         """The same with features and means as torch tensors on `device`; unchanged without one."""
-        if isinstance(self.features, ChosenRows):
+        if isinstance(self.features, RowSubset):
             return Samples(self.features.to(device), self.counts, to_device(self.means, device))
         return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
 

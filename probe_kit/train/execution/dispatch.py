@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from typing import Any
 
-from probe_kit.train.execution.executor import Columns, Crew, CrewSettings, Key, Probed, Problems, probe_column
-from probe_kit.train.execution.processes import ProcessCrew
-from probe_kit.train.execution.ray import RayCrew
+from probe_kit.train.execution.executor import Columns, ProbeExecutor, ExecutionSettings, Key, Probed, Problems, probe_column
+from probe_kit.train.execution.processes import ProcessExecutor
+from probe_kit.train.execution.ray import RayExecutor
 
 
-def probe_columns(columns: Columns, problems: Problems, settings: CrewSettings) -> Iterator[tuple[Key, Probed]]:
+def probe_columns(columns: Columns, problems: Problems, settings: ExecutionSettings) -> Iterator[tuple[Key, Probed]]:
     """The probes of every column by category, as they are done.
 
     Raises MissingExtraError if Ray is asked for and not installed, WorkerDiedError if a worker process dies, and
@@ -16,15 +16,15 @@ def probe_columns(columns: Columns, problems: Problems, settings: CrewSettings) 
     """
     jobs = settings.jobs or 1
     if settings.ray is not None:
-        yield from _side_by_side(columns, RayCrew(problems, settings.ray, settings.jobs))
+        yield from _side_by_side(columns, RayExecutor(problems, settings.ray, settings.jobs))
     elif jobs > 1:
-        yield from _side_by_side(columns, ProcessCrew(problems, jobs))
+        yield from _side_by_side(columns, ProcessExecutor(problems, jobs))
     else:
         for key, samples in columns:
             yield key, probe_column(samples, problems, settings.device)
 
 
-def _side_by_side(columns: Columns, crew: Crew) -> Iterator[tuple[Key, Probed]]:
+def _side_by_side(columns: Columns, crew: ProbeExecutor) -> Iterator[tuple[Key, Probed]]:
     waiting: dict[Any, Key] = {}
     with crew:
         for key, samples in columns:
@@ -35,6 +35,6 @@ def _side_by_side(columns: Columns, crew: Crew) -> Iterator[tuple[Key, Probed]]:
             yield from _finished(crew, waiting)
 
 
-def _finished(crew: Crew, waiting: dict[Any, Key]) -> Iterator[tuple[Key, Probed]]:
+def _finished(crew: ProbeExecutor, waiting: dict[Any, Key]) -> Iterator[tuple[Key, Probed]]:
     for task in crew.first_of(list(waiting)):
         yield waiting.pop(task), crew.result(task)

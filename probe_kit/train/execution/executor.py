@@ -17,7 +17,7 @@ Problems = Mapping[str, CategoryProblem]
 Probed = dict[str, SiteProbe]
 
 
-class Crew(Protocol):
+class ProbeExecutor(Protocol):
     """Who probes columns side by side. A context manager; a task is whatever `submit` returns.
 
     size: columns that can be probed at once.
@@ -42,7 +42,7 @@ class Crew(Protocol):
 
 
 @dataclass(frozen=True)
-class CrewSettings:
+class ExecutionSettings:
     """Who probes, which changes no number.
 
     jobs: columns at once, 1 by default. device: where torch solves them; numpy does without one. ray: address of

@@ -11,7 +11,7 @@ from probe_kit.train.data.samples import Samples
 from probe_kit.train.execution.executor import Probed, Problems, probe_column
 
 
-class ProcessCrew:
+class ProcessExecutor:
     """`size` processes; a task is its number. One that dies ends the sweep, which continues where it stopped."""
 
     def __init__(self, problems: Problems, size: int) -> None:

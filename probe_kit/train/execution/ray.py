@@ -10,7 +10,7 @@ from probe_kit.train.data.samples import Samples
 from probe_kit.train.execution.executor import Probed, Problems, probe_column
 
 
-class RayCrew:
+class RayExecutor:
     """Tasks on a cluster, one core each; a task whose worker dies is repeated by Ray.
 
     address: of the cluster, whose nodes have probe_kit installed; `auto` for the one this process belongs to, or

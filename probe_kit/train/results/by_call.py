@@ -8,7 +8,7 @@ from probe_kit.train.results.store import is_current, load_results, read_probes,
 from probe_kit.train.settings import FORMAT
 
 
-def load_calls(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
+def load_results_by_call(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
     """By captured inference, in order: the stored probes of `run` that differ from `like` in nothing else.
 
     Episodes that ended before an inference have no part in its probes. `like` itself is among them.

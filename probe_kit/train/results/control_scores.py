@@ -53,7 +53,7 @@ class TwinScore:
 
 
 @dataclass(frozen=True)
-class Excess:
+class ControlComparison:
     """Whether a site's probe is more accurate than a control: paired by group, family-wise over its stream.
 
     control: `binding`, or `twin` for the best site of the twin's stream. reference: the control's accuracy.
@@ -71,7 +71,7 @@ Beats = dict[str, bool | None]
 """Whether a site is better than `chance`, `binding` and `twin`; None for what was not run."""
 
 
-def signal(beats: Beats) -> bool:
+def has_signal(beats: Beats) -> bool:
     """Whether that is knowledge: better than chance, and than every control that was run."""
     return beats["chance"] is True and False not in beats.values()
 
@@ -82,7 +82,7 @@ class Controls:
 
     baselines: tuple[BaselineScore, ...] = ()
     twin: tuple[TwinScore, ...] = ()
-    excess: tuple[Excess, ...] = ()
+    excess: tuple[ControlComparison, ...] = ()
 
     def beats(self, category: str, view: str, site: str, p_fwe: float) -> Beats:
         """What a site with this family-wise p is better than."""
@@ -116,7 +116,7 @@ class Controls:
         """The same baselines with another twin."""
         return replace(self, twin=tuple(scores))
 
-    def with_excess(self, found: Sequence[Excess]) -> "Controls":
+    def with_excess(self, found: Sequence[ControlComparison]) -> "Controls":
         """These, with all sites held anew against the controls that are in `found`."""
         renewed = {one.control for one in found}
         return replace(self, excess=(*(one for one in self.excess if one.control not in renewed), *found))
@@ -131,5 +131,5 @@ class Controls:
         return cls(
             tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
             tuple(TwinScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["twin"]),
-            tuple(Excess(**one) for one in stored["excess"]),
+            tuple(ControlComparison(**one) for one in stored["excess"]),
         )

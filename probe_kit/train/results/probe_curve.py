@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
 from probe_kit.statistics.folds import Fold
-from probe_kit.statistics.label_permutations import family_p
+from probe_kit.statistics.label_permutations import max_statistic_p
 from probe_kit.train.crossval.metrics import chance_level, correctness
 
 
 @dataclass(frozen=True)
-class Curve:
+class ProbeCurve:
     """All sites of one category in one view, on the same episodes (E), folds (F) and relabellings (P).
 
     sites: S of them. labels: (E,) bool. episodes, items, groups: (E,) identities. fold_of: (E,) outer fold.
@@ -83,7 +83,7 @@ class Curve:
         accuracy = self.correct.mean(axis=1)
         for name in {site.stream for site in self.sites}:
             rows = self.stream(name)
-            p[rows] = family_p(accuracy[rows], self.null[rows])
+            p[rows] = max_statistic_p(accuracy[rows], self.null[rows])
         return p
 
     @property

@@ -12,11 +12,11 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
-from probe_kit.statistics.label_permutations import site_p, smallest_p
+from probe_kit.statistics.label_permutations import pointwise_p, smallest_p
 from probe_kit.train.crossval.metrics import balanced_accuracy, fold_auc, log_loss
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import Controls, signal
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.control_scores import Controls, has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import Direction, Place
 from probe_kit.train.results.summary import results_html, results_text
 from probe_kit.train.settings import ProbeSettings
@@ -36,7 +36,7 @@ class ProbeResults:
     """
 
     settings: ProbeSettings
-    curves: Mapping[tuple[str, str], Curve]
+    curves: Mapping[tuple[str, str], ProbeCurve]
     directions: Mapping[Place, Direction] = field(default_factory=dict)
     controls: Controls = field(default_factory=Controls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
@@ -62,7 +62,7 @@ class ProbeResults:
         outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
         consistent within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`:
         no p-value can be lower with so many relabellings. `beats_binding`, `beats_twin`: whether the site is
-        better than that control, missing where it was not run; `signal`: than chance, family-wise, and every
+        better than that control, missing where it was not run; `has_signal`: than chance, family-wise, and every
         control that was run.
         """
         import pandas as pd
@@ -91,11 +91,11 @@ def episodes_sha256(run: RunReader) -> str:
     return sha256_json(sorted(run.episodes["episode_id"].astype(str)))
 
 
-def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -> list[dict[str, Any]]:
+def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCurve) -> list[dict[str, Any]]:
     settings, folds, correct = results.settings, curve.folds(), curve.correct
     accuracy = correct.mean(axis=1)
     low, high = group_bootstrap(correct.T, curve.groups, units_seed(curve.groups, settings.suite))
-    p, p_fwe, control = site_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
+    p, p_fwe, control = pointwise_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
     beats = [
         results.controls.beats(category, view, str(site), float(p_site))
         for site, p_site in zip(curve.sites, p_fwe, strict=True)
@@ -133,7 +133,7 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: Curve) -
             "smallest_p": smallest_p(curve.null.shape[1]),
             "beats_binding": beats[row]["binding"],
             "beats_twin": beats[row]["twin"],
-            "signal": signal(beats[row]),
+            "signal": has_signal(beats[row]),
         }
         for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True))
     ]

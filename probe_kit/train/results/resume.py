@@ -12,13 +12,13 @@ from probe_kit.train.crossval.site_probe import SiteProbe
 
 
 @dataclass(frozen=True)
-class Unfinished:
+class SweepCheckpoint:
     """Probes of single sites, kept until the sweep they belong to is complete."""
 
     pieces: Pieces
 
     @classmethod
-    def of(cls, run: Location, key: str, stamp: str = "") -> "Unfinished":
+    def of(cls, run: Location, key: str, stamp: str = "") -> "SweepCheckpoint":
         """Those of the sweep that will be stored as `key`. stamp: hash of the commits that it reads."""
         return cls(Pieces.of(run, PROBES, key, stamp, "the same `probe-kit train` then probes the site again"))
 

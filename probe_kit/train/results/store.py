@@ -20,11 +20,11 @@ from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, t
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.train.data.captured_call import at_call, captured_calls
+from probe_kit.train.data.captured_call import restrict_to_call, captured_calls
 from probe_kit.train.data.labels import Target
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.settings import FORMAT, ProbeSettings
@@ -131,7 +131,7 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     """Whether probes of these settings are of the episodes that the run has now."""
     if settings.run_settings != run.settings_sha256 or settings.call >= max(captured_calls(run), 1):
         return False
-    return settings.episodes == episodes_sha256(at_call(run, settings.call))
+    return settings.episodes == episodes_sha256(restrict_to_call(run, settings.call))
 
 
 def _why_none(run: RunReader, target: Target, stored: int) -> str:
@@ -157,7 +157,7 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
-def _pack(curves: Mapping[tuple[str, str], Curve]) -> dict[str, Any]:
+def _pack(curves: Mapping[tuple[str, str], ProbeCurve]) -> dict[str, Any]:
     """Arrays by `category/view/member`; views hold no slash."""
     return {
         f"{category}/{view}/{name}": np.array([str(own) for own in value]) if isinstance(value, tuple) else value
@@ -166,13 +166,13 @@ def _pack(curves: Mapping[tuple[str, str], Curve]) -> dict[str, Any]:
     }
 
 
-def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], Curve]:
+def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     members: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)
         members.setdefault((category, view), {})[member] = value
     return {
-        pair: Curve(
+        pair: ProbeCurve(
             **{
                 **found,
                 "sites": tuple(Site.parse(str(name)) for name in found["sites"]),
@@ -208,7 +208,7 @@ def read_controls(bundle: Bundle) -> Controls:
 
 def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     settings = settings_of(bundle.head)
-    _refuse_foreign(run, bundle, settings)
+    _check_foreign(run, bundle, settings)
     try:
         with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
             curves = _unpack(arrays)
@@ -227,7 +227,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     )
 
 
-def _refuse_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
+def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
     """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
     stamp, now = bundle.head.get("stamp", ""), stamp_of_run(run)
     if stamp == now or not (stamp and now):

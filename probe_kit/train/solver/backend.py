@@ -13,7 +13,7 @@ Array = Any
 """A numpy array, or a torch tensor on any device."""
 
 
-def namespace(array: Array) -> Any:
+def array_namespace(array: Array) -> Any:
     """The module that made `array`: numpy or torch."""
     return import_module(type(array).__module__.partition(".")[0])
 
@@ -29,7 +29,7 @@ def to_device(array: NDArray[Any], device: str | None) -> Array:
 
 def to_device_of(like: Array, array: NDArray[Any]) -> Array:
     """`array` where `like` is, and made by the same module."""
-    return array if isinstance(like, np.ndarray) else namespace(like).as_tensor(array, device=like.device)
+    return array if isinstance(like, np.ndarray) else array_namespace(like).as_tensor(array, device=like.device)
 
 
 def to_numpy(array: Array) -> NDArray[Any]:

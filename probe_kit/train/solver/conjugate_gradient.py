@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probe_kit.train.solver.backend import Array, namespace
+from probe_kit.train.solver.backend import Array, array_namespace
 from probe_kit.train.solver.design_matrix import Design
 
 MAX_CG_STEPS = 100
 
 
 @dataclass(frozen=True)
-class Steps:
+class NewtonSteps:
     """Newton steps, (R, K), and what they change in the decisions: Z · step, (N, K), which costs no product more.
 
     unsettled: numbers of the columns that were not found in time, and are nothing.
@@ -22,12 +22,12 @@ class Steps:
     unsettled: Array
 
 
-def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array) -> Steps:
+def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array) -> NewtonSteps:
     """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
 
     penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S.
     """
-    xp = namespace(gradient)
+    xp = array_namespace(gradient)
     size = xp.linalg.norm(gradient, axis=0).clip(np.finfo(float).tiny)
     spectrum = design.spectrum
     penalty, rest, curvature, precision = (
@@ -56,7 +56,7 @@ def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Arr
             if len(live) < len(size):
                 found[:, live], changed[:, live] = step, change
                 step, change = found, changed
-            return Steps(step * size, change * size, live[keep])
+            return NewtonSteps(step * size, change * size, live[keep])
         if not keep.all():
             found[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
             live, slope, precision = live[keep], slope[keep], precision[keep]
@@ -69,9 +69,9 @@ def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Arr
         direction *= slope / previous
         direction += scaled
     found[:, live], changed[:, live] = 0.0, 0.0
-    return Steps(found * size, changed * size, live)
+    return NewtonSteps(found * size, changed * size, live)
 
 
 def _dots(left: Array, right: Array) -> Array:
     """(K,) products of columns."""
-    return namespace(left).einsum("rk,rk->k", left, right)
+    return array_namespace(left).einsum("rk,rk->k", left, right)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, Self
 
-from probe_kit.train.solver.backend import Array, namespace
-from probe_kit.train.solver.row_subset import ChosenRows
+from probe_kit.train.solver.backend import Array, array_namespace
+from probe_kit.train.solver.row_subset import RowSubset
 from probe_kit.train.solver.standardiser import Standardiser
 
 WORTH_NARROWING = 2**17
@@ -72,7 +72,7 @@ class DenseDesign(_OfAllColumns):
     @cached_property
     def spectrum(self) -> Array:
         """(R, 1) squared length of every column."""
-        return namespace(self.samples).einsum("nr,nr->r", self.samples, self.samples)[:, None]
+        return array_namespace(self.samples).einsum("nr,nr->r", self.samples, self.samples)[:, None]
 
     def __matmul__(self, weights: Array) -> Array:
         return self.samples @ weights
@@ -87,7 +87,7 @@ class DenseDesign(_OfAllColumns):
 
     def narrow(self) -> Self:
         """The same in float32, unless it is small."""
-        xp, (count, width) = namespace(self.samples), self.shape
+        xp, (count, width) = array_namespace(self.samples), self.shape
         if count * width < WORTH_NARROWING:
             return self
         return replace(self, samples=xp.asarray(self.samples, dtype=xp.float32))
@@ -109,7 +109,7 @@ class StackedDesign:
     def of_folds(cls, folds: Sequence[Design], columns: int) -> "StackedDesign":
         """Of dense designs, each with so many label columns of its own."""
         dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
-        xp, like = namespace(dense[0]), dense[0]
+        xp, like = array_namespace(dense[0]), dense[0]
         count, width = (max(samples.shape[axis] for samples in dense) for axis in (0, 1))
         filled = xp.zeros((len(folds), count, width), dtype=like.dtype, device=like.device)
         for fold, samples in zip(filled, dense, strict=True):
@@ -126,7 +126,7 @@ class StackedDesign:
     @property
     def spectrum(self) -> Array:
         """(R, K) squared length of every column of a label column's samples."""
-        return namespace(self.samples).square(self.samples).sum(axis=1)[self.fold_of].T
+        return array_namespace(self.samples).square(self.samples).sum(axis=1)[self.fold_of].T
 
     def of(self, columns: Array) -> "StackedDesign":
         """The same samples for the label columns of a mask (K,)."""
@@ -161,7 +161,7 @@ class StreamedDesign(_OfAllColumns):
     Memory is one block in float64, and (N, K) for K problems.
     """
 
-    features: ChosenRows
+    features: RowSubset
     standardise: Standardiser
     axes: Array
     variances: Array
@@ -174,7 +174,7 @@ class StreamedDesign(_OfAllColumns):
     @property
     def spectrum(self) -> Array:
         """(R, 1) squared length of every column."""
-        xp = namespace(self.axes)
+        xp = array_namespace(self.axes)
         return xp.hstack([self.variances, xp.ones_like(self.axes[0, :1]) * len(self.features)])[:, None]
 
     def __matmul__(self, weights: Array) -> Array:
@@ -191,10 +191,10 @@ class StreamedDesign(_OfAllColumns):
 
     def moments(self, weights: Array) -> Array:
         """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
-        return namespace(self.axes).stack([self._moments(column) for column in weights.T])
+        return array_namespace(self.axes).stack([self._moments(column) for column in weights.T])
 
     def _moments(self, weights: Array) -> Array:
-        xp, start = namespace(self.axes), 0
+        xp, start = array_namespace(self.axes), 0
         inner, border = 0.0, 0.0
         for block in self.features.blocks():
             samples, share = self.standardise(block), weights[start : start + len(block)]
@@ -207,4 +207,4 @@ class StreamedDesign(_OfAllColumns):
         return xp.vstack([xp.hstack([turned, edge]), xp.hstack([edge.T, corner])])
 
     def _joined(self, parts: list[Any]) -> Array:
-        return namespace(self.axes).concatenate(parts)
+        return array_namespace(self.axes).concatenate(parts)

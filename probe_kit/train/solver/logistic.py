@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train.solver.backend import Array, keep_freed_memory, namespace
+from probe_kit.train.solver.backend import Array, keep_freed_memory, array_namespace
 from probe_kit.train.solver.conjugate_gradient import newton_steps
 from probe_kit.train.solver.design_matrix import Design
 
@@ -54,7 +54,7 @@ class _Point:
 
     def like(self) -> "_Point":
         """As many points, of which nothing is known yet."""
-        return _Point(*(namespace(part).empty_like(part) for part in vars(self).values()))
+        return _Point(*(array_namespace(part).empty_like(part) for part in vars(self).values()))
 
     def only(self, chosen: Array) -> "_Point":
         """Some of them."""
@@ -99,7 +99,7 @@ class LogisticSolver:
         self.samples = samples
         self.tolerance = tolerance
         spectrum = samples.spectrum
-        self.xp = namespace(spectrum)
+        self.xp = array_namespace(spectrum)
         self.penalty = self.xp.ones_like(spectrum[:, :1])
         self.penalty[-1] = 0.0
         self.rounding = 1e-15 * (spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
@@ -110,7 +110,7 @@ class LogisticSolver:
         Raises ProbeNotConvergedError rather than return a column that is not at its optimum, and
         TooFewGroupsError for a column with a single class, which has no optimum.
         """
-        refuse_single_class(labels)
+        check_single_class(labels)
         signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.penalty.device) - 1.0
         yield from self.path_of_signs(signs, strengths)
 
@@ -265,7 +265,7 @@ class LogisticSolver:
         return strength * loss + 0.5 * self.xp.square(weights[:-1]).sum(axis=0)
 
 
-def refuse_single_class(labels: NDArray[np.bool_]) -> None:
+def check_single_class(labels: NDArray[np.bool_]) -> None:
     """Raise TooFewGroupsError for a column of (N, K) training labels that has no optimum."""
     if (labels.all(axis=0) | ~labels.any(axis=0)).any():
         raise TooFewGroupsError("all training samples have the same label; a probe needs both classes")
@@ -273,7 +273,7 @@ def refuse_single_class(labels: NDArray[np.bool_]) -> None:
 
 def _losses(margins: Array) -> tuple[Array, Array]:
     """(K,) sums of log(1 + exp(−m)) over (N, K) margins, and each one's negative slope, 1 − P(label)."""
-    xp = namespace(margins)
+    xp = array_namespace(margins)
     small = -abs(margins)
     xp.exp(small, out=small)
     loss = (xp.log1p(small) + (-margins).clip(0.0)).sum(axis=0)

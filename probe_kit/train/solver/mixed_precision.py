@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError
-from probe_kit.train.solver.backend import Array, namespace, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 
 TOLERANCE = 1e-9
 """A solution is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
@@ -30,7 +30,7 @@ TINY = float(np.finfo(np.float32).tiny)
 
 
 @dataclass(frozen=True)
-class Point:
+class NewtonState:
     """The objective of k problems at some weights.
 
     value: (k,) C · Σ loss + penalty. gradient: (k, R) by weights along axes, float64. size, length: (k,) norms
@@ -47,14 +47,14 @@ class Point:
     @property
     def relative(self) -> Array:
         """(k,) size of the gradient in units of the weights."""
-        larger = namespace(self.size).maximum(self.length, self.size)
+        larger = array_namespace(self.size).maximum(self.length, self.size)
         return self.size / larger.clip(TINY)
 
-    def only(self, chosen: NDArray[np.bool_]) -> "Point":
+    def only(self, chosen: NDArray[np.bool_]) -> "NewtonState":
         """Some of the problems."""
-        return self if chosen.all() else Point(*(part[chosen] for part in vars(self).values()))
+        return self if chosen.all() else NewtonState(*(part[chosen] for part in vars(self).values()))
 
-    def replace(self, chosen: NDArray[np.bool_], others: "Point") -> None:
+    def replace(self, chosen: NDArray[np.bool_], others: "NewtonState") -> None:
         """Put `others` in the place of some of the problems."""
         for part, other in zip(vars(self).values(), vars(others).values(), strict=True):
             part[chosen] = other
@@ -70,7 +70,7 @@ class Problems(Protocol):
     def strength(self) -> NDArray[np.float64]:
         """(K,) C."""
 
-    def point(self, weights: Array, rows: Rows, *, exact: bool) -> Point:
+    def point(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
         """The objective at turned `weights` (k, R), in float32, or at ones on features, exactly: in float64.
 
         Exact is on the data as they are, whatever the axes are.
@@ -102,12 +102,12 @@ def solve(problems: Problems, start: Array) -> Array:
 
     Raises ProbeNotConvergedError rather than return one that is not at its optimum.
     """
-    search = _Search(problems)
+    search = _NewtonSolver(problems)
     return search.refined(problems.turned_back(search.rough(problems.turned(start))))
 
 
 @dataclass(frozen=True)
-class _Search:
+class _NewtonSolver:
     problems: Problems
 
     def rough(self, start: Array) -> Array:
@@ -132,7 +132,7 @@ class _Search:
 
     def refined(self, start: Array) -> Array:
         """`start` brought to the optimum, certified by float64 gradients."""
-        found, rows, weights = namespace(start).empty_like(start), np.arange(len(start)), start
+        found, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
         point = self._at(weights, rows, exact=True)
         for _ in range(MAX_NEWTON_STEPS):
             # Negated, so that NaN stays open and ends in an error.
@@ -152,14 +152,14 @@ class _Search:
             "feature values."
         )
 
-    def _at(self, weights: Array, rows: Rows, *, exact: bool) -> Point:
+    def _at(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
         return self.problems.point(weights, rows, exact=exact)
 
     def _moved(
-        self, weights: Array, point: Point, rows: Rows, step: Array, slope: Array, *, exact: bool
-    ) -> tuple[Array, Point]:
+        self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
+    ) -> tuple[Array, NewtonState]:
         """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
-        length = namespace(step).ones_like(slope)
+        length = array_namespace(step).ones_like(slope)
         noise = (1e-11 if exact else 1e-6) * abs(point.value)
         moved = weights + step
         there = self._at(moved, rows, exact=exact)
@@ -172,12 +172,12 @@ class _Search:
             there.replace(too_far, self._at(moved[too_far], rows[too_far], exact=exact))
         return moved, there
 
-    def _newton_step(self, point: Point, rows: Rows) -> Array:
+    def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
         """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
 
         What conjugate gradients do not settle in time is solved by factorising.
         """
-        xp = namespace(point.gradient)
+        xp = array_namespace(point.gradient)
         size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
         rest = xp.asarray(-point.gradient / size, dtype=xp.float32)
         step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(rest)), point.curvature
@@ -208,7 +208,7 @@ class _Search:
         return step
 
 
-def _precision(point: Point) -> Array:
+def _precision(point: NewtonState) -> Array:
     """(k,) the share of the gradient that a step may leave: a more precise step would be wasted."""
     relative = point.relative
-    return namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)
+    return array_namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from probe_kit.train.solver.backend import Array, namespace, to_device_of, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_device_of, to_numpy
 
 WORTH_NARROWING = 1024
 """Features from which on eigenvectors in float32, made orthogonal again, take less time than in float64."""
@@ -22,7 +22,7 @@ def principal_axes(samples: Array) -> Array:
     orthogonal to machine precision, or 1e-10 where there are many, also for nearly equal samples, which the
     eigenvectors of a Gram matrix, scaled back, are not.
     """
-    xp = namespace(samples)
+    xp = array_namespace(samples)
     if samples.shape[0] < samples.shape[1]:
         span = xp.linalg.qr(samples.T)[0]
         return span @ principal_axes(samples @ span)
@@ -37,7 +37,7 @@ def narrow_axes(moments: Array) -> Array:
 
     They shape steps only, so that float32 will do, in half the time.
     """
-    xp = namespace(moments)
+    xp = array_namespace(moments)
     if len(moments) < WORTH_NARROWING:
         return _eigenvectors(xp.asarray(moments, dtype=xp.float32))
     moments = xp.asarray(moments, dtype=xp.float64)
@@ -55,7 +55,7 @@ def narrow_axes(moments: Array) -> Array:
 
 def _leading(moments: Array) -> tuple[Array, Array]:
     """(D, k) axes of the largest variances, and these, ascending: as many as a few products settle, maybe none."""
-    xp = namespace(moments)
+    xp = array_namespace(moments)
     start = np.random.default_rng(0).standard_normal((len(moments), LEADING))
     block = to_device_of(moments, start)
     for _ in range(POWERS):
@@ -71,7 +71,7 @@ def _leading(moments: Array) -> tuple[Array, Array]:
 def _eigenvectors(moments: Array) -> Array:
     """(D, D) of symmetric `moments` in float32, which are lost, by ascending eigenvalue."""
     if not isinstance(moments, np.ndarray):
-        return namespace(moments).linalg.eigh(moments)[1]
+        return array_namespace(moments).linalg.eigh(moments)[1]
     from scipy.linalg import eigh  # type: ignore[import-untyped]  # numpy's takes as long in float32 as in float64
 
     return eigh(moments, driver="evd", overwrite_a=True, check_finite=False)[1]
@@ -79,7 +79,7 @@ def _eigenvectors(moments: Array) -> Array:
 
 def _orthogonal(axes: Array) -> Array:
     """(D, D) float64: float32 axes after a step of Newton and Schulz, which squares what they lack, some 2e-6."""
-    xp = namespace(axes)
+    xp = array_namespace(axes)
     exact = xp.asarray(axes, dtype=xp.float64)
     lacking = exact.T @ exact
     diagonal = xp.arange(len(axes))

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.train.solver.backend import Array, namespace, to_device, to_numpy
+from probe_kit.train.solver.backend import Array, array_namespace, to_device, to_numpy
 
 ROWS_PER_BLOCK = 2048
 """32 MB of float64 at a width of 2,048."""
 
 
 @dataclass(frozen=True)
-class ChosenRows:
+class RowSubset:
     """The rows `chosen` (N,) of `matrix` (M, D), numpy or torch. Indexing chooses among them, without a copy."""
 
     matrix: Array
     chosen: NDArray[np.intp]
 
     @classmethod
-    def all(cls, matrix: Array) -> "ChosenRows":
+    def all(cls, matrix: Array) -> "RowSubset":
         """Every row."""
         return cls(matrix, np.arange(len(matrix)))
 
@@ -33,8 +33,8 @@ class ChosenRows:
     def __len__(self) -> int:
         return len(self.chosen)
 
-    def __getitem__(self, rows: NDArray[np.intp]) -> "ChosenRows":
-        return ChosenRows(self.matrix, self.chosen[rows])
+    def __getitem__(self, rows: NDArray[np.intp]) -> "RowSubset":
+        return RowSubset(self.matrix, self.chosen[rows])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(to_numpy(self.read()), dtype)
@@ -48,20 +48,20 @@ class ChosenRows:
         for start in range(0, len(self), ROWS_PER_BLOCK):
             yield self.matrix[self.chosen[start : start + ROWS_PER_BLOCK]]
 
-    def to(self, device: str | None) -> "ChosenRows":
+    def to(self, device: str | None) -> "RowSubset":
         """The same with the matrix as a torch tensor on `device`; unchanged without one."""
-        return ChosenRows(to_device(self.matrix, device), self.chosen)
+        return RowSubset(to_device(self.matrix, device), self.chosen)
 
 
-Features = Array | ChosenRows
+Features = Array | RowSubset
 """(N, D) in memory, or rows that are visited block by block."""
 
 
 def blocks_of(features: Features) -> Iterator[Array]:
     """The rows of `features` in blocks; an array is one block, itself."""
-    return features.blocks() if isinstance(features, ChosenRows) else iter([features])
+    return features.blocks() if isinstance(features, RowSubset) else iter([features])
 
 
 def module_of(features: Features) -> Any:
     """numpy or torch, whichever holds `features`."""
-    return namespace(features.matrix if isinstance(features, ChosenRows) else features)
+    return array_namespace(features.matrix if isinstance(features, RowSubset) else features)

@@ -9,7 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.rollout.action_ensemble import ensemble
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
-from probe_kit.extract.rollout.settings_checks import refuse_unreachable
+from probe_kit.extract.rollout.settings_checks import check_unreachable
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, load_policy
 from tests.support.spatialvla_checkpoints import write_checkpoint
@@ -56,5 +56,5 @@ def test_an_episode_is_played_by_the_mean_of_its_plans(tmp_path: Path, observati
     assert len(past) == 3
     asked = ExtractSettings("spatialvla", checkpoint, execute=2)
     with pytest.raises(UsageError, match="needs an inference per action"):
-        refuse_unreachable(asked, policy.card)
-    refuse_unreachable(replace(asked, execute=None), policy.card)
+        check_unreachable(asked, policy.card)
+    check_unreachable(replace(asked, execute=None), policy.card)

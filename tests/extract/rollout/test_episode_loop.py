@@ -12,7 +12,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
-from probe_kit.extract.rollout.episode_loop import Failure, Play, Rollout
+from probe_kit.extract.rollout.episode_loop import Failure, EpisodeLoop, Rollout
 from probe_kit.extract.rollout.stage import Ending, LocalStage, Seen, Stage
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.hooks.contract.observation import Observation
@@ -65,8 +65,8 @@ class Thinking:
 
     flagged = None
 
-    def __init__(self, log: list[tuple[str, int]], listens: bool) -> None:
-        self._log, self.listens = log, listens
+    def __init__(self, log: list[tuple[str, int]], capture_only: bool) -> None:
+        self._log, self.capture_only = log, capture_only
 
     def act(self, turns: Any) -> list[np.ndarray]:
         self._log.append(("asked for actions", turns[0].seed))
@@ -77,22 +77,22 @@ class Thinking:
 
 
 def played(
-    episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, listens: bool = False
+    episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
 ) -> tuple[list[Rollout | Failure], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
     left = iter([SimpleNamespace(index=number, policy_seed=number) for number in range(episodes)])
     ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
-    controller: Any = Thinking(log, listens)
+    controller: Any = Thinking(log, capture_only)
     next_episode: Callable[[], Any] = lambda: next(left, None)  # noqa: E731
-    return list(Play(stages, controller, ring, next_episode, lambda _planned: False)), log
+    return list(EpisodeLoop(stages, controller, ring, next_episode, lambda _planned: False)), log
 
 
-@pytest.mark.parametrize("listens", [False, True])
+@pytest.mark.parametrize("capture_only", [False, True])
 @pytest.mark.parametrize(("batch", "length"), [(1, 1), (1, 2), (2, 1), (2, 3)])
-def test_stages_begin_what_follows_before_they_are_heard(batch: int, length: int, listens: bool) -> None:
+def test_stages_begin_what_follows_before_they_are_heard(batch: int, length: int, capture_only: bool) -> None:
     """So that setting up an episode never falls between two inferences."""
-    results, log = played(12, batch, length, listens=listens)
+    results, log = played(12, batch, length, capture_only=capture_only)
     assert sorted(result.planned.index for result in results if isinstance(result, Rollout)) == list(range(12))
     begun = [position for position, (what, _) in enumerate(log) if what == "begun"]
     by_themselves = [position for position in begun if log[position - 1][0] == "ended"]

@@ -6,10 +6,10 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.env.simulation.camera import Camera
 from probe_kit.errors import UsageError
-from probe_kit.extract.rollout.examples import example_observations, refuse_unfit
-from probe_kit.hooks import Card
+from probe_kit.extract.rollout.examples import example_observations, check_unfit
+from probe_kit.hooks import ModelCard
 
-CARD = Card("mine", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 1, 1)
+CARD = ModelCard("mine", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 1, 1)
 
 
 def test_examples_have_the_scenes_picture_size_and_its_intrinsics() -> None:
@@ -31,8 +31,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused() -> None:
     (example,) = example_observations(SceneSpec(), ["Put the cube on the star"])
-    refuse_unfit(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), 1, example)
+    check_unfit(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), 1, example)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
-        refuse_unfit(replace(CARD, batch=1), 2, example)
+        check_unfit(replace(CARD, batch=1), 2, example)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
-        refuse_unfit(replace(CARD, needs=frozenset({"camera.wrist"})), 1, example)
+        check_unfit(replace(CARD, needs=frozenset({"camera.wrist"})), 1, example)

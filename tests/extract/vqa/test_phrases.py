@@ -35,7 +35,7 @@ def test_without_a_twin_the_concept_is_exchanged_in_the_items_own_phrase(suite: 
     alone = replace(suite, items=(item,))
     assert phrases(alone, "distractor")[item.item_id].text == f"{item.distractor_concept} shape"
     other = replace(suite, items=(replace(item, object_phrase="thing"),))
-    with pytest.raises(UsageError, match="--ask distractor: 1 of 1 items, in color"):
+    with pytest.raises(UsageError, match="--query distractor: 1 of 1 items, in color"):
         phrases(other, "distractor")
 
 

@@ -13,10 +13,10 @@ from probe_kit.errors import (
     UsageError,
     WeightsError,
 )
-from probe_kit.hooks.checkpoints.third_party import acting, loading, whose
+from probe_kit.hooks.checkpoints.third_party import while_acting, while_loading, with_origin
 
 
-@pytest.mark.parametrize("context", [loading, acting], ids=["loading", "acting"])
+@pytest.mark.parametrize("context", [while_loading, while_acting], ids=["loading", "acting"])
 @pytest.mark.parametrize("kind", [CheckpointError, WeightsError, InstructionError])
 def test_an_error_about_a_checkpoint_names_its_family_and_its_folder(
     context: Callable[[str, str], AbstractContextManager[None]], kind: type[ProbeKitError]
@@ -37,31 +37,31 @@ def test_an_error_about_a_checkpoint_names_its_family_and_its_folder(
     ],
 )
 def test_what_a_message_names_already_is_not_said_twice(reason: str, told: str) -> None:
-    assert whose(reason, "pi0", "/models/mine") == told
-    assert whose(told, "pi0", "/models/mine") == told
+    assert with_origin(reason, "pi0", "/models/mine") == told
+    assert with_origin(told, "pi0", "/models/mine") == told
 
 
 def test_a_slash_at_the_end_makes_no_other_folder() -> None:
-    assert whose("pi0: /models/mine/x is gone", "pi0", "/models/mine/") == "pi0: /models/mine/x is gone"
+    assert with_origin("pi0: /models/mine/x is gone", "pi0", "/models/mine/") == "pi0: /models/mine/x is gone"
 
 
 def test_a_folder_called_like_the_model_is_not_its_name() -> None:
-    told = whose("/golden/pi0/checkpoint/config.json is missing", "pi0", "/golden/pi0/checkpoint")
+    told = with_origin("/golden/pi0/checkpoint/config.json is missing", "pi0", "/golden/pi0/checkpoint")
     assert told == "pi0: /golden/pi0/checkpoint/config.json is missing"
 
 
 def test_other_errors_of_ours_are_left_as_they_are() -> None:
-    with pytest.raises(UsageError, match=r"^device 'x' cannot be used$"), loading("pi0", "/models/mine"):
+    with pytest.raises(UsageError, match=r"^device 'x' cannot be used$"), while_loading("pi0", "/models/mine"):
         raise UsageError("device 'x' cannot be used")
 
 
 def test_errors_of_others_and_an_end_of_the_process_are_named() -> None:
     with (
         pytest.raises(CheckpointError, match=r"pi0 cannot be loaded from /x: KeyError: 'a'"),
-        loading("pi0", "/x"),
+        while_loading("pi0", "/x"),
     ):
         raise KeyError("a")
-    with pytest.raises(PolicyFailedError, match=r"sys\.exit\(3\)"), loading("pi0", "/x"):
+    with pytest.raises(PolicyFailedError, match=r"sys\.exit\(3\)"), while_loading("pi0", "/x"):
         raise SystemExit(3)
-    with pytest.raises(PolicyFailedError, match=r"pi0 failed while it acted: KeyError"), acting("pi0", "/x"):
+    with pytest.raises(PolicyFailedError, match=r"pi0 failed while it acted: KeyError"), while_acting("pi0", "/x"):
         raise KeyError("a")

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import Card, Model, Observation, Reading, Roles, Rows, Site, Stream, Tap, capture, edit
+from probe_kit.hooks import ModelCard, Model, Observation, Reading, Roles, Rows, Site, Stream, Tap, capture, edit
 from probe_kit.hooks.testing import example_observations
 
-CARD = Card("guided", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 0, 0)
+CARD = ModelCard("guided", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 0, 0)
 
 
 class Guided(Model):

@@ -13,7 +13,7 @@ from probe_kit.extract import ask_run
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.vqa.phrases import Phrase
 from probe_kit.extract.vqa.templates import ORDERS, TEMPLATES
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny
 from probe_kit.models.embedded.folder import embedded_checkpoint
@@ -52,7 +52,7 @@ def test_it_knows_every_word_of_the_suite_in_every_prompt(reader: PaliGemma) -> 
 def test_transformers_reads_the_same_network_from_the_same_folder(reader: PaliGemma) -> None:
     theirs = PaliGemmaForConditionalGeneration.from_pretrained(FOLDER).eval()
     picture = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
-    question = Question(Observation(picture, "", np.zeros(8, np.float32)), "Put cube on star", ("A", "B"))
+    question = Prompt(Observation(picture, "", np.zeros(8, np.float32)), "Put cube on star", ("A", "B"))
     reading = reader.read([question])
     ids = torch.tensor([reader.prompt(question).ids])
     with torch.inference_mode():

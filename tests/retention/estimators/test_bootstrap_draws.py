@@ -14,13 +14,13 @@ from probe_kit.retention.estimators.bootstrap_draws import (
 )
 from probe_kit.retention.estimators.cross_fit import Crossfit
 from probe_kit.statistics.bootstrap import group_bootstrap
-from probe_kit.train import Curve
+from probe_kit.train import ProbeCurve
 
-CurveOf = Callable[..., Curve]
+CurveOf = Callable[..., ProbeCurve]
 Outcomes = Callable[..., pd.DataFrame]
 
 
-def estimates_of(curve: Curve, suite: str = "s@1#0") -> dict[str, Estimate]:
+def estimates_of(curve: ProbeCurve, suite: str = "s@1#0") -> dict[str, Estimate]:
     peaks = {"prefix": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
     found = {name: peak for name, peak in peaks.items() if peak is not None}
     return probe_estimates(curve, found, measure_retention(curve), suite)

@@ -16,7 +16,7 @@ from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.estimators.by_call import CallCurves, event_calls
-from probe_kit.train import ArrayRun, Curve, ProbeResults, load_results
+from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, load_results
 
 EXECUTED = 4
 GRASPS = (3, 11)
@@ -30,7 +30,7 @@ def _closed_figures() -> Iterator[None]:
 
 
 @pytest.fixture
-def by_call(probed_run: Callable[..., ArrayRun], curve_of: Callable[..., Curve]) -> dict[int, ProbeResults]:
+def by_call(probed_run: Callable[..., ArrayRun], curve_of: Callable[..., ProbeCurve]) -> dict[int, ProbeResults]:
     """The answer appears at call 2: nothing, nothing, 90 %, 90 %."""
     run = probed_run({"color": ([0.5, 0.5], [[0.5]])})
     first = load_results(run)

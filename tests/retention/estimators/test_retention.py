@@ -8,9 +8,9 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import best_site, measure_retention
-from probe_kit.train import Curve
+from probe_kit.train import ProbeCurve
 
-CurveOf = Callable[..., Curve]
+CurveOf = Callable[..., ProbeCurve]
 Outcomes = Callable[..., pd.DataFrame]
 
 
@@ -53,7 +53,7 @@ def test_without_backbone_signal_retention_is_not_defined_but_kept(
 
 def test_without_relabellings_retention_is_not_defined(curve_of: CurveOf, episodes: pd.DataFrame) -> None:
     curve = curve_of(episodes, [0.9], [[0.8]])
-    bare = Curve(**{**vars(curve), "null": np.empty((2, 0))})
+    bare = ProbeCurve(**{**vars(curve), "null": np.empty((2, 0))})
     found = measure_retention(bare)
     assert found is not None
     assert (found.defined, found.note) == (False, "n/a (no permutations)")

@@ -77,7 +77,7 @@ def test_every_probed_policy_has_its_story_by_its_first_view() -> None:
     assert [len(one.chapters) for one in (first, twin)] == [3, 1]
 
 
-@pytest.mark.parametrize("fields", [{"listened": True}, {"prefix_accuracy": None}])
+@pytest.mark.parametrize("fields", [{"capture_only": True}, {"prefix_accuracy": None}])
 def test_who_only_listened_or_was_not_probed_has_none(fields: dict[str, Any]) -> None:
     plain = vars(acts("color", 1.0, "used"))
     assert stories([RetentionRow(**{**plain, **fields})]) == []

@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks import Stream
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeResults, train_probes
-from probe_kit.train.controls.random_features import BindingInputs
+from probe_kit.train.controls.random_features import RandomFeatureInputs
 
 ITEMS, WIDTH = 100, 24
 
@@ -32,7 +32,7 @@ def run_of(suite: Suite, path: Path, knowledge: float = 0.0) -> ArrayRun:
     )  # fmt: skip
     sites = list(Stream("backbone", 3, WIDTH).sites())
     run = ArrayRun(path, "random", suite.identity, episodes, {})
-    inputs = BindingInputs.of(run, suite.folder)
+    inputs = RandomFeatureInputs.of(run, suite.folder)
     rows = np.arange(len(episodes))
     features = {(site, "mean"): inputs.layer(rows, WIDTH, 100 + site.layer) for site in sites}
     sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
@@ -63,7 +63,7 @@ def test_a_network_that_knows_the_answer_is_better_than_binding(suite: Suite, tm
 
 
 def test_random_layers_repeat_and_differ_by_seed(suite: Suite, tmp_path: Path) -> None:
-    inputs, rows = BindingInputs.of(run_of(suite, tmp_path), suite.folder), np.arange(20)
+    inputs, rows = RandomFeatureInputs.of(run_of(suite, tmp_path), suite.folder), np.arange(20)
     np.testing.assert_array_equal(inputs.layer(rows, 8, 0), inputs.layer(rows, 8, 0))
     assert (inputs.layer(rows, 8, 0) != inputs.layer(rows, 8, 1)).all()
     assert inputs.layer(rows, 8, 0).std() > 0.3  # neither dead nor saturated

@@ -23,8 +23,8 @@ from probe_kit.train.crossval.site_probe import STRENGTHS, cross_validate, neste
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver import mixed_precision as mixed
 from probe_kit.train.solver.backend import Array
-from probe_kit.train.solver.mixed_precision import Point
-from probe_kit.train.solver.row_subset import ChosenRows
+from probe_kit.train.solver.mixed_precision import NewtonState
+from probe_kit.train.solver.row_subset import RowSubset
 
 GENERATOR = np.random.default_rng(0)
 ITEMS = np.repeat(np.arange(30), 2)
@@ -48,14 +48,14 @@ class Evaluated(JointProblems):
 
     evaluated: ClassVar = Counter[int]()
 
-    def point(self, weights: Array, rows: np.ndarray, *, exact: bool) -> Point:
+    def point(self, weights: Array, rows: np.ndarray, *, exact: bool) -> NewtonState:
         self.evaluated.update(rows.tolist())
         return super().point(weights, rows, exact=exact)
 
 
 def tokens(features: np.ndarray) -> Samples:
     sums = np.add.reduceat(features, np.cumsum(COUNTS) - COUNTS, axis=0, dtype=np.float64)
-    return Samples(ChosenRows.all(features), COUNTS, sums / COUNTS[:, None])
+    return Samples(RowSubset.all(features), COUNTS, sums / COUNTS[:, None])
 
 
 def outliers() -> np.ndarray:
@@ -212,7 +212,7 @@ def test_59_relabellings_of_many_tokens_stay_within_the_stated_memory(monkeypatc
     """Features, their turned copy, COLUMN_MEMORY and blocks; held at once they would be many times as much."""
     counts = np.full(60, 150)
     features = np.random.default_rng(1).standard_normal((9000, 8), dtype=np.float32)
-    samples = Samples(ChosenRows.all(features), counts, features.reshape(60, 150, 8).mean(axis=1, dtype=float))
+    samples = Samples(RowSubset.all(features), counts, features.reshape(60, 150, 8).mean(axis=1, dtype=float))
     many = np.column_stack([LABELS, flip_items(LABELS, ITEMS, 59, seed=1)])
     monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 2**23)
     monkeypatch.setattr(joint_probe, "STRENGTHS", np.array([1e-3]))
@@ -246,7 +246,7 @@ def test_large_weights_that_nearly_cancel_are_found_as_far_as_sums_can_tell(
     signs = np.repeat(np.where(LABELS, 1.0, -1.0), 15)[:, None]
     features = shared + generator.standard_normal((900, 200)) + 0.2 * signs
     means = features.reshape(60, 15, 200).mean(axis=1)
-    site = JointSite.of(Samples(ChosenRows.all(features), counts, means), FOLDS)
+    site = JointSite.of(Samples(RowSubset.all(features), counts, means), FOLDS)
     sets = np.arange(len(training_sets(FOLDS)))
     of_episodes = np.tile(np.where(LABELS, 1, -1).astype(np.int8), (sets.size, 1))
     problems = Evaluated(site, sets, of_episodes, np.full(sets.size, 10.0))

@@ -16,9 +16,9 @@ from probe_kit.train.crossval.category_problem import CategoryProblem
 from probe_kit.train.crossval.site_probe import nested_folds
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.execution.dispatch import probe_columns
-from probe_kit.train.execution.executor import CrewSettings, Key, Probed
-from probe_kit.train.execution.processes import ProcessCrew
-from probe_kit.train.execution.ray import RayCrew
+from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
+from probe_kit.train.execution.processes import ProcessExecutor
+from probe_kit.train.execution.ray import RayExecutor
 
 ITEMS = np.repeat(np.arange(10), 2)
 LABELS = np.tile([True, False], 10)
@@ -41,7 +41,7 @@ def columns(read: list[Key]) -> Iterator[tuple[Key, Samples]]:
         yield key, Samples.pooled(np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32))
 
 
-def columns_of(settings: CrewSettings) -> dict[Key, Probed]:
+def columns_of(settings: ExecutionSettings) -> dict[Key, Probed]:
     return dict(probe_columns(columns([]), {"color": PROBLEM}, settings))
 
 
@@ -53,17 +53,17 @@ def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -
 
 
 def test_processes_give_the_same_numbers_as_this_one() -> None:
-    assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(jobs=2)))
+    assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(jobs=2)))
 
 
 def test_what_a_process_raises_keeps_its_class() -> None:
     of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
     with pytest.raises(TooFewGroupsError, match="same label"):
-        list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(jobs=2)))
+        list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(jobs=2)))
 
 
 def test_a_process_that_dies_is_named_with_a_way_out() -> None:
-    crew = ProcessCrew({"color": PROBLEM}, 1)
+    crew = ProcessExecutor({"color": PROBLEM}, 1)
     samples = next(columns([]))[1]
 
     def probe() -> None:
@@ -78,12 +78,12 @@ def test_a_process_that_dies_is_named_with_a_way_out() -> None:
 def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
     pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
     with pytest.raises(UsageError, match=r"no Ray cluster answers at '127\.0\.0\.1:9'"):
-        columns_of(CrewSettings(ray="127.0.0.1:9"))
+        columns_of(ExecutionSettings(ray="127.0.0.1:9"))
 
 
 def test_columns_are_read_only_when_they_are_needed() -> None:
     read: list[Key] = []
-    probing = probe_columns(columns(read), {"color": PROBLEM}, CrewSettings())
+    probing = probe_columns(columns(read), {"color": PROBLEM}, ExecutionSettings())
     next(probing)
     assert len(read) == 1
 
@@ -91,7 +91,7 @@ def test_columns_are_read_only_when_they_are_needed() -> None:
 def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"probe-kit\[ray\]"):
-        columns_of(CrewSettings(ray="auto"))
+        columns_of(ExecutionSettings(ray="auto"))
 
 
 LOST = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError")
@@ -111,7 +111,7 @@ def test_a_task_that_ray_repeated_in_vain_says_how_to_go_on(name: str, monkeypat
     kinds = dict.fromkeys(
         ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError"), OtherError
     )
-    crew = RayCrew({}, "auto")
+    crew = RayExecutor({}, "auto")
     there = SimpleNamespace(get=get, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
     monkeypatch.setattr(crew, "_ray", there, raising=False)
     with pytest.raises(WorkerDiedError, match=r"its node is gone\. The same command continues"):
@@ -136,9 +136,9 @@ def test_ray_gives_the_same_numbers_and_raises_what_a_task_raises() -> None:
         pytest.skip(f"Ray does not start here: {error}")
     of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
     try:
-        assert_same_numbers(columns_of(CrewSettings()), columns_of(CrewSettings(ray="auto")))
+        assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(ray="auto")))
         with pytest.raises(TooFewGroupsError, match="same label"):
-            list(probe_columns(columns([]), {"color": of_one_class}, CrewSettings(ray="auto", jobs=1)))
+            list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(ray="auto", jobs=1)))
         assert ray.is_initialized()  # a cluster somebody else started stays
     finally:
         ray.shutdown()

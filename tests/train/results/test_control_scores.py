@@ -1,7 +1,7 @@
 import json
 
-from probe_kit.train import BaselineScore, Controls, Excess, TwinScore
-from probe_kit.train.results.control_scores import signal
+from probe_kit.train import BaselineScore, Controls, ControlComparison, TwinScore
+from probe_kit.train.results.control_scores import has_signal
 
 
 def baseline(name: str, p: float | None = 0.5, accuracy: float = 0.5) -> BaselineScore:
@@ -42,19 +42,19 @@ def test_the_twin_of_a_stream_is_its_peak() -> None:
 
 def test_signal_must_beat_every_control_that_was_run() -> None:
     site = "backbone.01.residual"
-    controls = Controls().with_excess([Excess("binding", "color", "mean", site, 0.6, 0.2)])
+    controls = Controls().with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.2)])
     assert controls.beats("color", "mean", site, 0.001) == {"chance": True, "binding": False, "twin": None}
-    assert not signal(controls.beats("color", "mean", site, 0.001))
-    better = controls.with_excess([Excess("binding", "color", "mean", site, 0.6, 0.01)])
-    assert signal(better.beats("color", "mean", site, 0.001))
-    assert not signal(better.beats("color", "mean", site, 0.2))
+    assert not has_signal(controls.beats("color", "mean", site, 0.001))
+    better = controls.with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.01)])
+    assert has_signal(better.beats("color", "mean", site, 0.001))
+    assert not has_signal(better.beats("color", "mean", site, 0.2))
     assert better.beats("shape", "mean", site, 0.001) == {"chance": True, "binding": None, "twin": None}
-    assert signal({"chance": True, "binding": None, "twin": None})
+    assert has_signal({"chance": True, "binding": None, "twin": None})
     assert better.beats("color", "mean", site, float("nan"))["chance"] is None
-    assert not signal(better.beats("color", "mean", site, float("nan")))
+    assert not has_signal(better.beats("color", "mean", site, float("nan")))
 
 
 def test_json_gives_the_same_controls_back() -> None:
-    excess = Excess("twin", "color", "mean", "backbone.01.residual", 0.6, 0.2)
+    excess = ControlComparison("twin", "color", "mean", "backbone.01.residual", 0.6, 0.2)
     controls = Controls((baseline("pixels", None),), (twin("backbone.01.residual", True),), (excess,))
     assert Controls.from_json(json.loads(json.dumps(controls.to_json()))) == controls

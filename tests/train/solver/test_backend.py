@@ -2,19 +2,19 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.train.solver.backend import check_device, namespace, to_device, to_numpy
+from probe_kit.train.solver.backend import check_device, array_namespace, to_device, to_numpy
 
 
 def test_numpy_arrays_stay_where_they_are_without_a_device() -> None:
     array = np.ones(3)
     assert to_numpy(to_device(array, None)) is array
-    assert namespace(array) is np
+    assert array_namespace(array) is np
 
 
 def test_tensors_come_back_as_the_same_numbers() -> None:
     torch = pytest.importorskip("torch")
     tensor = to_device(np.arange(3.0), "cpu")
-    assert namespace(tensor) is torch
+    assert array_namespace(tensor) is torch
     assert tensor.dtype == torch.float64
     assert to_numpy(tensor).tolist() == [0, 1, 2]
 

@@ -6,8 +6,8 @@ import pytest
 from probe_kit.train.solver import row_subset as rows
 from probe_kit.train.solver.design_matrix import DenseDesign, StreamedDesign
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.projection import Coordinates
-from probe_kit.train.solver.row_subset import ChosenRows
+from probe_kit.train.solver.projection import Projection
+from probe_kit.train.solver.row_subset import RowSubset
 
 GENERATOR = np.random.default_rng(0)
 FEATURES = (GENERATOR.standard_normal((300, 12)) @ GENERATOR.standard_normal((12, 12)) + 30).astype(np.float32)
@@ -25,8 +25,8 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rows, "ROWS_PER_BLOCK", 64)
 
 
-def streamed(features: np.ndarray = FEATURES) -> Coordinates:
-    coordinates = Coordinates.fit(ChosenRows.all(features))
+def streamed(features: np.ndarray = FEATURES) -> Projection:
+    coordinates = Projection.fit(RowSubset.all(features))
     assert isinstance(coordinates.train, StreamedDesign)
     return coordinates
 
@@ -47,7 +47,7 @@ def test_streamed_products_are_those_of_the_samples_in_memory() -> None:
 @pytest.mark.usefixtures("small_blocks")
 def test_streamed_probes_decide_as_probes_in_memory() -> None:
     strengths = np.array([1e-4, 1e-1, 10.0])
-    at_once, by_blocks = Coordinates.fit(FEATURES), streamed()
+    at_once, by_blocks = Projection.fit(FEATURES), streamed()
     for one, other in zip(
         LogisticSolver(at_once.train).path(LABELS, strengths),
         LogisticSolver(by_blocks.train).path(LABELS, strengths),
@@ -79,10 +79,10 @@ def test_a_probe_on_many_rows_needs_memory_for_a_block_not_for_a_copy() -> None:
 
 def test_rows_that_fit_into_memory_are_turned_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("probe_kit.train.solver.projection.IN_MEMORY", 8 * 300 * 12)
-    assert isinstance(Coordinates.fit(ChosenRows.all(FEATURES)).train, DenseDesign)
+    assert isinstance(Projection.fit(RowSubset.all(FEATURES)).train, DenseDesign)
 
 
 def test_few_rows_are_taken_into_memory_and_reduced() -> None:
-    few = Coordinates.fit(ChosenRows.all(FEATURES[:8]))
+    few = Projection.fit(RowSubset.all(FEATURES[:8]))
     assert isinstance(few.train, DenseDesign)
     assert few.train.shape == (8, 9)

@@ -14,7 +14,7 @@ from probe_kit.train.solver import logistic as solver
 from probe_kit.train.solver import principal_axes as axes
 from probe_kit.train.solver.design_matrix import DenseDesign, StackedDesign
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 
 GENERATOR = np.random.default_rng(0)
 NOISE = GENERATOR.standard_normal((90, 200))
@@ -22,7 +22,7 @@ LABELS = GENERATOR.random(90) < 0.5
 SIGNS = np.where(LABELS, 1.0, -1.0)[:, None]
 
 
-Path = Callable[[Coordinates, np.ndarray, np.ndarray], list[np.ndarray]]
+Path = Callable[[Projection, np.ndarray, np.ndarray], list[np.ndarray]]
 
 
 @pytest.fixture(params=["alone", "by steps in float32", "beside another fold"])
@@ -38,13 +38,13 @@ def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Pat
     return beside_another_fold if request.param == "beside another fold" else alone
 
 
-def alone(coordinates: Coordinates, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
+def alone(coordinates: Projection, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
     return list(LogisticSolver(coordinates.train).path(labels, strengths))
 
 
-def beside_another_fold(coordinates: Coordinates, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
+def beside_another_fold(coordinates: Projection, labels: np.ndarray, strengths: np.ndarray) -> list[np.ndarray]:
     """With samples filled up to the size of a larger fold."""
-    larger = Coordinates.fit(np.random.default_rng(1).standard_normal((95, 120)))
+    larger = Projection.fit(np.random.default_rng(1).standard_normal((95, 120)))
     count, (samples, rank) = labels.shape[1], coordinates.train.shape
     design = StackedDesign.of_folds([coordinates.train, larger.train], count)
     signs = np.zeros((95, 2 * count))
@@ -87,7 +87,7 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
     case: Callable[[], tuple[np.ndarray, np.ndarray]], path: Path
 ) -> None:
     features, labels = case()
-    coordinates = Coordinates.fit(features)
+    coordinates = Projection.fit(features)
     others = features.mean(axis=0) + features.std(axis=0) * GENERATOR.standard_normal((25, features.shape[1]))
     samples = np.vstack([coordinates.standardise(features), coordinates.standardise(others)])
     ours = np.vstack([coordinates(features), coordinates(others)])
@@ -103,7 +103,7 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
 
 
 def test_columns_solved_together_equal_columns_solved_alone(path: Path) -> None:
-    samples = Coordinates.fit(NOISE)
+    samples = Projection.fit(NOISE)
     labels = GENERATOR.random((90, 7)) < 0.5
     together = path(samples, labels, STRENGTHS)
     for column in range(7):
@@ -115,7 +115,7 @@ def test_columns_solved_together_equal_columns_solved_alone(path: Path) -> None:
 def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    samples = Coordinates.fit(NOISE).train
+    samples = Projection.fit(NOISE).train
     (expected,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
     monkeypatch.setattr(conjugate, "MAX_CG_STEPS", 1)
     (found,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
@@ -123,7 +123,7 @@ def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
 
 
 def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = Coordinates.fit(outliers_and_constants()).train
+    samples = Projection.fit(outliers_and_constants()).train
     labels = GENERATOR.random((90, 40)) < 0.5
     wide = list(LogisticSolver(samples).path(labels, STRENGTHS))
     monkeypatch.setattr(design, "WORTH_NARROWING", 0)
@@ -143,7 +143,7 @@ def test_steps_that_nobody_looked_back_at_never_go_in_circles(seed: int) -> None
     """One enormous sample: guessed wrong it has no curvature, and a whole step is far too long."""
     features = np.random.default_rng(0).standard_normal((1200, 400))
     features[0] *= 1e4
-    samples = Coordinates.fit(features.astype(np.float32)).train
+    samples = Projection.fit(features.astype(np.float32)).train
     assert samples.narrow() is not samples
     labels = np.random.default_rng(seed).random((1200, 12)) < 0.5
     for strength, weights in zip(STRENGTHS, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
@@ -154,7 +154,7 @@ def test_steps_that_nobody_looked_back_at_never_go_in_circles(seed: int) -> None
 
 
 def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = Coordinates.fit(NOISE[:, :40]).train
+    samples = Projection.fit(NOISE[:, :40]).train
     labels = GENERATOR.random((90, 5)) < 0.5
     expected = list(LogisticSolver(samples).path(labels, STRENGTHS))
     blurred = DenseDesign((samples.samples * (1 + 1e-3 * GENERATOR.random(samples.shape))).astype(np.float32))
@@ -165,7 +165,7 @@ def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.Mon
 
 def test_every_weight_given_back_has_an_exact_gradient_that_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(design, "WORTH_NARROWING", 0)
-    samples = Coordinates.fit(outliers_and_constants()).train.samples
+    samples = Projection.fit(outliers_and_constants()).train.samples
     labels = GENERATOR.random((90, 20)) < 0.5
     signs = 2.0 * labels - 1
     for strength, weights in zip(
@@ -179,11 +179,11 @@ def test_every_weight_given_back_has_an_exact_gradient_that_is_zero(monkeypatch:
 def test_an_unfinished_probe_is_an_error(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver, "MAX_NEWTON_STEPS", 2)
     with pytest.raises(ProbeNotConvergedError, match=r"of [12] logistic problems \(N=9[05], C=10\)"):
-        path(Coordinates.fit(NOISE), LABELS[:, None], np.array([10.0]))
+        path(Projection.fit(NOISE), LABELS[:, None], np.array([10.0]))
 
 
 def test_non_finite_samples_never_pass_as_converged(path: Path) -> None:
-    coordinates = Coordinates.fit(NOISE)
+    coordinates = Projection.fit(NOISE)
     assert isinstance(coordinates.train, DenseDesign)
     coordinates.train.samples[0, 0] = np.nan
     with pytest.raises(ProbeNotConvergedError):
@@ -192,11 +192,11 @@ def test_non_finite_samples_never_pass_as_converged(path: Path) -> None:
 
 def test_a_single_class_has_no_optimum() -> None:
     with pytest.raises(TooFewGroupsError, match="same label"):
-        list(LogisticSolver(Coordinates.fit(NOISE).train).path(np.ones((90, 1), dtype=bool), STRENGTHS))
+        list(LogisticSolver(Projection.fit(NOISE).train).path(np.ones((90, 1), dtype=bool), STRENGTHS))
 
 
 def test_every_column_can_have_a_strength_of_its_own() -> None:
-    samples = Coordinates.fit(NOISE)
+    samples = Projection.fit(NOISE)
     of_columns = LogisticSolver(samples.train).path_of_signs(
         np.repeat(SIGNS, 3, axis=1), [np.array([1.0, 0.01, 1.0])]
     )

@@ -6,7 +6,7 @@ import torch
 
 from probe_kit.train.solver import principal_axes as axes
 from probe_kit.train.solver.principal_axes import principal_axes
-from probe_kit.train.solver.projection import Coordinates
+from probe_kit.train.solver.projection import Projection
 from probe_kit.train.solver.standardiser import Standardiser
 
 
@@ -63,7 +63,7 @@ def test_many_axes_are_found_in_float32_and_orthogonal_in_float64(
 
 
 def test_coordinates_of_training_samples_are_uncorrelated() -> None:
-    (moments,) = Coordinates.fit(noise(30, 80)).train.moments(np.ones((30, 1)))
+    (moments,) = Projection.fit(noise(30, 80)).train.moments(np.ones((30, 1)))
     np.testing.assert_allclose(moments, np.diag(np.diag(moments)), atol=1e-10)
 
 
@@ -71,7 +71,7 @@ def test_coordinates_of_training_samples_are_uncorrelated() -> None:
 def test_raw_weights_decide_like_the_weights_in_coordinates(shape: tuple[int, int]) -> None:
     features = 4 + 2 * noise(*shape)
     features[:, 5] = 3.0
-    coordinates = Coordinates.fit(features)
+    coordinates = Projection.fit(features)
     weights = np.random.default_rng(1).standard_normal(coordinates.train.shape[1])
     raw, intercept = coordinates.raw_weights(weights)
     np.testing.assert_allclose(features @ raw + intercept, coordinates.train @ weights, atol=1e-9)
@@ -79,5 +79,5 @@ def test_raw_weights_decide_like_the_weights_in_coordinates(shape: tuple[int, in
 
 
 def test_a_site_without_any_varying_feature_has_only_an_intercept() -> None:
-    coordinates = Coordinates.fit(np.ones((10, 6)))
+    coordinates = Projection.fit(np.ones((10, 6)))
     assert (coordinates.train @ np.eye(1)).tolist() == [[1.0]] * 10

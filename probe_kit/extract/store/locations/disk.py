@@ -10,7 +10,7 @@ HEADROOM = 1.1
 _UNITS = ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
 
-def refuse_if_full(parts: Mapping[str, int], location: Location) -> None:
+def check_if_full(parts: Mapping[str, int], location: Location) -> None:
     """Raise DiskSpaceError if the parts of a run, in bytes, with headroom exceed the free space at `location`."""
     needed, free = sum(parts.values()) * HEADROOM, location.free_bytes()
     if free is not None and needed > free:

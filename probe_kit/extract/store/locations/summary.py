@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from probe_kit._terminal.notebook import facts_html
-from probe_kit.extract.run_layout import LISTENED, RUN_FILE
+from probe_kit.extract.run_layout import CAPTURE_ONLY, RUN_FILE
 from probe_kit.hooks.contract.summary import streams_text
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ NOT_PROTECTED = "not protected: made by a former version, without hashes that fi
 def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
-    random += ", LISTENED TO (it did not act)" if LISTENED in _outcomes(run) else ""
+    random += ", CAPTURE_ONLY TO (it did not act)" if CAPTURE_ONLY in _outcomes(run) else ""
     old = "" if run.protected else ", not protected"
     return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}{old}, at {run.location}>"
 

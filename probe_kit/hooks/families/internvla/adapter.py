@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Rows, Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -101,7 +101,7 @@ class InternVLA(QwenVLA):
             )
         return {stream.name: stream for stream in streams}
 
-    def _card(self, filled: Filled[InternVLANetwork], checkpoint: str, tokenizer: str | None) -> Card:
+    def _card(self, filled: Filled[InternVLANetwork], checkpoint: str, tokenizer: str | None) -> ModelCard:
         units = self._units_or_reason()
         if isinstance(units, ActionUnits):
             note = f"units of {units.key}"
@@ -112,7 +112,7 @@ class InternVLA(QwenVLA):
         files = side_files(self.parts.place) | side_files(self.parts.vlm, "vlm/")
         if tokenizer is not None:
             files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
-        return Card(
+        return ModelCard(
             family="internvla-m1",
             checkpoint=checkpoint,
             weights_sha256=filled.audit.sha256,
@@ -174,13 +174,13 @@ class InternVLA(QwenVLA):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
-        if (reason := self.misfit()) is not None:
+        if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
-        actions = self.units.restore(self.listen(seen, seeds))
+        actions = self.units.restore(self.infer_without_acting(seen, seeds))
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """No statistics, or other actions than an end-effector delta."""
         units, head = self._units_or_reason(), self.config.head
         if isinstance(units, str):
@@ -192,7 +192,7 @@ class InternVLA(QwenVLA):
             "needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
         )
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, A, action numbers) as the head puts them out, without units."""
         self.check(seen, seeds)
         head = self.config.head

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
 from probe_kit.hooks.families.internvla.units import ActionUnits
@@ -94,7 +94,7 @@ def _given(module: nn.Module, stack: ExitStack) -> list[tuple[Tensor, ...]]:
     return given
 
 
-def _vision(policy: InternVLA, tape: Tape, calls: Calls, pixels: Tensor) -> dict[str, Produce]:
+def _vision(policy: InternVLA, tape: ActivationCache, calls: Calls, pixels: Tensor) -> dict[str, Produce]:
     vision, dino = policy.further_streams["vision"], policy.further_streams["vision_dino"]
     return {
         "dino_pixels": lambda: numpy_of(pixels),
@@ -106,7 +106,7 @@ def _vision(policy: InternVLA, tape: Tape, calls: Calls, pixels: Tensor) -> dict
     }
 
 
-def _backbone(policy: InternVLA, inputs: QwenInputs, tape: Tape) -> dict[str, Produce]:
+def _backbone(policy: InternVLA, inputs: QwenInputs, tape: ActivationCache) -> dict[str, Produce]:
     backbone = policy.streams["backbone"]
 
     def normed() -> NDArray[Any]:
@@ -120,7 +120,7 @@ def _backbone(policy: InternVLA, inputs: QwenInputs, tape: Tape) -> dict[str, Pr
     }
 
 
-def _head(policy: InternVLA, tape: Tape, calls: Calls, actions: Tensor) -> dict[str, Produce]:
+def _head(policy: InternVLA, tape: ActivationCache, calls: Calls, actions: Tensor) -> dict[str, Produce]:
     halves = [stream for stream in policy.streams.values() if stream.part == "action"]
     rows = len(actions)
 

@@ -18,15 +18,15 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import Card
-from probe_kit.hooks.contract.model import Policy, Question, Reader, Reading, Tap
+from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.model import Policy, Prompt, AnswerModel, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
-from probe_kit.hooks.families.magma.text import ChatText, Prompt
+from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import MAPS
@@ -56,7 +56,7 @@ _GRIPPER_OPEN = 0.5
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
-class Magma(Policy, Reader):
+class Magma(Policy, AnswerModel):
     """A loaded Magma: acts, and answers questions in text."""
 
     interventions = MAPS
@@ -94,14 +94,14 @@ class Magma(Policy, Reader):
         }
         self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": layer_scale})
 
-    def _card(self, options: dict[str, str]) -> Card:
+    def _card(self, options: dict[str, str]) -> ModelCard:
         loaded, statistics = self.loaded, self.statistics
         files = side_files(loaded.folder)
         if self._text_folder != loaded.folder and self._text_folder.is_dir():
             files |= side_files(self._text_folder, "tokenizer/")
         side = f"shrunk to {self.shrink} x {self.shrink} first" if self.shrink else "whole, at any resolution"
         how = f"drawn at temperature {self.temperature:g}" if self.temperature else "the likeliest"
-        return Card(
+        return ModelCard(
             family="magma",
             checkpoint=loaded.checkpoint,
             weights_sha256=loaded.audit.sha256,
@@ -149,7 +149,7 @@ class Magma(Policy, Reader):
         """Which ids name which values: the last ones before the added tokens."""
         return ActionTokens(self.text.vocabulary, BINS)
 
-    def prompt(self, instruction: str) -> Prompt:
+    def prompt(self, instruction: str) -> TokenPrompt:
         """What the model is asked to act on an instruction."""
         return self.text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
@@ -181,7 +181,7 @@ class Magma(Policy, Reader):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; a row that put out no action holds still, see `flagged` and the contract."""
-        if (reason := self.misfit()) is not None:
+        if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         ids = self._tokens(seen, seeds)
         assert self.flagged is not None
@@ -191,7 +191,7 @@ class Magma(Policy, Reader):
             actions[row] = [0] * (STEPS - 1) + [seen[row].state[-1] > _GRIPPER_OPEN]
         return actions[:, None].astype(np.float32)
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta."""
         if len(self.statistics.low) == self.steps == STEPS:
             return None
@@ -200,7 +200,7 @@ class Magma(Policy, Reader):
             f"{self.steps} tokens; Act2Answer needs {STEPS} of both. Choose another -M unnorm_key"
         )
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, 1, tokens): the middle of the bin that each token names, without units."""
         return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
 
@@ -232,13 +232,13 @@ class Magma(Policy, Reader):
         """The language model's weights in modules of their own, so that what runs there fires no tap."""
         return self.network.unheard()
 
-    def weighing(self, note: Note) -> AbstractContextManager[None]:
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more for the position that chooses a token."""
         return of_decoder(self.decoder.layers, note)
 
     # -- answering ---------------------------------------------------------------------------------------
 
-    def read(self, questions: Sequence[Question]) -> Reading:
+    def read(self, questions: Sequence[Prompt]) -> Reading:
         """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
         self.check([question.seen for question in questions])
         prompts = [self._question(question).ids for question in questions]
@@ -251,7 +251,7 @@ class Magma(Policy, Reader):
         decoded = self.generate(prompts, pictures)
         return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
 
-    def _question(self, question: Question) -> Prompt:
+    def _question(self, question: Prompt) -> TokenPrompt:
         return self.text.prompt(question.text, question.begun, question.pictured)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
@@ -271,7 +271,7 @@ class Magma(Policy, Reader):
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
         return self._roles([self._labels(self.prompt(one.instruction), one.image) for one in seen])
 
-    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+    def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """As `roles`, of other questions than what to do; how an answer has begun is `special`."""
         shown = self.shows_pictures(questions)
         return self._roles(
@@ -283,7 +283,7 @@ class Magma(Policy, Reader):
         backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
         return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}
 
-    def _labels(self, prompt: Prompt, image: NDArray[np.uint8] | None) -> list[str]:
+    def _labels(self, prompt: TokenPrompt, image: NDArray[np.uint8] | None) -> list[str]:
         """Of every position but the last, which belongs to the stream `action`."""
         labels = ["language" if asked else "special" for asked in prompt.question]
         if image is None:

@@ -132,11 +132,11 @@ def _with_layer_scales(weights: Weights, layer_scale: str) -> tuple[dict[str, Te
         notes = (f"{len(renamed)} layer scales taken from tensors stored as .weight",)
     tensors = {renamed.get(name, name): tensor for name, tensor in weights.tensors.items()}
     if not weights.random:
-        _refuse_initial(tensors, weights.source)
+        _check_initial(tensors, weights.source)
     return tensors, notes
 
 
-def _refuse_initial(tensors: Mapping[str, Tensor], source: str) -> None:
+def _check_initial(tensors: Mapping[str, Tensor], source: str) -> None:
     scales = [tensor.float() for name, tensor in tensors.items() if _BLOCK.fullmatch(name)]
     values = {float(value) for scale in scales for value in (scale.min(), scale.max())}
     if len(values) == 1:

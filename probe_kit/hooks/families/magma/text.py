@@ -16,7 +16,7 @@ _FILE = "tokenizer.json"
 
 
 @dataclass(frozen=True)
-class Prompt:
+class TokenPrompt:
     """A whole prompt as ids, and which of them are the question, not the frames around it."""
 
     ids: tuple[int, ...]
@@ -102,13 +102,13 @@ class ChatText:
         flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)
 
-    def prompt(self, question: str, begun: str = "", pictured: bool = True) -> Prompt:
+    def prompt(self, question: str, begun: str = "", pictured: bool = True) -> TokenPrompt:
         """The whole prompt of a question about one picture, or in words alone.
 
         begun: how the answer has begun already.
         Raises InstructionError for a question that holds a token of the frames.
         """
-        self._refuse_markers(question + begun)
+        self._check_markers(question + begun)
         before = picture_question("", self.config.image_start_end) if pictured else ""
         turn = before + question
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
@@ -119,7 +119,7 @@ class ChatText:
             not special and first < stop and last > start
             for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
         )
-        return Prompt(tuple(encoding.ids), inside)
+        return TokenPrompt(tuple(encoding.ids), inside)
 
     def _place(self, turn: str, frames: str) -> tuple[int, int]:
         """Where in `frames` what the user says begins and ends."""
@@ -132,7 +132,7 @@ class ChatText:
             )
         return place, place + len(said)
 
-    def _refuse_markers(self, text: str) -> None:
+    def _check_markers(self, text: str) -> None:
         for token in self._tokenizer.get_added_tokens_decoder().values():
             if token.special and token.content in text:
                 raise InstructionError(

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.magma.adapter import BINS, Magma, load_magma
 from probe_kit.hooks.families.openvla.actions import ActionTokens
@@ -53,7 +53,7 @@ class _Run:
 
     picture: Picture
     decoded: Decoded
-    tape: Tape
+    tape: ActivationCache
 
 
 class _Reference:
@@ -158,7 +158,7 @@ class _Reference:
         parts = [self._column(run.tape, "backbone", None), self._column(run.tape, "action", 0)]
         return torch.cat(parts, dim=2)
 
-    def _column(self, tape: Tape, stream: str, iteration: int | None) -> Tensor:
+    def _column(self, tape: ActivationCache, stream: str, iteration: int | None) -> Tensor:
         """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
         blocks = self.model.streams[stream].layers - 1
         layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]

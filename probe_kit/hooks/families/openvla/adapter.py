@@ -97,7 +97,7 @@ class OpenVLA(PrismaticModel, Policy):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; seeds count only at a temperature. See the contract."""
-        if (reason := self.misfit()) is not None:
+        if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         ids = self._tokens(seen, seeds)
         if self.flagged is not None and self.flagged.any():
@@ -106,7 +106,7 @@ class OpenVLA(PrismaticModel, Policy):
         actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
         return actions[:, None].astype(np.float32)
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta."""
         if self.steps == _DIMENSIONS:
             return None
@@ -115,7 +115,7 @@ class OpenVLA(PrismaticModel, Policy):
             "delta. Choose another -M unnorm_key"
         )
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, 1, tokens): the middle of the bin that each token names, without units."""
         return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
 
@@ -149,14 +149,14 @@ class OpenVLA(PrismaticModel, Policy):
             stacklevel=3,
         )
 
-    def weighing(self, note: Note) -> AbstractContextManager[None]:
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more for the position that chooses a token."""
         return of_decoder(self.decoder.layers, note)
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""
         ids = self.tokenizer.encode(self.template.replace(_SLOT, instruction.lower()))
-        self._refuse_other_ids(ids)
+        self._check_other_ids(ids)
         return self.with_empty_token(ids)
 
     def with_empty_token(self, ids: list[int]) -> list[int]:
@@ -164,7 +164,7 @@ class OpenVLA(PrismaticModel, Policy):
         empty = self.config.empty_token
         return ids if ids[-1] == empty else [*ids, empty]
 
-    def _refuse_other_ids(self, ids: list[int]) -> None:
+    def _check_other_ids(self, ids: list[int]) -> None:
         """Of Llama's tokenizer it is known how it splits the prompt; another split would go unnoticed."""
         llama = self.config.text.model_type == "llama" and self.config.action_vocabulary == _LLAMA_VOCABULARY
         if llama and self.template == PROMPTS["openvla"] and ids[: len(_LLAMA_PROMPT)] != _LLAMA_PROMPT:

@@ -61,7 +61,7 @@ FAMILIES = (
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. lerobot/pi0_base acts in 32 unnamed "
-            "dimensions: --checkpoint lerobot/pi0_base --listen"
+            "dimensions: --checkpoint lerobot/pi0_base --no-act"
         ),
         verifier=_VERIFIER,
         config_types=("pi0",),

@@ -35,7 +35,7 @@ LEAST_BYTES = 1_000_000_000
 """Of weights in the released size, which have 3.5 billion parameters."""
 
 
-def _refuse_small_weights(folder: Path) -> None:
+def _check_small_weights(folder: Path) -> None:
     """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
     found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
     if 0 < found < LEAST_BYTES:
@@ -60,7 +60,7 @@ class Pi0(EvaluatedPi0):
         """lerobot's policy at the size `dims.json` gives, or at the released size."""
         sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
         if not sizes:
-            _refuse_small_weights(folder)
+            _check_small_weights(folder)
         network: nn.Module = build_pi0(config, Pi0Size.from_file(sizes[0]) if sizes else None)
         return network
 
@@ -125,7 +125,7 @@ class Pi0(EvaluatedPi0):
         """The state, then the chunk."""
         return ["state", *["action"] * self.config.chunk_size]
 
-    def weighing(self, note: Note) -> AbstractContextManager[None]:
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """lerobot's expert attends eagerly, and returns its weights."""
         acting = [label == "action" for label in self.suffix_labels()]
 

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import Card
-from probe_kit.hooks.contract.model import Model, Question, Reader, Reading, Tap
+from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.model import Model, Prompt, AnswerModel, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -61,7 +61,7 @@ class PrismaticModel(Model):
             "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
             self.output: (self.output,),
         }
-        self.card = Card(
+        self.card = ModelCard(
             family=self.family,
             checkpoint=loaded.checkpoint,
             weights_sha256=loaded.audit.sha256,
@@ -198,7 +198,7 @@ class PrismaticModel(Model):
         return dict(zip(("vision", "vision_fused"), self.network.vision_backbone.towers, strict=False))
 
 
-class Prismatic(PrismaticModel, Reader):
+class Prismatic(PrismaticModel, AnswerModel):
     """A loaded Prismatic vision-language model: answers in text."""
 
     family: ClassVar[str] = "prismatic"
@@ -221,7 +221,7 @@ class Prismatic(PrismaticModel, Reader):
         """Ids of a question in the frame around it."""
         return self.tokenizer.encode(self.frame.around(instruction))
 
-    def read(self, questions: Sequence[Question]) -> Reading:
+    def read(self, questions: Sequence[Prompt]) -> Reading:
         """One prefill; see the contract. Raises UsageError if the model was loaded for more than one step."""
         if self.steps != 1:
             raise UsageError(
@@ -235,7 +235,7 @@ class Prismatic(PrismaticModel, Reader):
         prefill = self.prefill(questions)
         return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
 
-    def prefill(self, questions: Sequence[Question]) -> Prefill:
+    def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One pass over all questions."""
         self.check([question.seen for question in questions])
         pixels = None
@@ -246,14 +246,14 @@ class Prismatic(PrismaticModel, Reader):
             self.network.language_model, decoded.mask.long(), decoded.last, decoded.logits[:, 0], decoded.cache
         )
 
-    def _asked(self, question: Question) -> str:
+    def _asked(self, question: Prompt) -> str:
         return self.frame.around(question.text) + question.begun
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the observations' instructions as questions."""
-        return self.asked_roles([Question(one, one.instruction) for one in seen])
+        return self.asked_roles([Prompt(one, one.instruction) for one in seen])
 
-    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+    def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
         shown = self.network.patches if self.shows_pictures(questions) else 0
         image = [f"image.{CAMERA}"] * shown

@@ -62,7 +62,7 @@ def load_checkpoint(
     folder = checkpoint_folder(checkpoint)
     adapter = Adapter.read(folder) if (folder / ADAPTER_CONFIG).is_file() else None
     base = folder if adapter is None else adapter.base_folder()
-    _refuse_other_heads((folder, base))
+    _check_other_heads((folder, base))
     config = PrismaticConfig.from_folder(base)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
     if random_weights:
@@ -90,7 +90,7 @@ def load_checkpoint(
     )
 
 
-def _refuse_other_heads(folders: tuple[Path, ...]) -> None:
+def _check_other_heads(folders: tuple[Path, ...]) -> None:
     for folder in folders:
         for pattern in _OTHER_HEADS:
             if found := sorted(folder.glob(pattern)):

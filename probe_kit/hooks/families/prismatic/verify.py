@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, load_prismatic
 from probe_kit.hooks.families.prismatic.verify_asked import verify_asked
@@ -157,7 +157,7 @@ class Reference:
         return states, logits
 
 
-def _column(tape: Tape, model: PrismaticModel, stream: str, iteration: int | None) -> Tensor:
+def _column(tape: ActivationCache, model: PrismaticModel, stream: str, iteration: int | None) -> Tensor:
     """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
     blocks = model.streams[stream].layers - 1
     layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]

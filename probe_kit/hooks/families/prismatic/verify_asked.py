@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.capture_context import Tape, capture
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import Prismatic
@@ -37,7 +37,7 @@ def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comp
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
     frame = model.frame
     questions = [
-        Question(
+        Prompt(
             Observation(recorded[f"in_picture_{int(number)}"], np.zeros(8, np.float32), ""),
             row["text"].removeprefix(frame.before).removesuffix(frame.behind),
             tuple(model.lead + letter for letter in LETTERS),
@@ -50,11 +50,11 @@ def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comp
 class _Asked:
     """The recorded questions, run through the adapter when something asks for what comes of them."""
 
-    def __init__(self, model: Prismatic, questions: Sequence[Question], recorded: Arrays) -> None:
+    def __init__(self, model: Prismatic, questions: Sequence[Prompt], recorded: Arrays) -> None:
         self.model, self.questions, self.recorded = model, questions, recorded
 
     @cached_property
-    def heard(self) -> list[tuple[Tape, Prefill]]:
+    def heard(self) -> list[tuple[ActivationCache, Prefill]]:
         """Every row alone, with everything that is stored of it."""
         rows = []
         for question in self.questions:

@@ -19,7 +19,7 @@ TOKENS = Interventions(
     unread=("backbone",),
     memory=True,
     attention=True,
-    heard_from=1,
+    first_affected_token=1,
     tiles=True,
     readout="shadow",
 )

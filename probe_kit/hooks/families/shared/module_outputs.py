@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.hooks.capturing.capture_context import Tape
+from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.sites import Stream
 
 
@@ -23,7 +23,7 @@ def outputs_of(module: nn.Module, stack: ExitStack) -> list[Any]:
     return outputs
 
 
-def stacked(tape: Tape, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
+def stacked(tape: ActivationCache, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
     """(iterations or 1, layers, B, T, D) of one quantity."""
     sites = stream.sites(quantity)
     values = torch.stack([tape[site] for site in sites])

@@ -26,7 +26,7 @@ def kept_prompt(text: Any) -> Stream:
     return memory_stream(int(text.num_hidden_layers), heads * size)
 
 
-def remembered(joint: Any, blocks: int) -> Memory:
+def attach_prompt_kv(joint: Any, blocks: int) -> Memory:
     """The memory of lerobot's `joint`, whose pass over the prompt leaves its keys and values there from now on.
 
     lerobot calls its `forward` by name, past all hooks, so the instance gets one that sends the cache through.

@@ -96,7 +96,7 @@ class SmolVLA(LerobotFlow):
         return ["special", "special", *labels, "special"] if self.config.add_image_special_tokens else labels
 
     @contextmanager
-    def weighing(self, note: Note) -> Iterator[None]:
+    def record_attention(self, note: Note) -> Iterator[None]:
         """lerobot's attention is a method that tells no weights: computed once more from what it is given.
 
         Over the prompt it is called once per block, then in every iteration by each block that has an expert.

@@ -20,7 +20,7 @@ from torch import Tensor
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
@@ -102,9 +102,9 @@ class SpatialVLA(Policy):
         }
         self.card = self._card()
 
-    def _card(self) -> Card:
+    def _card(self) -> ModelCard:
         loaded, needed = self.loaded, self.config.depth is not None and self._preset is None
-        return Card(
+        return ModelCard(
             family=self.family,
             checkpoint=loaded.checkpoint,
             weights_sha256=loaded.audit.sha256,
@@ -238,7 +238,7 @@ class SpatialVLA(Policy):
                 packed.ids.to(device), packed.mask.to(device), features, self.steps, slots, fed
             )
 
-    def weighing(self, note: Note) -> AbstractContextManager[None]:
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Gemma-2's attention is eager, for its soft cap, and returns its weights."""
         return of_decoder(self.decoder.layers, note, eager=True)
 

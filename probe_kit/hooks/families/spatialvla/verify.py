@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.spatialvla.adapter import SCENE, SpatialVLA, choose_statistics
@@ -126,12 +126,12 @@ class _Reference:
         return policy.generate(self.pictures, self.cameras, [self.prompt], fed)
 
     @cached_property
-    def _spoken(self) -> tuple[Decoded, Tape]:
+    def _spoken(self) -> tuple[Decoded, ActivationCache]:
         with capture(self.policy, [*self.policy.sites(), *self.policy.sites("final_norm")]) as tape:
             return self._generate(self.policy), tape
 
     @cached_property
-    def _forced(self) -> tuple[Decoded, Tape]:
+    def _forced(self) -> tuple[Decoded, ActivationCache]:
         fed = torch.from_numpy(self.recorded["forced_ids"].reshape(1, -1))
         policy = self._policy(fed.shape[1] + 1)
         with capture(policy, [*policy.sites("residual"), *policy.sites("final_norm")]) as tape:
@@ -216,14 +216,14 @@ def _camera(loaded: LoadedSpatialVLA, recorded: Arrays) -> str:
     return SCENE
 
 
-def _steps(spoken: tuple[Decoded, Tape], policy: SpatialVLA) -> NDArray[Any]:
+def _steps(spoken: tuple[Decoded, ActivationCache], policy: SpatialVLA) -> NDArray[Any]:
     """(N, L+1, D) of every output token."""
     decoded, tape = spoken
     steps = range(decoded.ids.shape[1])
     return _numpy(torch.stack([_column(tape, policy, "action", step)[:, 0, 0] for step in steps]))
 
 
-def _column(tape: Tape, policy: SpatialVLA, stream: str, iteration: int | None) -> Tensor:
+def _column(tape: ActivationCache, policy: SpatialVLA, stream: str, iteration: int | None) -> Tensor:
     """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
     blocks = policy.streams[stream].layers - 1
     layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import read_weights
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -97,7 +97,7 @@ class Xiaomi(QwenVLA):
         self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
         self.card = self._card(filled, checkpoint, tokenizer)
 
-    def _card(self, filled: Filled[XiaomiNetwork], checkpoint: str, tokenizer: str | None) -> Card:
+    def _card(self, filled: Filled[XiaomiNetwork], checkpoint: str, tokenizer: str | None) -> ModelCard:
         units = self._units_or_reason()
         if isinstance(units, ActionUnits):
             chunk, note = len(units.mean), f"robot: {units.robot}"
@@ -108,7 +108,7 @@ class Xiaomi(QwenVLA):
         files = side_files(self.folder)
         if tokenizer is not None:
             files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
-        return Card(
+        return ModelCard(
             family="xiaomi-r0",
             checkpoint=checkpoint,
             weights_sha256=filled.audit.sha256,
@@ -169,16 +169,16 @@ class Xiaomi(QwenVLA):
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
         units = self.units
-        actions = units.restore(self.listen(seen, seeds))[..., :_USED]
+        actions = units.restore(self.infer_without_acting(seen, seeds))[..., :_USED]
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """No statistics."""
         units = self._units_or_reason()
         return units if isinstance(units, str) else None
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the flow puts them out, without units; all where nothing says which."""
         self.check(seen, seeds)
         units = self._units_or_reason()
@@ -217,7 +217,7 @@ class Xiaomi(QwenVLA):
         expert = Roles.from_labels(["special", *states, *["action"] * self.card.chunk])
         return {"backbone": self.backbone_roles(seen), "expert": [expert] * len(seen)}
 
-    def weighing(self, note: Note) -> AbstractContextManager[None]:
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more from what a layer of the expert is given, under the block whose memory it reads."""
         layers: Any = self.network.dit.layers
         first, own = len(self.language.layers) - len(layers), 1 + self.config.state_length

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.families.shared.module_outputs import numpy_of, outputs_of, stacked
 from probe_kit.hooks.families.xiaomi.adapter import Xiaomi, load_xiaomi
 from probe_kit.hooks.verification.verify import Comparison, Produce, compare
@@ -71,7 +71,7 @@ def _valid(policy: Xiaomi, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool
 
 
 def _backbone(
-    policy: Xiaomi, inputs: QwenInputs, tape: Tape, calls: Mapping[str, list[list[Any]]]
+    policy: Xiaomi, inputs: QwenInputs, tape: ActivationCache, calls: Mapping[str, list[list[Any]]]
 ) -> dict[str, Produce]:
     backbone = policy.streams["backbone"]
     cache = calls["model"][0][0].past_key_values.layers
@@ -89,7 +89,7 @@ def _backbone(
     }
 
 
-def _expert(policy: Xiaomi, tape: Tape, calls: Mapping[str, list[list[Any]]]) -> dict[str, Produce]:
+def _expert(policy: Xiaomi, tape: ActivationCache, calls: Mapping[str, list[list[Any]]]) -> dict[str, Produce]:
     return {
         "dit_layer_input": lambda: stacked(tape, policy.streams["expert"])[:, :-1],
         "dit_layer_output": lambda: numpy_of(

@@ -48,7 +48,7 @@ class Attention(Intervention):
 
     @property
     def kind(self) -> str:
-        """`attention`."""
+        """`capture_attention`."""
         return ATTENTION
 
     @property
@@ -121,11 +121,11 @@ class Noting:
 
     def play(self, turn: Turn) -> Played:
         """Nothing is changed."""
-        from probe_kit.hooks.capturing.attention import attention
+        from probe_kit.hooks.capturing.attention import capture_attention
 
         question, bench = turn.question, turn.bench
         masks = [self._mask(turn, role) for role in self.roles]
-        with attention(bench.policy) as mass:
+        with capture_attention(bench.policy) as mass:
             chunk = bench.act(question.seen, question.seed)
         return Played(chunk, mass=by_role(mass, masks))
 

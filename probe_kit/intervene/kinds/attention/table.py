@@ -6,7 +6,7 @@ from probe_kit.intervene.edits.sites import TILE_ROLES
 from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Weighed
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import FittingTable
+    from probe_kit._terminal.responsive_table import ResponsiveTable
 
 _LEGEND = (
     "Describes and enters no verdict: what is weighed need not be used. Percent of the attention that what acts "
@@ -16,9 +16,9 @@ _LEGEND = (
 )
 
 
-def weighed_table(weighed: Weighed, suite: str, of: str) -> "FittingTable":
+def weighed_table(weighed: Weighed, suite: str, of: str) -> "ResponsiveTable":
     """One line per category and block of the backbone that is read. of: model, suite."""
-    from probe_kit._terminal.responsive_table import Cell, FittingTable, Part
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
 
     names, shares, sides = [], [], []
     rows = weighed.rows(("block",))
@@ -38,7 +38,7 @@ def weighed_table(weighed: Weighed, suite: str, of: str) -> "FittingTable":
     parts = [Part("Where the attention lies, %", tuple(roles), tuple(shares))]
     if set(TILE_ROLES) <= set(roles):
         parts.append(Part("Tiles by answer", ("correct − other [95 %]",), tuple(sides)))
-    return FittingTable(
+    return ResponsiveTable(
         title=f"What does it weigh? {of}, attention",
         caption=_LEGEND,
         name="category · read",

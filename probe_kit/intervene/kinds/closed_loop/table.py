@@ -8,7 +8,7 @@ from probe_kit.intervene.kinds.image_swap.effects import WORTH
 from probe_kit.intervene.store.answers import PLAIN
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 _LEGEND = (
     "every episode played again, same scene and seeds, with the change at every inference; in a zone: whichever "
@@ -18,11 +18,11 @@ _LEGEND = (
 )
 
 
-def carried_out_table(rows: Sequence[CarriedOut], of: str) -> "FittingTable":
+def carried_out_table(rows: Sequence[CarriedOut], of: str) -> "ResponsiveTable":
     """One line per category and condition, dose 0 first. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import FittingTable, Part
+    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
 
-    return FittingTable(
+    return ResponsiveTable(
         title=f"Is it so when carried out? {of}",
         caption=_LEGEND,
         name="category · change",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from probe_kit.intervene.kinds.erase.effects import Erasing
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, FittingTable
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 _LEGEND = (
     "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
@@ -17,12 +17,12 @@ _LEGEND = (
 )
 
 
-def erased_table(rows: Sequence[Erasing], of: str) -> "FittingTable":
+def erased_table(rows: Sequence[Erasing], of: str) -> "ResponsiveTable":
     """One line per category and place; controls stand beside what they are held against. of: model, suite."""
-    from probe_kit._terminal.responsive_table import FittingTable, Part
+    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
 
     shown = [row for row in rows if row.finding not in ("control", "dose 0")]
-    return FittingTable(
+    return ResponsiveTable(
         title=f"What is lost without it? {of}, erase",
         caption=_LEGEND,
         name="category · erased",

@@ -20,7 +20,7 @@ from probe_kit.intervene.replay.token_directions import Bases, bases_of, check_d
 from probe_kit.intervene.store.settings import items_of
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Tape
+    from probe_kit.hooks import ActivationCache
 
 SITES = ("backbone.*",)
 ROLES = (ALL, "image", "language")
@@ -142,7 +142,7 @@ def along(direction: str, bases: Bases, place: Place, role: str, donors: tuple[S
     return [TakenOver(place, role, donors, name, bases) for name in (direction, *bases.control_names)]
 
 
-def donor_of(turn: Turn, sites: Sequence[Site]) -> "Tape":
+def donor_of(turn: Turn, sites: Sequence[Site]) -> "ActivationCache":
     """What all these sites hold before exchanged pictures, with the question's state and noise; made once."""
     from probe_kit.hooks import capture
 
@@ -150,5 +150,5 @@ def donor_of(turn: Turn, sites: Sequence[Site]) -> "Tape":
         with capture(turn.bench.policy, sites) as tape:
             turn.memo["chunk"] = turn.bench.act(turn.question.exchanged, turn.question.seed)
         turn.memo["donor"] = tape
-    donor: Tape = turn.memo["donor"]
+    donor: ActivationCache = turn.memo["donor"]
     return donor

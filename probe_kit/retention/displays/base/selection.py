@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
 from probe_kit.retention.estimators.retention import Iterations
-from probe_kit.train.results.probe_curve import Curve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ def known_view(results: ProbeResults, view: str | None) -> str:
     return view
 
 
-def curve_of(results: ProbeResults, category: str, view: str) -> Curve:
+def curve_of(results: ProbeResults, category: str, view: str) -> ProbeCurve:
     """The probes of a category. Raises UnknownCategoryError if it was not probed."""
     if (category, view) not in results.curves:
         probed = ", ".join(results.settings.categories)

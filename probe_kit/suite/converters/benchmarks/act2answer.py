@@ -28,7 +28,7 @@ from probe_kit.suite.converters.options import Act2AnswerOptions, options_from
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
 from probe_kit.suite.making import make_item
-from probe_kit.suite.manifest import refuse_foreign_folder, save_suite
+from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.wording import VERBATIM, side_words
 
@@ -57,7 +57,7 @@ def convert_set(
     if not root.is_dir():
         raise UsageError(f"{SOURCE}: {root} is no folder. {REMEDY}")
     category = _category(root, categories)
-    refuse_foreign_folder(out)
+    check_foreign_folder(out)
     pairs = read_pairs(root)
     assets = _Assets(root, options)
     items = [assets.item(category, pair) for pair in pairs[:n]]

@@ -8,7 +8,7 @@ import torch
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hooks import Observation, Site, capture
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.families.magma.adapter import Magma, load_magma
 from probe_kit.hooks.testing import AdapterContract, ReaderContract, example_observations
 from tests.support.magma_checkpoints import IDS, small_network, weights, write_checkpoint
@@ -92,8 +92,8 @@ class TestMagmaAsked(ReaderContract):
     def reader(self, unsteered: Magma) -> Magma:
         return unsteered
 
-    def questions(self, seen: Sequence[Observation]) -> list[Question]:
-        return [Question(own, own.instruction, self.letters, "It is ") for own in seen]
+    def questions(self, seen: Sequence[Observation]) -> list[Prompt]:
+        return [Prompt(own, own.instruction, self.letters, "It is ") for own in seen]
 
 
 # -- acting ----------------------------------------------------------------------------------------------
@@ -249,10 +249,10 @@ def test_every_stage_of_the_trunk_is_a_stream_of_its_own_width(loaded: Magma) ->
 # -- answering -------------------------------------------------------------------------------------------
 
 
-def questions(count: int = 2) -> list[Question]:
+def questions(count: int = 2) -> list[Prompt]:
     seen = example_observations([""] * count)
     texts = ["Is the star left (A) or right (B)?", "Do you see a square? A: yes, B: no"]
-    return [Question(one, text, ("A", "B")) for one, text in zip(seen, texts, strict=False)]
+    return [Prompt(one, text, ("A", "B")) for one, text in zip(seen, texts, strict=False)]
 
 
 def test_options_are_compared_by_the_logits_behind_the_prompt(unsteered: Magma) -> None:

@@ -86,7 +86,7 @@ def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
     assert actions.shape == (1, 4, 7)
     np.testing.assert_allclose(actions[0], expected, atol=1e-5)
     assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}
-    assert asked.misfit() is None
+    assert asked.embodiment_mismatch() is None
 
 
 def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, statistics: Path, policy: Pi0) -> None:
@@ -103,7 +103,7 @@ def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, stati
 
 def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(folder: Path, seen: Observation) -> None:
     policy = load_pi0(str(folder))
-    assert "-M statistics=bridge" in str(policy.misfit())
+    assert "-M statistics=bridge" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="-M statistics=bridge"):
         policy.act([seen], [0])
 
@@ -112,7 +112,7 @@ def test_statistics_that_lie_in_the_folder_are_read(folder: Path, statistics: Pa
     copy = Path(shutil.copytree(folder, tmp_path / "pi0"))
     shutil.copy(statistics, copy / "dataset_statistics.json")
     policy = load_pi0(str(copy))
-    assert policy.misfit() is None
+    assert policy.embodiment_mismatch() is None
     np.testing.assert_allclose(policy.action_units.low, bounds_of("action")[0], rtol=1e-6)
 
 
@@ -124,7 +124,7 @@ def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
     assert name in evaluated.EVALUATED_WITH
     monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.flow.checkpoint_folder", lambda _: folder)
     policy = adapter.load_pi0(str(name))
-    assert policy.misfit() is None
+    assert policy.embodiment_mismatch() is None
     assert policy.state_units.source == "bridge statistics shipped with probe_kit"
     assert policy.picture == "squashed"
 
@@ -169,7 +169,7 @@ def test_openness_as_the_release_has_it_uses_the_fingers_of_our_widowx() -> None
 
 
 def test_listening_is_the_inference_that_acting_makes(policy: Pi0, seen: Observation) -> None:
-    heard = policy.listen([seen], [SEED])
+    heard = policy.infer_without_acting([seen], [SEED])
     np.testing.assert_array_equal(policy.action_units.restore(heard), policy.act([seen], [SEED]))
 
 
@@ -182,14 +182,14 @@ def test_a_checkpoint_of_other_actions_and_another_state_can_be_listened_to(
     config["output_features"]["action"]["shape"] = [32]
     (copy / "config.json").write_text(json.dumps(config))
     policy = load_pi0(str(copy))
-    assert "acts in 32 dimensions" in str(policy.misfit())
-    assert policy.deaf_to() == ("state",)
+    assert "acts in 32 dimensions" in str(policy.embodiment_mismatch())
+    assert policy.zero_filled_inputs() == ("state",)
     with pytest.raises(CheckpointError, match="acts in 32 dimensions"):
         policy.act([seen], [0])
-    heard = policy.listen([seen], [SEED])
+    heard = policy.infer_without_acting([seen], [SEED])
     assert heard.shape == (1, 4, 32)
     moved = replace(seen, state=seen.state + 1)
-    np.testing.assert_array_equal(policy.listen([moved], [SEED]), heard)
+    np.testing.assert_array_equal(policy.infer_without_acting([moved], [SEED]), heard)
 
 
 @pytest.mark.parametrize("option", [{"picture": "cropped"}, {"openness": "wide"}])

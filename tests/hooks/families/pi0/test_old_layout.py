@@ -83,14 +83,14 @@ def test_statistics_that_nobody_filled_are_no_statistics(golden: Path, tmp_path:
     policy = load_pi0(str(copy))
     with pytest.raises(CheckpointError, match=r"buffer_action\.std"):
         _ = policy.action_units
-    assert "buffer_action.std" in str(policy.misfit())
+    assert "buffer_action.std" in str(policy.embodiment_mismatch())
 
 
 def test_statistics_given_to_a_checkpoint_that_has_its_own_are_refused(
     golden: Path, observation: Observation
 ) -> None:
     policy = load_pi0(str(golden / "checkpoint"), statistics="bridge")
-    assert "leave -M statistics out" in str(policy.misfit())
+    assert "leave -M statistics out" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="leave -M statistics out"):
         policy.act([observation], [0])
 

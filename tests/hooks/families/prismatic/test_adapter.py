@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import Observation, Question, Site, capture, load_model, load_policy
+from probe_kit.hooks import Observation, Prompt, Site, capture, load_model, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
 from probe_kit.hooks.testing import ReaderContract
@@ -108,7 +108,7 @@ def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Ob
     """Against as many steps of one decoding, and without the towers being run once more."""
     folder = str(write_checkpoint(tmp_path, model_type="prismatic"))
     reader, whole = (load_prismatic(folder, tokenizer="bytes", steps=steps) for steps in (1, 6))
-    reading = reader.read([Question(observation, "Which?", ("A", "B"))])
+    reading = reader.read([Prompt(observation, "Which?", ("A", "B"))])
     decoded = whole.generate(whole.pixel_values([observation.image]), [whole.prompt("Which?")])
     with torch.inference_mode():
         said = reading.state.speak(6, frozenset())
@@ -139,14 +139,14 @@ def test_a_reading_compares_what_may_stand_behind_the_prompt(
     model: Prismatic, tmp_path: Path, observation: Observation
 ) -> None:
     reader = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")), tokenizer="bytes")
-    reading = reader.read([Question(observation, "Which?", ("A", "B"))])
+    reading = reader.read([Prompt(observation, "Which?", ("A", "B"))])
     ids = reader.tokenizer.encode("In: Which?\nOut:")
     logits = reader.generate(reader.pixel_values([observation.image]), [ids]).logits[0, 0]
     expected = logits[[3 + ord(letter) for letter in "AB"]]
     np.testing.assert_allclose(reading.option_logits[0], expected, atol=1e-6)
     np.testing.assert_allclose(reading.option_mass[0], logits.softmax(0)[[3 + 65, 3 + 66]].sum(), rtol=1e-5)
     with pytest.raises(UsageError, match="steps=1"):
-        model.read([Question(observation, "Which?", ("A",))])
+        model.read([Prompt(observation, "Which?", ("A",))])
 
 
 def test_a_vision_language_model_is_no_policy() -> None:

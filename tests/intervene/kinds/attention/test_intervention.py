@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import CaptureChangedActionError, CaptureError, UnsupportedInterventionError, UsageError
 from probe_kit.extract import Run, open_run, verify_run
-from probe_kit.hooks.capturing.attention import AttentionMass, attention
+from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import (
     Attention,
@@ -55,7 +55,7 @@ def test_it_is_what_the_policy_tells_by_block_iteration_and_head(bench: Bench, w
     (question, _) = bench.questions(str(weighed.episodes[0]).partition(":")[0])
     row, role = list(weighed.episodes).index(question.episode_id), weighed.roles.index("language")
     words = bench.policy.roles([question.seen])["backbone"][0].mask("language")
-    with attention(bench.policy) as mass:
+    with capture_attention(bench.policy) as mass:
         bench.act(question.seen, question.seed)
     assert weighed.mass.shape == (4, BLOCKS, ITERATIONS, HEADS, len(weighed.roles))
     for (block, step), weights in mass.by_head.items():

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
-from probe_kit.hooks.contract.card import Card
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
@@ -38,7 +38,7 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import (
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
-from probe_kit.hooks.families.shared.prompt_kv import memory_tap, remembered
+from probe_kit.hooks.families.shared.prompt_kv import memory_tap, attach_prompt_kv
 from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
@@ -67,7 +67,7 @@ class LerobotFlow(Policy):
         self.network, self.folder, self.config = network, folder, network.config
         self.stacks = self._stacks()
         self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "expert")}
-        self._kept = remembered(self._joint, len(self.stacks["backbone"].layers))
+        self._kept = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
         self.memory = memory_stream(len(self._kept.keys), self._memory_width)
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
@@ -185,7 +185,7 @@ class LerobotFlow(Policy):
         config.device = device
         policy = cls(network.to(device), folder)
         policy.prepare(checkpoint, evaluation)
-        policy.card = Card(
+        policy.card = ModelCard(
             family=cls.family,
             checkpoint=checkpoint,
             weights_sha256=audit.sha256,
@@ -259,19 +259,19 @@ class LerobotFlow(Policy):
         chunk = self.infer(self.batch(seen), self.noise(seeds))
         return self.action_units.restore(chunk.float().cpu().numpy())
 
-    def listen(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the network puts them out, without units."""
         self.check(seen, seeds)
-        zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.deaf_to() else None
+        zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
         chunk = self.infer(self.batch(seen, zeros), self.noise(seeds))
         output: NDArray[np.float32] = chunk.float().cpu().numpy()
         return output
 
-    def misfit(self) -> str | None:
+    def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta, another state, or no units for either."""
         return self._action_misfit() or self._state_misfit()
 
-    def deaf_to(self) -> tuple[str, ...]:
+    def zero_filled_inputs(self) -> tuple[str, ...]:
         """The state, where it has other numbers than the arm's, or no units."""
         return ("state",) if self._state_misfit() else ()
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.hooks.capturing.capture_context import Tape, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.shared.lerobot.flow import IMAGES, MASK, STATE, TOKENS, LerobotFlow
 from probe_kit.hooks.verification.verify import Comparison, Produce, compare
@@ -69,7 +69,7 @@ def _sites(policy: LerobotFlow) -> list[Site]:
     return [*policy.further_streams["vision"].sites(), *policy.sites(), *policy.sites("final_norm")]
 
 
-def _streams(policy: LerobotFlow, tape: Tape) -> dict[str, Produce]:
+def _streams(policy: LerobotFlow, tape: ActivationCache) -> dict[str, Produce]:
     backbone, expert = policy.streams["backbone"], policy.streams["expert"]
     return {
         "prefix_embs": lambda: _numpy(tape[Site("backbone", 0)]),
@@ -80,7 +80,7 @@ def _streams(policy: LerobotFlow, tape: Tape) -> dict[str, Produce]:
     }
 
 
-def _stacked(tape: Tape, stream: Stream, quantity: str) -> NDArray[Any]:
+def _stacked(tape: ActivationCache, stream: Stream, quantity: str) -> NDArray[Any]:
     """(iterations or 1, layers, B, T, D)."""
     sites = stream.sites(quantity)
     values = torch.stack([tape[site] for site in sites])

@@ -18,15 +18,15 @@ from torch import Tensor, nn
 
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import Card
-from probe_kit.hooks.contract.model import Question, Reader, Reading, Tap
+from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.model import Prompt, AnswerModel, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.network_loading import Filled
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
-from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, Prompt
+from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, TokenPrompt
 from probe_kit.models.packing import LeftPacked
 
 CAMERA = "primary"
@@ -51,7 +51,7 @@ class Loaded:
         return self.filled.network
 
 
-class VisionLanguageModel(Reader):
+class VisionLanguageModel(AnswerModel):
     """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions."""
 
     family: ClassVar[str]
@@ -79,12 +79,12 @@ class VisionLanguageModel(Reader):
         self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
         self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", **settings})
 
-    def _card(self, settings: dict[str, str]) -> Card:
+    def _card(self, settings: dict[str, str]) -> ModelCard:
         loaded, audit = self.loaded, self.loaded.filled.audit
         files = side_files(loaded.folder)
         if self._text_folder != loaded.folder and self._text_folder.is_dir():
             files |= side_files(self._text_folder, "tokenizer/")
-        return Card(
+        return ModelCard(
             family=self.family,
             checkpoint=loaded.checkpoint,
             weights_sha256=audit.sha256,
@@ -150,7 +150,7 @@ class VisionLanguageModel(Reader):
             text.check_token(self.picture_token, int(self.network.config.image_token_id))
         return text
 
-    def prompt(self, question: Question) -> Prompt:
+    def prompt(self, question: Prompt) -> TokenPrompt:
         """The whole prompt of a question. Raises InstructionError or ObservationError for what does not fit in."""
         ids = None
         if question.pictured:
@@ -170,7 +170,7 @@ class VisionLanguageModel(Reader):
 
     # -- answering ---------------------------------------------------------------------------------------
 
-    def prefill(self, questions: Sequence[Question]) -> Prefill:
+    def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One pass over all questions."""
         self.check([question.seen for question in questions])
         shown: dict[str, Tensor] = {}
@@ -182,11 +182,11 @@ class VisionLanguageModel(Reader):
                 self.network, packed, self.positions(packed, shown), {**shown, **self.further(packed)}
             )
 
-    def packed(self, prompts: Sequence[Prompt]) -> LeftPacked:
+    def packed(self, prompts: Sequence[TokenPrompt]) -> LeftPacked:
         """Prompts as one batch on the model's device."""
         return LeftPacked.of([prompt.ids for prompt in prompts], self.text.padding, self.loaded.device)
 
-    def read(self, questions: Sequence[Question]) -> Reading:
+    def read(self, questions: Sequence[Prompt]) -> Reading:
         """One prefill; see the contract."""
         self.shows_pictures(questions)
         options = [
@@ -209,9 +209,9 @@ class VisionLanguageModel(Reader):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the observations' instructions as questions."""
-        return self.asked_roles([Question(one, one.instruction) for one in seen])
+        return self.asked_roles([Prompt(one, one.instruction) for one in seen])
 
-    def asked_roles(self, questions: Sequence[Question]) -> dict[str, list[Roles]]:
+    def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
         self.shows_pictures(questions)
         prompts = [self.prompt(question) for question in questions]
@@ -240,7 +240,7 @@ class VisionLanguageModel(Reader):
         return Tap(block.input_layernorm, 1, tokens=tokens)
 
 
-def _labels(prompt: Prompt) -> list[str]:
+def _labels(prompt: TokenPrompt) -> list[str]:
     labels = ["language" if asked else "special" for asked in prompt.question]
     start, stop = prompt.picture
     labels[start:stop] = [IMAGE_ROLE] * (stop - start)

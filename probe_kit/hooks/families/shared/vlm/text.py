@@ -40,7 +40,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Prompt:
+class TokenPrompt:
     """A whole prompt.
 
     text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
@@ -105,14 +105,14 @@ class FramedText:
 
     def prompt(
         self, question: str, begun: str = "", picture: Sequence[int] | None = None, marks: int = 0
-    ) -> Prompt:
+    ) -> TokenPrompt:
         """The prompt of a question.
 
         begun: how the answer has begun already. picture: ids at the positions of a picture, None without one;
         `marks` of them at either end are no picture but say where it begins and ends.
         Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
         """
-        self._refuse_markers(question + begun)
+        self._check_markers(question + begun)
         lead = self.frame.bare if picture is None else self.frame.behind
         text = lead + question + self.frame.end + begun
         before = [] if picture is None else [*self._encode(self.frame.before).ids, *picture]
@@ -123,7 +123,7 @@ class FramedText:
             for (first, last), special in zip(behind.offsets, behind.special_tokens_mask, strict=True)
         ]
         shown = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
-        return Prompt(text, (*before, *behind.ids), (*[False] * len(before), *asked), shown)
+        return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *asked), shown)
 
     def _encode(self, text: str) -> Any:
         encoding = self._tokenizer.encode(text, add_special_tokens=False)
@@ -135,7 +135,7 @@ class FramedText:
             )
         return encoding
 
-    def _refuse_markers(self, text: str) -> None:
+    def _check_markers(self, text: str) -> None:
         for token in self._tokenizer.get_added_tokens_decoder().values():
             if token.special and token.content in text:
                 raise InstructionError(
@@ -143,7 +143,7 @@ class FramedText:
                     "write it without"
                 )
 
-    def option(self, prompt: Prompt, option: str) -> int:
+    def option(self, prompt: TokenPrompt, option: str) -> int:
         """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
         before, whole = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
         if whole[: len(before)] != before or len(whole) == len(before):

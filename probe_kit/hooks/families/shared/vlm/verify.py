@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.capture_context import Tape, capture
-from probe_kit.hooks.contract.model import Question
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.shared.module_outputs import numpy_of
@@ -70,7 +70,7 @@ def _tolerance(name: str, streams: float) -> float:
     return LOGITS if "logits" in name else streams
 
 
-def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Question]:
+def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
     """The recorded questions with their pictures. Raises UsageError where they do not lie beside the reference."""
     file = folder / DIMS_FILE
     if not file.is_file():
@@ -78,7 +78,7 @@ def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> 
     rows = json.loads(file.read_text())["rows"]
     shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
-        Question(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))
+        Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))
         for row, picture in zip(rows, shown, strict=True)
     ]
 
@@ -97,7 +97,7 @@ def _between(text: str, model: VisionLanguageModel) -> str:
 class Reference:
     """The recorded questions, run through the adapter when something asks for what comes of them."""
 
-    def __init__(self, model: VisionLanguageModel, questions: Sequence[Question], recorded: Arrays) -> None:
+    def __init__(self, model: VisionLanguageModel, questions: Sequence[Prompt], recorded: Arrays) -> None:
         self.model, self.questions, self.recorded = model, questions, recorded
 
     @cached_property
@@ -111,7 +111,7 @@ class Reference:
         return self.model.packed([self.model.prompt(question) for question in self.questions])
 
     @cached_property
-    def heard(self) -> tuple[Tape, Prefill]:
+    def heard(self) -> tuple[ActivationCache, Prefill]:
         """One pass over all rows, with everything that is stored of it."""
         model = self.model
         with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
@@ -124,7 +124,7 @@ class Reference:
         return [self.model.prefill([question]) for question in self.questions]
 
     @cached_property
-    def bare(self) -> Question:
+    def bare(self) -> Prompt:
         """The first question without its picture."""
         return replace(self.questions[0], pictured=False)
 

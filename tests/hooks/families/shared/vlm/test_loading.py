@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks import Question, load_model
+from probe_kit.hooks import Prompt, load_model
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from tests.support.vlm_checkpoints import (
@@ -52,8 +52,8 @@ def test_the_larger_internvl_has_another_tower(tmp_path: Path) -> None:
     assert "attention.q_norm.weight" in names
     assert "attention.q_proj.bias" not in names
     seen = example_observations(["Why?"])[0]
-    reading = reader.read([Question(seen, "Why?", ("A", "B"))])
-    other = reader.read([Question(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
+    reading = reader.read([Prompt(seen, "Why?", ("A", "B"))])
+    other = reader.read([Prompt(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
     assert np.abs(reading.option_logits - other.option_logits).max() > 0
 
 
@@ -112,7 +112,7 @@ def test_two_pictures_of_different_size_go_together(tmp_path: Path) -> None:
     reader = load_model("qwen3-vl", str(write_qwen3_vl(tmp_path)))
     small, large = example_observations(["Why?", "Why not?"])
     large = replace(large, image=np.tile(large.image, (3, 2, 1)))
-    asked = [Question(own, own.instruction, ("A", "B")) for own in (small, large)]
+    asked = [Prompt(own, own.instruction, ("A", "B")) for own in (small, large)]
     together = reader.read(asked)
     alone = [reader.read([question]).option_logits[0] for question in asked]
     np.testing.assert_allclose(together.option_logits, alone, atol=1e-5)
