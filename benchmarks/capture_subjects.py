@@ -20,7 +20,7 @@ from torch import nn
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.rollout.examples import example_observations
-from probe_kit.hooks import Model, Policy, AnswerModel, load_model
+from probe_kit.hooks import AnswerModel, Model, Policy, load_model
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.roles import Roles
 
@@ -208,7 +208,9 @@ def subject(
     seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
     if isinstance(model, Policy):
         policy = model  # named, for the closure
-        return Subject(policy, lambda: policy.infer_without_acting(seen, list(range(len(seen)))), policy.roles(seen))
+        return Subject(
+            policy, lambda: policy.infer_without_acting(seen, list(range(len(seen)))), policy.roles(seen)
+        )
     assert isinstance(model, AnswerModel)
     reader = model
     questions = [Prompt(one, "Which of them is red?", ("a", "b")) for one in seen]

@@ -19,12 +19,12 @@ from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract import Run
 from probe_kit.intervene import (
     ClosedLoop,
-    Effects,
     Interchange,
-    Passing,
-    Source,
-    Steer,
-    intervene_on,
+    InterventionResult,
+    PatchEffect,
+    ReplaySource,
+    Steering,
+    run_intervention,
 )
 from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite, build_suite
@@ -50,13 +50,13 @@ class Trial:
     """The trained organism's run, and what is true of it. used, unused: its categories."""
 
     run: Run
-    source: Source
+    source: ReplaySource
     used: tuple[str, ...]
     unused: tuple[str, ...]
 
-    def done(self, asked: Intervention) -> Effects:
+    def done(self, asked: Intervention) -> InterventionResult:
         """One intervention; a stored one is read back."""
-        return intervene_on(self.run, asked, self.source)
+        return run_intervention(self.run, asked, self.source)
 
 
 def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, twin: Run | None) -> Run:
@@ -86,10 +86,10 @@ def maps(trial: Trial, last: int) -> Iterator[Property]:
         rows = {(row.place, row.role): row for row in effects.changes if row.category == category}
         unread = rows[end, "all"]
         yield Property(
-            f"{category}: {end} is read by nothing", unread.changed == 0 and unread.fires > unread.still == 0,
-            f"largest change {unread.changed:g}; {unread.fires} fires moved tokens {unread.norm_ratio:.2f} norms",
+            f"{category}: {end} is read by nothing", unread.max_action_change == 0 and unread.fires > unread.no_op_fires == 0,
+            f"largest change {unread.max_action_change:g}; {unread.fires} fires moved tokens {unread.relative_change:.2f} norms",
         )  # fmt: skip
-        located = [row.name for row in rows.values() if row.is_located]
+        located = [row.name for row in rows.values() if row.is_localised]
         yield Property(
             f"{category}: passes somewhere" if category in trial.used else f"{category}: passes nowhere",
             bool(located) == (category in trial.used), ", ".join(located) or "nowhere",
@@ -107,7 +107,7 @@ def last_located(trial: Trial) -> tuple[str, str] | None:
     effects = trial.done(Interchange(categories=(*trial.used, *trial.unused)))
     everywhere: dict[tuple[str, str], list[float]] = {}
     for row in effects.changes:
-        if row.category in trial.used and row.is_located and row.role != "all":
+        if row.category in trial.used and row.is_localised and row.role != "all":
             everywhere.setdefault((row.place, row.role), []).append(row.effect or 0.0)
     found = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
     return max(found, key=lambda name: (name[0], found[name]), default=None)
@@ -115,7 +115,7 @@ def last_located(trial: Trial) -> tuple[str, str] | None:
 
 def memories(trial: Trial) -> Iterator[Property]:
     """One block is read, and the others are not."""
-    effects = trial.done(Interchange(categories=trial.used, sites=("memory.*",), roles=("all",)))
+    effects = trial.done(Interchange(categories=trial.used, sites=("kv.*",), roles=("all",)))
     for category in trial.used:
         found = {row.place: row.effect for row in effects.changes if row.category == category}
         read = [place for place, effect in found.items() if effect is not None and effect >= 0.95]
@@ -135,7 +135,9 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
             categories=categories, sites=(place,), roles=(role,), direction="mean-difference:1", controls=1
         )
     )
-    steered = trial.done(Steer(categories=trial.used, sites=(place,), role=role, doses=(4.0,), controls=1))
+    steered = trial.done(
+        Steering(categories=trial.used, sites=(place,), role=role, coefficients=(4.0,), controls=1)
+    )
     for category in categories:
         own, control = pair(effects.changes, category)
         if category in trial.unused:
@@ -161,7 +163,7 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
 def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
     """Dose zero gives the run's own episodes again."""
     asked = ClosedLoop(
-        categories=(*trial.used, *trial.unused), items=items, cells=(cell,), direction="none", controls=0
+        categories=(*trial.used, *trial.unused), items=items, targets=(cell,), direction="none", controls=0
     )
     try:
         effects = trial.done(asked)
@@ -176,7 +178,7 @@ def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
     )
 
 
-def pair(rows: Sequence[Passing], category: str) -> tuple[Passing, Passing]:
+def pair(rows: Sequence[PatchEffect], category: str) -> tuple[PatchEffect, PatchEffect]:
     """The change of one category along its direction, and along the random one beside it."""
     own = [row for row in rows if row.category == category]
     (first,), (second,) = ([row for row in own if row.is_control == control] for control in (False, True))
@@ -222,7 +224,7 @@ def main() -> int:
     used, unused = (
         tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "encoded, unused")
     )
-    trial = Trial(run, Source(suite.folder), used, unused)
+    trial = Trial(run, ReplaySource(suite.folder), used, unused)
     weights = str(run.weights_sha256)[:12]
     print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")
     found = []

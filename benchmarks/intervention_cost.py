@@ -21,7 +21,7 @@ import numpy as np
 from capture_subjects import LARGER, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
-from probe_kit.intervene.edits.patching import Replaced, Tokens, patched
+from probe_kit.intervene.edits.patching import ReplaceWith, TokenSelection, apply_patch
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
@@ -54,14 +54,14 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
         policy.infer_without_acting([other], [0])
     roles = policy.roles([seen])
 
-    def changed(sites: list[Site]) -> Callable[[], object]:
-        tokens = Tokens.of(roles[sites[0].stream][0].valid, policy.card.device)
+    def max_action_change(sites: list[Site]) -> Callable[[], object]:
+        tokens = TokenSelection.of(roles[sites[0].stream][0].valid, policy.card.device)
 
         def run() -> object:
-            with patched(policy, sites, tokens, Replaced(donor, tokens.count)) as ledger:
+            with apply_patch(policy, sites, tokens, ReplaceWith(donor, tokens.count)) as edit_log:
                 policy.infer_without_acting([seen], [0])
-            assert ledger.fires == len(sites)
-            return ledger
+            assert edit_log.fires == len(sites)
+            return edit_log
 
         return run
 

@@ -21,12 +21,12 @@ import numpy as np
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks import Policy, load_policy
-from probe_kit.intervene import Answers, Bench, Follow, Interchange, Source
-from probe_kit.intervene.kinds.image_swap.effects import following
-from probe_kit.intervene.kinds.site_effects import passing
-from probe_kit.intervene.replay.conditions import Replayed, replay
-from probe_kit.intervene.replay.session import Question, open_bench
-from probe_kit.intervene.runner import answers_of
+from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
+from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
+from probe_kit.intervene.kinds.site_effects import patch_effects
+from probe_kit.intervene.replay.conditions import ReplayBatch, replay
+from probe_kit.intervene.replay.session import ReplayInput, open_session
+from probe_kit.intervene.runner import outcomes_of
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
 
@@ -55,7 +55,7 @@ class Count:
         return f"{self.found} / {self.cells}, p of more than 5 %: {p:.3f}"
 
 
-def shuffled(answers: Answers, draw: np.random.Generator) -> Answers:
+def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> ConditionOutcomes:
     """Sides of the correct picture exchanged in a random half of the items, in both of their layouts."""
     names, item_of = np.unique(answers.items, return_inverse=True)
     turn = draw.choice((False, True), names.size)[item_of]
@@ -64,19 +64,19 @@ def shuffled(answers: Answers, draw: np.random.Generator) -> Answers:
     )
 
 
-def count_outside(answers: Answers, suite: str, counts: dict[str, Count]) -> None:
+def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
     """Note every category of a `follow`."""
-    for row in following(answers, suite):
-        counts["follow: p < 0.05"].note(row.p_follows < SIGNIFICANCE)
-        counts["follow: called following"].note(row.is_following)
+    for row in image_swap_effects(answers, suite):
+        counts["follow: p < 0.05"].note(row.follow_p < SIGNIFICANCE)
+        counts["follow: called following"].note(row.follows_images)
 
 
-def count_inside(answers: Answers, suite: str, counts: dict[str, Count]) -> None:
+def count_inside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
     """Note every place and role of an interchange."""
-    rows = [row for row in passing(answers, suite) if row.p is not None and row.p_fwe is not None]
+    rows = [row for row in patch_effects(answers, suite) if row.p is not None and row.p_fwe is not None]
     for row in rows:
         counts["interchange: single p < 0.05"].note((row.p or 0.0) < SIGNIFICANCE)
-        counts["interchange: located"].note(row.is_located)
+        counts["interchange: located"].note(row.is_localised)
     for category in dict.fromkeys(row.category for row in rows):
         smallest = min(row.p_fwe or 0.0 for row in rows if row.category == category)
         counts["interchange: any p_fwe < 0.05 in a category"].note(smallest < SIGNIFICANCE)
@@ -87,20 +87,20 @@ class Frames:
     """First frames of a suite, drawn once, and what a policy does on them. run: whose episodes they are."""
 
     run: Run
-    bench: Bench
-    questions: Sequence[Question]
+    bench: ReplaySession
+    questions: Sequence[ReplayInput]
 
-    def answers(self, policy: Policy, asked: Follow | Interchange, file: Path) -> Answers:
+    def answers(self, policy: Policy, asked: ImageSwap | Interchange, file: Path) -> ConditionOutcomes:
         """Of one policy; read back from `file` where that is there."""
         if not file.is_file():
             self.bench.policy = policy
             conditions = asked.conditions(self.bench)
             parts = [replay(self.bench, [question], conditions) for question in self.questions]
-            found = answers_of(self.run, [one.name for one in conditions], Replayed.joined(parts))
+            found = outcomes_of(self.run, [one.name for one in conditions], ReplayBatch.joined(parts))
             partial = file.with_suffix(".partial")
             partial.write_bytes(found.to_bytes())
             partial.replace(file)
-        return Answers.from_bytes(file.read_bytes())
+        return ConditionOutcomes.from_bytes(file.read_bytes())
 
 
 def run_of(folder: Path, suite: Suite, model: str) -> Run:
@@ -125,13 +125,13 @@ def measure(frames: Frames, model: str, folder: Path, twins: Iterable[int], insi
     suite = frames.run.suite
     for seed in twins:
         policy = load_policy(model, random_weights=True, weights_seed=seed)
-        count_outside(frames.answers(policy, Follow(), folder / f"follow-{seed}.npz"), suite, of_twins)
+        count_outside(frames.answers(policy, ImageSwap(), folder / f"follow-{seed}.npz"), suite, of_twins)
         if seed < inside:
             found = frames.answers(policy, Interchange(), folder / f"interchange-{seed}.npz")
             count_inside(found, suite, of_twins)
         print(f"twin {seed}: {of_twins[NAMES[0]]}; {of_twins[NAMES[2]]}", flush=True)
     trained = load_policy(model)
-    outside = frames.answers(trained, Follow(), folder / "follow-trained.npz")
+    outside = frames.answers(trained, ImageSwap(), folder / "follow-trained.npz")
     within = frames.answers(trained, Interchange(), folder / "interchange-trained.npz")
     for number in range(shuffles):
         draw = np.random.default_rng(number)
@@ -154,7 +154,7 @@ def main() -> None:
     arguments = parser.parse_args()
     suite = build_suite(arguments.folder / "suite", arguments.categories.split(","), arguments.items)
     run = run_of(arguments.folder, suite, arguments.model)
-    with open_bench(run, Source(suite.folder)) as bench, bench.ready():
+    with open_session(run, ReplaySource(suite.folder)) as bench, bench.ready():
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
         questions = [replace(one, stored=None) for item in items for one in bench.questions(item)]
         frames = Frames(run, bench, questions)

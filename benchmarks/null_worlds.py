@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import Fold, grouped_folds
-from probe_kit.statistics.label_permutations import max_statistic_p, flip_groups, flip_items, pointwise_p
+from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import OUTER_FOLDS, nested_folds, probe_site

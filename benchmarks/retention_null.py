@@ -27,7 +27,7 @@ from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, re
 from probe_kit.retention.estimators.cross_fit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimators.retention import retention_interval
 from probe_kit.statistics.fieller import Interval
-from probe_kit.statistics.label_permutations import max_statistic_p, flip_items, pointwise_p
+from probe_kit.statistics.label_permutations import flip_items, max_statistic_p, pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site

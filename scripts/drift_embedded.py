@@ -57,7 +57,12 @@ def main(
 
 def _heard(out: Path, suite: Path, checkpoint: Path, count: object) -> Run:
     settings = ExtractSettings(
-        "pi0-tiny", str(checkpoint), suite=suite, scene=SceneSpec.preset("act2answer"), capture_only=True, frames="none"
+        "pi0-tiny",
+        str(checkpoint),
+        suite=suite,
+        scene=SceneSpec.preset("act2answer"),
+        capture_only=True,
+        frames="none",
     )
     return extract_run(settings, out.with_name(f"{out.name}-{checkpoint.name}"), count)  # type: ignore[arg-type]
 

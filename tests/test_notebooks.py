@@ -10,7 +10,7 @@ from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, executed, kernel, notebooks
 from probe_kit.extract import open_run
-from probe_kit.intervene import stored_passing
+from probe_kit.intervene import stored_site_effects
 from probe_kit.retention import retention
 from probe_kit.train import load_results
 
@@ -30,7 +30,7 @@ SHORT = {
     "ExtractSettings(model, ": f"ExtractSettings(model, {SCENE}",
     "permutations=24": "permutations=3",
     '["color", "state"]': '["color"]',
-    '"memory.*"': '"memory.02"',
+    '"kv.*"': '"kv.02"',
 }
 """Episodes that end after one inference, few relabellings, one category, and one block of the memory."""
 
@@ -149,11 +149,11 @@ def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
     made: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
     """Its hooks fired and moved tokens; what can be read there turns nothing."""
-    rows = stored_passing(open_run(made[0] / "work" / "runs" / "pi0-tiny"))["color"]
+    rows = stored_site_effects(open_run(made[0] / "work" / "runs" / "pi0-tiny"))["color"]
     (last,) = (row for row in rows if (row.place, row.role) == ("backbone.03", "all"))
-    assert (last.changed, last.still) == (0.0, 0)
+    assert (last.max_action_change, last.no_op_fires) == (0.0, 0)
     assert last.fires == last.n_episodes
-    assert last.norm_ratio > 0
+    assert last.relative_change > 0
 
 
 @pytest.mark.parametrize("name", NAMES)

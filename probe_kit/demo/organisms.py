@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
-from probe_kit.intervene import Follow, Source, intervene_on
-from probe_kit.intervene.kinds.image_swap.effects import WORTH
+from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.retention import RetentionRow, retention
 from probe_kit.retention.columns.text import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
 from probe_kit.retention.report.category_summary import Said, verdict
@@ -118,9 +118,9 @@ def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
     )
 
 
-def source_of(organism: Organism, suite: Suite) -> Source:
+def source_of(organism: Organism, suite: Suite) -> ReplaySource:
     """Where interventions find the organism and its pictures again; of a random twin, the one of its own seed."""
-    return Source(suite.folder, weights_seed=organism.weights_seed)
+    return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
 
 
 def probed(
@@ -150,7 +150,7 @@ def probed(
         progress=progress,
     )
     progress = stage(f"exchanging pictures, {organism.name}")
-    intervene_on(run, Follow(), source_of(organism, suite), progress=progress)
+    run_intervention(run, ImageSwap(), source_of(organism, suite), progress=progress)
     return run, results
 
 
@@ -190,13 +190,15 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     following would be seen in every other; a policy that nobody trained to act follows nowhere by itself.
     """
     said = verdict(row)
-    bounded = row.follows_net_ci is not None and (row.follows_net_ci[1] or 0.0) < WORTH
+    bounded = (
+        row.net_follow_rate_ci is not None and (row.net_follow_rate_ci[1] or 0.0) < SMALLEST_EFFECT_OF_INTEREST
+    )
     return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
 
 
 def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
     """One line per organism and category: the truth, the verdict, and the numbers behind it."""
-    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     agree = sum(finding.agrees for finding in findings)
     return ResponsiveTable(

@@ -235,7 +235,11 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
-        **({"acts": "no: it is listened to once per episode; no success rate"} if identity.get("capture_only") else {}),
+        **(
+            {"acts": "no: it is listened to once per episode; no success rate"}
+            if identity.get("capture_only")
+            else {}
+        ),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),

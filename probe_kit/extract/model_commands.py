@@ -34,7 +34,11 @@ def models(
             line = ", ".join(f"{name} {value}" for name, value in settings.items())
             out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
         if (supported := row["interventions"]) is not None:
-            one = "" if supported["readout"] == "chunk" else "; one action per inference, which says little alone"
+            one = (
+                ""
+                if supported["readout"] == "first-chunk"
+                else "; one action per inference, which says little alone"
+            )
             line = f"{', '.join(supported['kinds'])}{one}"
             out.print(marked("  [dim]intervene [/] {}", line), soft_wrap=True)
         for option in row["options"]:

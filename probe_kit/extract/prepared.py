@@ -11,9 +11,9 @@ from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episod
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
-from probe_kit.extract.rollout.examples import example_observations, check_unfit
+from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.extract.rollout.preflight import run_preflight
-from probe_kit.extract.rollout.settings_checks import check_meaningless, check_embodiment, check_unreachable
+from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -156,7 +156,9 @@ def load_reader(settings: AskSettings) -> "AnswerModel":
         **settings.options,
     )
     if not isinstance(model, AnswerModel):
-        raise UsageError(f"{settings.model} gave a {type(model).__name__}, which is no AnswerModel; mend its loader")
+        raise UsageError(
+            f"{settings.model} gave a {type(model).__name__}, which is no AnswerModel; mend its loader"
+        )
     return model
 
 

@@ -14,32 +14,32 @@ from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.activation_cache import ActivationCache
-    from probe_kit.hooks.capturing.apply_edits import applied
+    from probe_kit.hooks.capturing.apply_edits import apply_edits
     from probe_kit.hooks.capturing.attention import AttentionMass
     from probe_kit.hooks.capturing.capture_context import capture, edit
-    from probe_kit.hooks.contract.model import Model, Policy, Prompt, AnswerModel, Reading, Rows, Tap
+    from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading, Rows, Tap
     from probe_kit.hooks.contract.roles import Roles, pool
 
 __all__ = [
+    "ActivationCache",
+    "AnswerModel",
     "AttentionMass",
-    "ModelCard",
     "Edit",
     "Family",
     "Interventions",
     "Model",
+    "ModelCard",
     "Observation",
     "Option",
     "Policy",
     "Prompt",
-    "AnswerModel",
     "Reading",
     "Roles",
     "Rows",
     "Site",
     "Stream",
     "Tap",
-    "ActivationCache",
-    "applied",
+    "apply_edits",
     "capture",
     "edit",
     "known_families",
@@ -61,7 +61,7 @@ __getattr__ = lazy_names(
         "Rows": "contract.model",
         "Tap": "contract.model",
         "ActivationCache": "capturing.activation_cache",
-        "applied": "capturing.apply_edits",
+        "apply_edits": "capturing.apply_edits",
         "capture": "capturing.capture_context",
         "edit": "capturing.capture_context",
         "Roles": "contract.roles",

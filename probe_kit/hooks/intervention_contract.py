@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
 from probe_kit.hooks.capturing.activation_cache import ActivationCache
-from probe_kit.hooks.capturing.apply_edits import applied
+from probe_kit.hooks.capturing.apply_edits import apply_edits
 from probe_kit.hooks.capturing.attention import capture_attention
 from probe_kit.hooks.capturing.capture_context import capture, edit
 from probe_kit.hooks.capturing.edits import Edit, Vectors, vector_hash
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.sites import MEMORY, Site, Stream, memory_stream
+from probe_kit.hooks.contract.sites import KV, Site, Stream, kv_stream
 from probe_kit.hooks.registry import find_family
 
 
@@ -35,7 +35,7 @@ class InterventionContract:
     def test_policy_and_family_declare_the_same(self, policy: Policy) -> None:
         if self.family:
             assert find_family(self.family).interventions == policy.interventions
-        assert policy.interventions.memory == (policy.memory is not None)
+        assert policy.interventions.prompt_kv == (policy.prompt_kv is not None)
         assert set(policy.interventions.unread) <= policy.streams.keys()
         edits = policy.interventions.edits
         for name, stream in policy.streams.items():
@@ -46,7 +46,7 @@ class InterventionContract:
     ) -> None:
         sites = [
             site
-            for stream in [*policy.streams.values(), *([] if policy.memory is None else [policy.memory])]
+            for stream in [*policy.streams.values(), *([] if policy.prompt_kv is None else [policy.prompt_kv])]
             for quantity in stream.quantities
             for site in stream.sites(quantity)
         ]
@@ -88,9 +88,9 @@ class InterventionContract:
                 continue
             with pytest.raises(UnsupportedInterventionError, match=f"{policy.card.family}.*{kind}"):
                 policy.interventions.check(kind, policy.card.family)
-        if policy.memory is None:
+        if policy.prompt_kv is None:
             with pytest.raises(UnknownSiteError):
-                policy.tap(memory_stream(1, 1).sites("keys")[0])
+                policy.tap(kv_stream(1, 1).sites("keys")[0])
 
     # -- memory --------------------------------------------------------------------------------------------
 
@@ -117,16 +117,16 @@ class InterventionContract:
         late = [site for site in acting if site not in early]
         plain, donor = (_heard(policy, [own], [*_all(memory), *acting]) for own in (one, other))
         edits, vectors = _donated(donor, [*_all(memory), *early])
-        with applied(policy, edits, [one], vectors) as ledger:
+        with apply_edits(policy, edits, [one], vectors) as edit_log:
             exchanged = _heard(policy, [one], late)
         np.testing.assert_array_equal(policy.act([other], [0]), self._under(policy, edits, vectors, one))
         for site in late:
             torch.testing.assert_close(exchanged[site], donor[site], rtol=0, atol=0)
         assert any((plain[site] != donor[site]).any() for site in late)
-        assert [entry.site for entry in ledger.entries if entry.site.startswith(memory.name)] == [
+        assert [entry.site for entry in edit_log.entries if entry.site.startswith(memory.name)] == [
             str(site) for layer in range(memory.layers - 1) for site in _of(memory, layer)
         ]
-        assert sum(entry.moved for entry in ledger.entries) > 0
+        assert sum(entry.moved for entry in edit_log.entries) > 0
 
     def test_the_memory_of_one_role_is_exchanged_in_that_role_only(
         self, policy: Policy, observations: list[Observation]
@@ -139,11 +139,11 @@ class InterventionContract:
             for own in (one, replace(one, image=255 - one.image))
         )
         own = Edit("replace", (site,), roles=("image",), vector=vector_hash(donor.numpy()))
-        with applied(policy, [own], [one], {own.vector: donor.numpy()}) as ledger:
+        with apply_edits(policy, [own], [one], {own.vector: donor.numpy()}) as edit_log:
             edited = _heard(policy, [one], [site])[site][0].float().cpu()
         image = torch.from_numpy(policy.token_roles([one])[memory.name][0].mask("image"))
         torch.testing.assert_close(edited, torch.where(image[:, None], donor, plain), rtol=0, atol=0)
-        assert [entry.tokens for entry in ledger.entries] == [int(image.sum())]
+        assert [entry.tokens for entry in edit_log.entries] == [int(image.sum())]
 
     # -- tiles ---------------------------------------------------------------------------------------------
 
@@ -203,13 +203,13 @@ class InterventionContract:
         assert all((share > 0).all() for share in mass.of_role(roles, "image").values())
 
     def _memory(self, policy: Policy) -> Stream:
-        if policy.memory is None:
+        if policy.prompt_kv is None:
             pytest.skip(f"{policy.card.family} declares no memory")
-        return policy.memory
+        return policy.prompt_kv
 
     @staticmethod
     def _under(policy: Policy, edits: list[Edit], vectors: Vectors, seen: Observation) -> NDArray[np.float32]:
-        with applied(policy, edits, [seen], vectors):
+        with apply_edits(policy, edits, [seen], vectors):
             return policy.act([seen], [0])
 
 
@@ -221,11 +221,11 @@ def _heard(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -
 
 
 def _of(memory: Stream, layer: int) -> list[Site]:
-    return [Site(memory.name, layer, quantity) for quantity in MEMORY]
+    return [Site(memory.name, layer, quantity) for quantity in KV]
 
 
 def _all(memory: Stream) -> list[Site]:
-    return [site for quantity in MEMORY for site in memory.sites(quantity)]
+    return [site for quantity in KV for site in memory.sites(quantity)]
 
 
 def _donated(donor: ActivationCache, sites: Sequence[Site]) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:

@@ -38,7 +38,7 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.capturing.capture_context import capture, edit
 from probe_kit.hooks.contract.family import SIZE, Family
-from probe_kit.hooks.contract.model import Model, Policy, Prompt, AnswerModel, Reading
+from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles, pool
 from probe_kit.hooks.contract.sites import PARTS, Site, Stream
@@ -132,7 +132,7 @@ class ModelContract:
             assert stream.name == name
             assert stream.part in PARTS
             assert stream.label
-            assert "residual" in stream.quantities or stream is model.memory
+            assert "residual" in stream.quantities or stream is model.prompt_kv
         parts = [stream.part for stream in model.streams.values() if stream.probed]
         assert "backbone" in parts
 
@@ -519,7 +519,9 @@ class ReaderContract(ModelContract):
         assert len(first) == len(seen)
         assert all(isinstance(text, str) for text in first)
 
-    def test_speaking_does_not_use_a_reading_up(self, reader: AnswerModel, observations: list[Observation]) -> None:
+    def test_speaking_does_not_use_a_reading_up(
+        self, reader: AnswerModel, observations: list[Observation]
+    ) -> None:
         reading = self._read(reader, self.shown(reader, observations))
         assert reader.speak(reading, 4) == reader.speak(reading, 4)
         assert reader.speak(reading, 0) == [""] * len(reading.option_logits)
@@ -533,7 +535,9 @@ class ReaderContract(ModelContract):
         forth, back = self._ask(reader, questions), self._ask(reader, questions[::-1])
         np.testing.assert_allclose(forth, back[::-1], atol=self.tolerance)
 
-    def test_a_far_longer_neighbour_changes_nothing(self, reader: AnswerModel, observations: list[Observation]) -> None:
+    def test_a_far_longer_neighbour_changes_nothing(
+        self, reader: AnswerModel, observations: list[Observation]
+    ) -> None:
         if reader.card.batch == 1:
             pytest.skip(f"{reader.card.family} reads one question at a time")
         short = self.questions(observations)[0]
@@ -562,7 +566,9 @@ class ReaderContract(ModelContract):
         with pytest.raises((UsageError, ObservationError)):
             self._ask(reader, [first, replace(second, pictured=False)])
 
-    def test_options_that_begin_alike_are_refused(self, reader: AnswerModel, observations: list[Observation]) -> None:
+    def test_options_that_begin_alike_are_refused(
+        self, reader: AnswerModel, observations: list[Observation]
+    ) -> None:
         twice = replace(self.questions(observations)[0], options=(self.letters[0], self.letters[0]))
         with pytest.raises(UsageError, match="same token"):
             self._ask(reader, [twice])

@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 if TYPE_CHECKING:
     from probe_kit.extract import Run
     from probe_kit.intervene.replay.conditions import Intervention
-    from probe_kit.intervene.results.results import Effects
+    from probe_kit.intervene.results.results import InterventionResult
 
 KINDS = ("follow", "words", "interchange", "steer", "closed-loop", "erase", "attention")
 INSIDE = "Inside the network (interchange, steer, closed-loop, erase, attention)"
@@ -70,11 +70,11 @@ def intervene(
             rich_help_panel=INSIDE,
         ),
     ] = None,
-    doses: Annotated[
+    coefficients: Annotated[
         str | None,
         typer.Option(help="Steer: in half gaps of the class means; default 1,2,4.", rich_help_panel=INSIDE),
     ] = None,
-    toward: Annotated[
+    target_side: Annotated[
         str | None, typer.Option(help="Steer: wrong (default), correct, left or right.", rich_help_panel=INSIDE)
     ] = None,
     readout: Annotated[
@@ -83,7 +83,7 @@ def intervene(
             help="chunk: what the first inference would do. shadow: what every inference of the unedited episode "
             "would, for policies whose inference is one action (OpenVLA, SpatialVLA, Magma).",
         ),
-    ] = "chunk",
+    ] = "first-chunk",
     seed: Annotated[int, typer.Option(help="Of controls and folds of directions.", rich_help_panel=INSIDE)] = 0,
     suite: Annotated[
         Path | None, typer.Option(help="Folder of the run's suite; default the embedded one.")
@@ -114,34 +114,36 @@ def intervene(
     """
     from probe_kit.extract import open_run
     from probe_kit.hooks.contract.options import read_pairs
-    from probe_kit.intervene import Source, intervene_on
+    from probe_kit.intervene import ReplaySource, run_intervention
     from probe_kit.intervene.runner import check_unsupported
     from probe_kit.intervene.store.answers import is_stored
-    from probe_kit.intervene.store.settings import key_of, readout_of, check_unfit, settings_of
+    from probe_kit.intervene.store.settings import check_unfit, key_of, readout_of, settings_of
 
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
     if style not in _FORMATS:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    asked = _asked(
+    intervention = _asked(
         opened,
         kind,
         {"categories": split(categories), "items": items, "readout": readout_of(readout)},
         {"sites": split(sites), "roles": split(roles), "direction": direction, "controls": controls,
-         "doses": None if doses is None else tuple(map(_dose, split(doses) or ())), "toward": toward,
+         "doses": None if coefficients is None else tuple(map(_dose, split(coefficients) or ())), "toward": target_side,
          "seed": seed or None},
     )  # fmt: skip
     check_unfit(opened)
-    check_unsupported(opened, asked)
-    asked.chosen(opened)
+    check_unsupported(opened, intervention)
+    intervention.categories_in(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
-    source = Source(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
-    is_there = is_stored(opened.location, key_of(settings_of(asked, opened)))
+    source = ReplaySource(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
+    is_there = is_stored(opened.location, key_of(settings_of(intervention, opened)))
     with progress() as bar:
-        learning = counter(bar, "items learnt from") if asked.learns else None
+        on_fit_progress = counter(bar, "items learnt from") if intervention.fits_first else None
         replayed = counter(bar, "items replayed")
-        effects = intervene_on(opened, asked, source, progress=replayed, learning=learning)
+        effects = run_intervention(
+            opened, intervention, source, progress=replayed, on_fit_progress=on_fit_progress
+        )
     _show(effects, style)
     if is_there:
         say("read back: it was stored, so that no policy, suite or device was looked for")
@@ -161,7 +163,7 @@ _OPTIONS = {
 
 def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]) -> "Intervention":
     """What was asked. Raises UsageError for an option that this kind does not have."""
-    from probe_kit.intervene import Attention, Follow, Interchange, Steer, Words
+    from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, Steering
 
     given = {name: value for name, value in inside.items() if value is not None}
     if meaningless := [name for name in given if name not in _OPTIONS[kind]]:
@@ -169,9 +171,9 @@ def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]
             f"--{meaningless[0]} means nothing to --kind {kind}; leave it out, or choose another kind"
         )
     if kind in ("follow", "words"):
-        return Words(**common) if kind == "words" else Follow(**common)
+        return InstructionSwap(**common) if kind == "words" else ImageSwap(**common)
     if kind == "attention":
-        return Attention(**common, **given)
+        return AttentionReadout(**common, **given)
     if kind == "closed-loop":
         return _closed_loop(run, common, given)
     if kind == "interchange":
@@ -184,19 +186,19 @@ def _asked(run: "Run", kind: str, common: dict[str, Any], inside: dict[str, Any]
         raise UsageError(
             "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
         )
-    return Steer(**common, **given, role=named[0])
+    return Steering(**common, **given, role=named[0])
 
 
 def _erase(common: dict[str, Any], given: dict[str, Any]) -> "Intervention":
-    from probe_kit.intervene import Erase
+    from probe_kit.intervene import ConceptErasure
 
     if "sites" not in given:
         raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
-    return Erase(**common, **given | ({"method": given.pop("direction")} if "direction" in given else {}))
+    return ConceptErasure(**common, **given | ({"method": given.pop("direction")} if "direction" in given else {}))
 
 
 def _closed_loop(run: "Run", common: dict[str, Any], given: dict[str, Any]) -> "Intervention":
-    from probe_kit.intervene import ClosedLoop, Follow, best_cells
+    from probe_kit.intervene import ClosedLoop, ImageSwap, best_patch_targets
 
     sites, roles = given.pop("sites", None), given.pop("roles", None)
     if roles and not sites:
@@ -206,7 +208,7 @@ def _closed_loop(run: "Run", common: dict[str, Any], given: dict[str, Any]) -> "
     if sites:
         cells = tuple(f"{site}|{role}" for site in sites for role in roles or ("all",))
     else:
-        cells = best_cells(run, Follow(**common).chosen(run))
+        cells = best_patch_targets(run, ImageSwap(**common).categories_in(run))
     return ClosedLoop(**common, **given, cells=cells)
 
 
@@ -217,7 +219,7 @@ def _dose(text: str) -> float:
         raise UsageError(f"{text!r} is no dose; expected numbers of half gaps, such as 1,2,4") from None
 
 
-def _show(effects: "Effects", style: str) -> None:
+def _show(effects: "InterventionResult", style: str) -> None:
     if style == "json":
         print_json_text(effects.to_json())
     elif style == "csv":

@@ -14,7 +14,7 @@ class Passage(nn.Module):
         return passing
 
 
-class Memory(nn.Module):
+class PromptKV(nn.Module):
     """One passage for the keys and one for the values of every block.
 
     An inference sends what it keeps of the prompt through once: when the prompt is read, and before the part that

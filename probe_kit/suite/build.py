@@ -18,7 +18,7 @@ from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUIT
 from probe_kit.suite.generators.twins import draw_twins
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
-from probe_kit.suite.manifest import load_suite, check_foreign_folder, save_suite
+from probe_kit.suite.manifest import check_foreign_folder, load_suite, save_suite
 from probe_kit.suite.suite import Suite
 
 Progress = Callable[[int, int], None]

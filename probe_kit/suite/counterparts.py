@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from probe_kit.suite.items import Item
 
 
-def twins_of(items: Iterable[Item]) -> Mapping[str, Item]:
+def counterparts_of(items: Iterable[Item]) -> Mapping[str, Item]:
     """By item id the twin of every item that has one.
 
     A twin shows the same two pictures, asks for the other one in other words, and is of the same category; how the

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
-    from probe_kit.train.results.control_scores import BaselineScore, Controls, ControlComparison, TwinScore
+    from probe_kit.train.results.control_scores import BaselineScore, ControlComparison, Controls, TwinScore
     from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
@@ -30,20 +30,20 @@ __all__ = [
     "ArrayRun",
     "Baseline",
     "BaselineScore",
-    "Controls",
-    "ProbeCurve",
-    "Direction",
     "ControlComparison",
+    "Controls",
+    "Direction",
     "FoldUnit",
     "Incomplete",
+    "ProbeCurve",
     "ProbeResults",
     "ProbeSettings",
     "Progress",
     "RunReader",
     "Target",
     "TwinScore",
-    "load_results_by_call",
     "load_results",
+    "load_results_by_call",
     "save_results",
     "train_probes",
 ]

@@ -8,7 +8,7 @@ import typer
 from rich.text import Text
 
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
-from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:

@@ -66,7 +66,7 @@ def power(
 
 
 def _print(found: "list[Power]") -> None:
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
     from probe_kit.statistics.significance import detectable
 
     headings = (

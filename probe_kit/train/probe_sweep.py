@@ -213,7 +213,10 @@ def _fit(sweep: _Sweep) -> ProbeResults:
 
 def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
     """Every view and site, in order, for every category; what a former sweep finished is read back."""
-    keys, unfinished = sweep.keys, SweepCheckpoint.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run))
+    keys, unfinished = (
+        sweep.keys,
+        SweepCheckpoint.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run)),
+    )
     probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
     progress = sweep.progress or notebook_progress("sites probed")
     columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)

@@ -19,7 +19,7 @@ from probe_kit.extract.store.integrity.orphans import known_keys
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.thumbnails import read_thumbnail, thumbnail_key
-from probe_kit.intervene import stored_following
+from probe_kit.intervene import stored_image_swaps
 from probe_kit.retention import retention
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
@@ -498,7 +498,7 @@ def test_changed_settings_of_interventions_are_found(run: Path, change: Edit) ->
     edit(stored_intervention(run) / "settings.json", change)
     assert_found(run, "settings.json")
     with pytest.raises(RunDamagedError, match="probe-kit intervene"):
-        stored_following(open_run(run))
+        stored_image_swaps(open_run(run))
 
 
 def test_changed_or_lost_answers_are_found(run: Path, other: Path) -> None:

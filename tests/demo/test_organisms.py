@@ -22,7 +22,7 @@ from probe_kit.demo.organisms import (
 )
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
-from probe_kit.intervene import Follow, Words, intervene_on
+from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import regime
 from probe_kit.retention.report.category_summary import verdict
@@ -87,7 +87,7 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
 def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
     p: float, limits: tuple[float, float], shown: bool, expected: str
 ) -> None:
-    alone = replace(row(0.4, p), used="inconclusive", follows_net_ci=limits)
+    alone = replace(row(0.4, p), used="inconclusive", net_follow_rate_ci=limits)
     assert measured(alone, shown) == expected
     assert measured(replace(alone, used="used"), shown) == "used"
 
@@ -97,9 +97,9 @@ def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_pa
     twin = replace(OTHER_TWINS[0], max_steps=1)
     settings = replace(settings_of(twin, small_suite), categories=("color",), items=2, video="none", env_workers=0)
     run = extract_run(settings, tmp_path / "run")
-    assert len(intervene_on(run, Follow(), source_of(twin, small_suite)).table) == 1
+    assert len(run_intervention(run, ImageSwap(), source_of(twin, small_suite)).table) == 1
     with pytest.raises(SettingsMismatchError, match="weights"):
-        intervene_on(run, Words(), source_of(RANDOM_TWIN, small_suite))
+        run_intervention(run, InstructionSwap(), source_of(RANDOM_TWIN, small_suite))
 
 
 def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:

@@ -27,7 +27,7 @@ from probe_kit.extract.rollout.answer_controller import AnswerController, AskTur
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
-from probe_kit.hooks import Prompt, AnswerModel, Reading, Site
+from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.suite import Suite, load_suite
 from tests.support.position_readers import PositionReader, always, likes

@@ -135,7 +135,10 @@ def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
     ("settings", "complaint"),
     [
         (ExtractSettings("pi0-tiny", capture_only=True, execute=2), "--execute means nothing"),
-        (ExtractSettings("pi0-tiny", capture_only=True, captured_calls=2, video="first"), "--captured-calls, --video"),
+        (
+            ExtractSettings("pi0-tiny", capture_only=True, captured_calls=2, video="first"),
+            "--captured-calls, --video",
+        ),
         (ExtractSettings("expert", capture_only=True), "--no-act means nothing"),
     ],
 )

@@ -147,7 +147,9 @@ def test_every_family_of_ours_is_looked_at() -> None:
     from probe_kit.hooks.registry import known_families
 
     untouched = {"pi0-tiny-early", "pi0-tiny-state", "prismatic"}
-    while_acting = {name for name, one in known_families().items() if one.acts and one.loader.startswith("probe_kit.")}
+    while_acting = {
+        name for name, one in known_families().items() if one.acts and one.loader.startswith("probe_kit.")
+    }
     assert while_acting - untouched <= FOLDERS.keys()
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.rollout.examples import example_observations
-from probe_kit.hooks import Policy, AnswerModel, capture, load_model
+from probe_kit.hooks import AnswerModel, Policy, capture, load_model
 from probe_kit.hooks.contract.model import Prompt
 from tests.support.every_checkpoint import WRITERS
 

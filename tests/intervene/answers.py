@@ -5,15 +5,15 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.intervene import Answers
+from probe_kit.intervene import ConditionOutcomes
 
 Cell = NDArray[np.float64]
 
 
-def answers_of(signs: Mapping[str, tuple[Cell, Cell]], groups: int | None = None) -> Answers:
+def outcomes_of(signs: Mapping[str, tuple[Cell, Cell]], groups: int | None = None) -> ConditionOutcomes:
     """signs: by category, metres toward the correct side (E,), plain and exchanged; two layouts an item."""
     rows: dict[str, list[str]] = {name: [] for name in ("episodes", "items", "groups", "categories", "sides")}
-    lateral: list[list[float]] = [[], []]
+    displacement: list[list[float]] = [[], []]
     for category, (plain, exchanged) in signs.items():
         for number, values in enumerate(zip(plain, exchanged, strict=True)):
             item, swapped = divmod(number, 2)
@@ -23,16 +23,16 @@ def answers_of(signs: Mapping[str, tuple[Cell, Cell]], groups: int | None = None
             rows["groups"].append(f"{category}-{item if groups is None else item % groups}")
             rows["categories"].append(category)
             rows["sides"].append(side)
-            for row, value in zip(lateral, values, strict=True):
+            for row, value in zip(displacement, values, strict=True):
                 row.append(value if side == "left" else -value)
-    moved = np.array(lateral)
-    return Answers(
-        conditions=("plain", "exchanged"),
+    moved = np.array(displacement)
+    return ConditionOutcomes(
+        conditions=("clean", "image_swap"),
         **{name: np.array(values) for name, values in rows.items()},
-        lateral=moved,
-        changed=np.abs(moved - moved[0]),
-        ledger=np.zeros((*moved.shape, 5)),
-        apart=np.zeros(moved.shape[1]),
+        displacement=moved,
+        max_action_change=np.abs(moved - moved[0]),
+        edit_log=np.zeros((*moved.shape, 5)),
+        replay_error=np.zeros(moved.shape[1]),
     )
 
 

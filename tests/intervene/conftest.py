@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from probe_kit.extract import Run, open_run
-from probe_kit.intervene import Source
-from probe_kit.intervene.replay.session import Bench, open_bench
+from probe_kit.intervene import ReplaySource
+from probe_kit.intervene.replay.session import ReplaySession, open_session
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="session")
-def source(small_suite: Suite) -> Source:
-    return Source(small_suite.folder)
+def source(small_suite: Suite) -> ReplaySource:
+    return ReplaySource(small_suite.folder)
 
 
 @pytest.fixture(scope="module")
-def bench(copy: Run, source: Source, twin: "Policy") -> Iterator[Bench]:
-    with open_bench(copy, source, lambda *_: twin) as opened, opened.ready():
+def session(copy: Run, source: ReplaySource, twin: "Policy") -> Iterator[ReplaySession]:
+    with open_session(copy, source, lambda *_: twin) as opened, opened.ready():
         yield opened

@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.extract import Run
-from probe_kit.intervene import Follow
+from probe_kit.intervene import ImageSwap
 from probe_kit.intervene.results.results import effects_csv
 from probe_kit.intervene.store.answers import save
 from probe_kit.intervene.store.settings import key_of, settings_of
-from tests.intervene.answers import answers_of, follower, habit
+from tests.intervene.answers import follower, habit, outcomes_of
 
 
 @pytest.fixture
@@ -22,15 +22,15 @@ def run(recorded_run: Run, tmp_path: Path) -> Run:
     from probe_kit.extract import open_run
 
     copy = open_run(shutil.copytree(recorded_run.path, tmp_path / "run"))
-    answers = answers_of({"color": follower(24), "shape": habit(24)})
-    settings = settings_of(Follow(), copy)
+    outcomes = outcomes_of({"color": follower(24), "shape": habit(24)})
+    settings = settings_of(ImageSwap(), copy)
     certificate = {"replay": {"episodes": 48, "compared": 48, "equal": 47, "largest_difference": 1e-7}}
     save(
         copy.location,
         settings,
         key_of(settings),
-        answers,
-        effects_csv(answers, copy.suite),
+        outcomes,
+        effects_csv(outcomes, copy.suite),
         certificate,
     )
     return copy
@@ -62,7 +62,7 @@ def test_json_holds_settings_and_effects(run: Run) -> None:
     assert code == 0
     assert [row["category"] for row in found["effects"]] == ["color", "shape"]
     assert found["effects"][0]["p_follows"] == 2.0**-12
-    assert found["settings"]["kind"] == "follow"
+    assert found["settings"]["kind"] == "image-swap"
 
 
 def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
@@ -73,7 +73,7 @@ def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "words"),
+    ("options", "code", "instruction-swap"),
     [
         (("--kind", "wish"), 2, "unknown kind"),
         (("--format", "xml"), 2, "unknown format"),
@@ -96,17 +96,23 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "instruction-swap"),
     [
-        (("--doses", "1"), "--doses means nothing to --kind follow"),
-        (("--kind", "interchange", "--toward", "left"), "--toward means nothing"),
+        (("--coefficients", "1"), "--coefficients means nothing to --kind image-swap"),
+        (("--kind", "interchange", "--target-side", "left"), "--target-side means nothing"),
         (("--kind", "steer"), "needs --sites"),
         (("--kind", "steer", "--sites", "backbone.02", "--roles", "image,language"), "one of --roles"),
-        (("--kind", "steer", "--sites", "backbone.02", "--roles", "image", "--doses", "much"), "is no dose"),
+        (
+            ("--kind", "steer", "--sites", "backbone.02", "--roles", "image", "--coefficients", "much"),
+            "is no dose",
+        ),
         (("--kind", "interchange", "--controls", "2"), "choose --direction"),
         (("--kind", "erase"), "needs --sites"),
         (("--kind", "erase", "--sites", "backbone.02", "--direction", "zap"), "expected leace"),
-        (("--kind", "erase", "--sites", "backbone.02", "--doses", "1"), "--doses means nothing to --kind erase"),
+        (
+            ("--kind", "erase", "--sites", "backbone.02", "--coefficients", "1"),
+            "--coefficients means nothing to --kind erase",
+        ),
     ],
 )
 def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...], words: str) -> None:
@@ -119,7 +125,7 @@ def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
     for options, words in (
         ((), "--kind interchange"),
         (("--roles", "image"), "go with --sites"),
-        (("--doses", "1"), "--doses means nothing to --kind closed-loop"),
+        (("--coefficients", "1"), "--coefficients means nothing to --kind closed-loop"),
         (("--sites", "backbone.02", "--direction", "none", "--controls", "1"), "--controls 0"),
         (("--sites", "backbone.02"), "--suite"),
     ):

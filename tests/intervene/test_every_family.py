@@ -15,16 +15,16 @@ from probe_kit.errors import UnsupportedInterventionError
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks.registry import find_family, known_families
 from probe_kit.intervene import (
-    Attention,
+    AttentionReadout,
     ClosedLoop,
-    Effects,
-    Erase,
-    Follow,
+    ConceptErasure,
+    ImageSwap,
+    InstructionSwap,
     Interchange,
-    Source,
-    Steer,
-    Words,
-    intervene_on,
+    InterventionResult,
+    ReplaySource,
+    Steering,
+    run_intervention,
 )
 from probe_kit.suite import Suite
 from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
@@ -67,7 +67,7 @@ def test_every_family_that_acts_is_here() -> None:
 @pytest.fixture(scope="module", params=FAMILIES)
 def made(
     request: pytest.FixtureRequest, small_suite: Suite, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Run, Source]:
+) -> tuple[Run, ReplaySource]:
     tiny = FAMILIES[request.param]
     checkpoint = None
     if tiny.golden:
@@ -80,7 +80,7 @@ def made(
         scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
     )  # fmt: skip
     run = extract_run(settings, tmp_path_factory.mktemp("families") / request.param)
-    return run, Source(small_suite.folder, checkpoint, tiny.options)
+    return run, ReplaySource(small_suite.folder, checkpoint, tiny.options)
 
 
 def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
@@ -89,9 +89,9 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     (file,) = copy.rglob("tokenizer.json")
     tokenizer = json.loads(file.read_text())
     vocabulary, special = tokenizer["model"]["vocab"], {own["content"] for own in tokenizer["added_tokens"]}
-    asked = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
-    spare = [word for word in vocabulary if word not in special | {"\n", *asked}]
-    missing = [word for word in asked if word not in vocabulary]
+    intervention = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
+    spare = [word for word in vocabulary if word not in special | {"\n", *intervention}]
+    missing = [word for word in intervention if word not in vocabulary]
     assert len(missing) <= len(spare)
     for word, other in zip(missing, spare, strict=False):
         vocabulary[word] = vocabulary.pop(other)
@@ -99,41 +99,45 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     return copy
 
 
-def asked_of(run: Run, kind: str) -> Attention | Follow | Words | Interchange | Steer | Erase | ClosedLoop:
+def asked_of(
+    run: Run, kind: str
+) -> AttentionReadout | ImageSwap | InstructionSwap | Interchange | Steering | ConceptErasure | ClosedLoop:
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}"
     acting = next(stream for stream in run.streams.values() if stream.part == "action")
     late = f"{acting.name}.01@0-{(acting.iterations or 1) - 1}"
     role = "action"
     return {
-        "follow": lambda: Follow(**COMMON),
-        "words": lambda: Words(**COMMON),
+        "image-swap": lambda: ImageSwap(**COMMON),
+        "instruction-swap": lambda: InstructionSwap(**COMMON),
         "interchange": lambda: Interchange(
             **COMMON, sites=("backbone.00", last, late), roles=("all", "image", "language", role)
         ),
         "direction": lambda: Interchange(
             **COMMON, sites=("backbone.01",), roles=("image",), direction="mean-difference", controls=1
         ),
-        "memory": lambda: Interchange(**COMMON, sites=("memory.*",), roles=("all", "image")),
-        "shadow": lambda: Interchange(**COMMON | {"items": 2}, sites=("backbone.00", last), readout="shadow"),
+        "kv": lambda: Interchange(**COMMON, sites=("kv.*",), roles=("all", "image")),
+        "per-step": lambda: Interchange(**COMMON | {"items": 2}, sites=("backbone.00", last), readout="per-step"),
         "tiles": lambda: Interchange(**COMMON, sites=("backbone.00",), roles=("image.left", "image.right")),
-        "steer": lambda: Steer(**COMMON, sites=("backbone.01",), role="image", doses=(2.0,), controls=1),
-        "erase": lambda: Erase(**COMMON, sites=("backbone.01",), controls=1),
-        "attention": lambda: Attention(**COMMON | {"items": 2}),
-        "attention-shadow": lambda: Attention(**COMMON | {"items": 1}, readout="shadow"),
-        "closed-loop": lambda: ClosedLoop(**COMMON | {"items": 2}, cells=("backbone.00|all", "backbone.01|image")),
+        "steer": lambda: Steering(**COMMON, sites=("backbone.01",), role="image", coefficients=(2.0,), controls=1),
+        "erase": lambda: ConceptErasure(**COMMON, sites=("backbone.01",), controls=1),
+        "attention": lambda: AttentionReadout(**COMMON | {"items": 2}),
+        "attention-shadow": lambda: AttentionReadout(**COMMON | {"items": 1}, readout="per-step"),
+        "closed-loop": lambda: ClosedLoop(
+            **COMMON | {"items": 2}, targets=("backbone.00|all", "backbone.01|image")
+        ),
     }[kind]()
 
 
 @pytest.mark.parametrize(
     "kind",
     [
-        "follow",
-        "words",
+        "image-swap",
+        "instruction-swap",
         "interchange",
         "direction",
-        "memory",
+        "kv",
         "tiles",
-        "shadow",
+        "per-step",
         "steer",
         "erase",
         "attention",
@@ -141,29 +145,29 @@ def asked_of(run: Run, kind: str) -> Attention | Follow | Words | Interchange | 
         "closed-loop",
     ],
 )
-def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, Source], kind: str) -> None:
+def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, ReplaySource], kind: str) -> None:
     run, source = made
-    asked, supported = asked_of(run, kind), find_family(run.model).interventions
-    if any(not supported.supports(needed) for needed in asked.needs):
+    intervention, supported = asked_of(run, kind), find_family(run.model).interventions
+    if any(not supported.supports(needed) for needed in intervention.required_capabilities):
         with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
-            intervene_on(run, asked, source)
+            run_intervention(run, intervention, source)
         return
-    effects = intervene_on(run, asked, source)
+    effects = run_intervention(run, intervention, source)
     check = effects.certificate["replay"]
     assert check["equal"] == check["compared"] > 0
-    assert np.isfinite(effects.answers.lateral).all()
+    assert np.isfinite(effects.outcomes.displacement).all()
     assert effects.to_csv().count("\n") > 1
     assert effects.to_rich() is not None
     _check_ledger(run, effects)
 
 
-def _check_ledger(run: Run, effects: Effects) -> None:
+def _check_ledger(run: Run, effects: InterventionResult) -> None:
     """Every change fired; what writes back what is there, or is read by nothing, changes nothing."""
     supported = find_family(run.model).interventions
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}|"
     for name, said in effects.certificate["edits"].items():
         assert said["fires"] > 0, name
-        if name == "plain" or name.endswith("|0"):
+        if name == "clean" or name.endswith("|0"):
             assert said["largest_change"] == 0.0
             assert said["still"] == said["fires"]
         if name.startswith(last) and "backbone" in supported.unread:

@@ -20,9 +20,16 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.rollout.stage import Seen, Stage
-from probe_kit.intervene import Effects, Follow, Source, intervene_on, load_effects, stored_interventions
+from probe_kit.intervene import (
+    ImageSwap,
+    InterventionResult,
+    ReplaySource,
+    load_effects,
+    run_intervention,
+    stored_interventions,
+)
 from probe_kit.intervene.replay.rollout import planned_of
-from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.retention import retention
 
 if TYPE_CHECKING:
@@ -32,12 +39,12 @@ FILES = ("episodes.npz", "effects.csv", "certificate.json")
 
 
 @pytest.fixture(scope="module")
-def effects(copy: Run, source: Source, twin: "Policy") -> Effects:
-    return intervene_on(copy, Follow(items=2), source, load=lambda *_: twin)
+def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+    return run_intervention(copy, ImageSwap(items=2), source, load=lambda *_: twin)
 
 
 @pytest.fixture
-def mine(copy: Run, effects: Effects, tmp_path: Path) -> Run:
+def mine(copy: Run, effects: InterventionResult, tmp_path: Path) -> Run:
     """One that a test may damage."""
     assert effects
     return open_run(shutil.copytree(copy.path, tmp_path / "run"))
@@ -46,26 +53,26 @@ def mine(copy: Run, effects: Effects, tmp_path: Path) -> Run:
 # -- replaying -----------------------------------------------------------------------------------------------
 
 
-def test_plain_inferences_are_the_runs_bit_for_bit(effects: Effects) -> None:
+def test_plain_inferences_are_the_runs_bit_for_bit(effects: InterventionResult) -> None:
     check = effects.certificate["replay"]
     assert check == {"episodes": 8, "compared": 8, "equal": 8, "largest_difference": 0.0}
 
 
-def test_too_few_groups_are_said_to_show_nothing(effects: Effects) -> None:
+def test_too_few_groups_are_said_to_show_nothing(effects: InterventionResult) -> None:
     assert len(effects.notes) == 2
     assert "with 1 group of items no p can be below 0.5, so that nothing is beyond chance" in effects.notes[0]
-    assert all(min(row.p_follows, row.p_against) >= 0.5 for row in effects.rows)
-    enough = replace(effects.answers, groups=np.array([f"g{number}" for number in range(8)]))
+    assert all(min(row.follow_p, row.reversal_p) >= 0.5 for row in effects.rows)
+    enough = replace(effects.outcomes, groups=np.array([f"g{number}" for number in range(8)]))
     many = replace(enough, categories=np.full(8, "color"))
-    assert replace(effects, answers=many).notes == ()
+    assert replace(effects, outcomes=many).notes == ()
 
 
-def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, bench: Bench) -> None:
+def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, session: ReplaySession) -> None:
     """State and noise stay; and what one layout sees exchanged is what the other one sees, set up by itself."""
     item = str(copy.episodes["item_id"][0])
-    original, swapped = bench.questions(item)
-    planned = replace(planned_of(bench, swapped), scene_seed=planned_of(bench, original).scene_seed)
-    alone = Stage(bench.scene, None)
+    original, swapped = session.replay_inputs(item)
+    planned = replace(planned_of(session, swapped), scene_seed=planned_of(session, original).scene_seed)
+    alone = Stage(session.scene, None)
     looked = alone.look(planned)
     alone.close()
     assert isinstance(looked, Seen)
@@ -79,45 +86,45 @@ def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Ru
     assert original.seed != swapped.seed
 
 
-def test_left_of_the_middle_is_positive(bench: Bench, copy: Run) -> None:
-    (question, _) = bench.questions(str(copy.episodes["item_id"][0]))
+def test_left_of_the_middle_is_positive(session: ReplaySession, copy: Run) -> None:
+    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
     still = np.zeros((4, 7), np.float32)
     left = still.copy()
     left[:, 1] = 0.05
-    at_rest = bench.lateral(still, question.seen)
-    assert at_rest == pytest.approx(question.seen.state[1] - 0.028, abs=1e-6)
-    assert bench.lateral(left, question.seen) == pytest.approx(at_rest + 0.2, abs=1e-6)
+    at_rest = session.lateral_displacement(still, replay_input.seen)
+    assert at_rest == pytest.approx(replay_input.seen.state[1] - 0.028, abs=1e-6)
+    assert session.lateral_displacement(left, replay_input.seen) == pytest.approx(at_rest + 0.2, abs=1e-6)
 
 
-def test_another_policy_is_noticed_by_what_it_does(bench: Bench, copy: Run) -> None:
-    (question, _) = bench.questions(str(copy.episodes["item_id"][0]))
-    chunk = bench.act(question.seen, question.seed)
-    assert bench.apart(question, chunk) == 0.0
+def test_another_policy_is_noticed_by_what_it_does(session: ReplaySession, copy: Run) -> None:
+    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
+    chunk = session.act(replay_input.seen, replay_input.seed)
+    assert session.replay_error(replay_input, chunk) == 0.0
     with pytest.raises(CaptureChangedActionError, match="differs from the stored one"):
-        bench.apart(question, chunk + 0.1)
-    assert np.isnan(bench.apart(replace(question, stored=None), chunk))
+        session.replay_error(replay_input, chunk + 0.1)
+    assert np.isnan(session.replay_error(replace(replay_input, stored=None), chunk))
 
 
 # -- storing -------------------------------------------------------------------------------------------------
 
 
-def test_what_is_stored_is_read_back_and_not_played_again(copy: Run, effects: Effects) -> None:
+def test_what_is_stored_is_read_back_and_not_played_again(copy: Run, effects: InterventionResult) -> None:
     def load(*_: object) -> "Policy":
         raise AssertionError("it is stored")
 
-    again = intervene_on(copy, Follow(items=2), Source(Path("nowhere")), load=load)
+    again = run_intervention(copy, ImageSwap(items=2), ReplaySource(Path("nowhere")), load=load)
     assert again.key == effects.key
     assert again.to_csv() == effects.to_csv() == load_effects(copy).to_csv()
     assert json.loads(effects.to_json())["settings"]["items"] == 2
 
 
-def test_an_intervened_run_is_whole(copy: Run, effects: Effects) -> None:
+def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> None:
     found = verify_run(copy.path, deep=True)
     assert (found.problems, found.strays) == ((), ())
     assert [one.key for one in stored_interventions(copy)] == [effects.key]
 
 
-def test_killed_and_resumed_gives_the_same_bytes(copy: Run, effects: Effects, mine: Run, source: Source,
+def test_killed_and_resumed_gives_the_same_bytes(copy: Run, effects: InterventionResult, mine: Run, source: ReplaySource,
                                                  twin: "Policy") -> None:  # fmt: skip
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
@@ -129,20 +136,20 @@ def test_killed_and_resumed_gives_the_same_bytes(copy: Run, effects: Effects, mi
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        intervene_on(mine, Follow(items=2), source, load=lambda *_: twin, progress=stop)
+        run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin, progress=stop)
     assert verify_run(mine.path, deep=True).ok
     assert stored_interventions(mine) == []
     partial = mine.path / "interventions" / f".{effects.key}.partial"
     before = {path.name: path.stat().st_mtime_ns for path in partial.iterdir()}
     assert len(before) == 3
-    intervene_on(mine, Follow(items=2), source, load=lambda *_: twin)
+    run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin)
     assert not partial.exists()
     for name in FILES:
         assert (folder / name).read_bytes() == (copy.path / "interventions" / effects.key / name).read_bytes()
 
 
 def test_a_damaged_piece_is_not_continued_from(
-    mine: Run, effects: Effects, source: Source, twin: "Policy"
+    mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
 ) -> None:
     shutil.rmtree(mine.path / "interventions" / effects.key)
 
@@ -151,15 +158,15 @@ def test_a_damaged_piece_is_not_continued_from(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        intervene_on(mine, Follow(items=2), source, load=lambda *_: twin, progress=stop)
+        run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin, progress=stop)
     first, second = sorted((mine.path / "interventions" / f".{effects.key}.partial").iterdir())
     shutil.copy(first, second)
     with pytest.raises(RunDamagedError, match=second.name):
-        intervene_on(mine, Follow(items=2), source, load=lambda *_: twin)
+        run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin)
 
 
 @pytest.mark.parametrize("name", [*FILES, "settings.json"])
-def test_a_changed_file_is_found(mine: Run, effects: Effects, name: str) -> None:
+def test_a_changed_file_is_found(mine: Run, effects: InterventionResult, name: str) -> None:
     path = mine.path / "interventions" / effects.key / name
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
@@ -168,7 +175,7 @@ def test_a_changed_file_is_found(mine: Run, effects: Effects, name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["episodes.npz", "settings.json"])
-def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: Effects, name: str) -> None:
+def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: InterventionResult, name: str) -> None:
     path = mine.path / "interventions" / effects.key / name
     path.write_bytes(path.read_bytes()[:-3] + b"}\n ")
     with pytest.raises(RunDamagedError, match=name):
@@ -181,15 +188,17 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     assert stored_interventions(fewer) == []
     with pytest.raises(NoInterventionsError, match="probe-kit intervene"):
         load_effects(fewer)
-    assert all(row.follows is None for row in retention([fewer]).rows)
+    assert all(row.follow_rate is None for row in retention([fewer]).rows)
 
 
 # -- what retention makes of it ------------------------------------------------------------------------------
 
 
-def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Effects) -> None:
+def test_tables_show_it_beside_the_success_rate(copy: Run, effects: InterventionResult) -> None:
     table = retention([copy])
-    assert {row.category: row.follows for row in table.rows} == {row.category: row.follows for row in effects.rows}
+    assert {row.category: row.follow_rate for row in table.rows} == {
+        row.category: row.follow_rate for row in effects.rows
+    }
     assert all(row.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
         assert "ollows / against" in text
@@ -204,21 +213,21 @@ def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:
 
 
 def test_another_policy_another_suite_another_category_are_refused(
-    copy: Run, source: Source, twin: "Policy", pi0_tiny: "Policy", tmp_path: Path
+    copy: Run, source: ReplaySource, twin: "Policy", pi0_tiny: "Policy", tmp_path: Path
 ) -> None:
     from probe_kit.suite import build_suite
 
     with pytest.raises(SettingsMismatchError, match="weights"):
-        intervene_on(copy, Follow(items=1), source, load=lambda *_: pi0_tiny)
+        run_intervention(copy, ImageSwap(items=1), source, load=lambda *_: pi0_tiny)
     other = build_suite(tmp_path / "other", ["color"], 2, seed=5)
     with pytest.raises(SuiteError):
-        intervene_on(copy, Follow(items=1), Source(other.folder), load=lambda *_: twin)
+        run_intervention(copy, ImageSwap(items=1), ReplaySource(other.folder), load=lambda *_: twin)
     with pytest.raises(UnknownCategoryError, match="color, shape"):
-        intervene_on(copy, Follow(categories=("colour",)), source, load=lambda *_: twin)
+        run_intervention(copy, ImageSwap(categories=("colour",)), source, load=lambda *_: twin)
     with pytest.raises(UsageError, match="--suite"):
-        intervene_on(copy, Follow(items=1), load=lambda *_: twin)
+        run_intervention(copy, ImageSwap(items=1), load=lambda *_: twin)
     with pytest.raises(UsageError, match="at least 1"):
-        Follow(items=0)
+        ImageSwap(items=0)
 
 
 @pytest.mark.parametrize(
@@ -226,8 +235,10 @@ def test_another_policy_another_suite_another_category_are_refused(
     [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"capture_only": True}, "capture_only"),
      ({"edits": [{}]}, "edited"), ({"ask": {}, "weights_sha256": None}, "asked")],
 )  # fmt: skip
-def test_a_policy_that_did_not_act_is_not_intervened_on(copy: Run, changed: dict[str, object], why: str) -> None:
+def test_a_policy_that_did_not_act_is_not_intervened_on(
+    copy: Run, max_action_change: dict[str, object], why: str
+) -> None:
     run = open_run(copy.path)
     run.settings = {**run.settings, **changed}
     with pytest.raises(UsageError, match=why):
-        intervene_on(run, Follow(items=1))
+        run_intervention(run, ImageSwap(items=1))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene import Weighed
+from probe_kit.intervene import AttentionShares
 from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import WEIGHED, save
+from probe_kit.intervene.store.answers import ATTENTION_FILE, save
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.retention import retention
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, gallery
@@ -25,7 +25,7 @@ def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
     return probed_run({"color": ([0.5, 0.9], [[0.7]])})
 
 
-def noted(run: ArrayRun) -> Weighed:
+def noted(run: ArrayRun) -> AttentionShares:
     """Four inferences, three blocks of which one is not read, two iterations, two heads."""
     draw = np.random.default_rng(0)
     mass = draw.uniform(0, 0.2, (4, 3, 2, 2, len(ROLES))).astype(np.float32)
@@ -33,14 +33,14 @@ def noted(run: ArrayRun) -> Weighed:
     mass[:, 1] = np.nan
     names = np.array(["a", "b", "c", "d"])
     sides = np.array(["left", "right"] * 2)
-    weighed = Weighed(ROLES, names, names, np.array(["color"] * 4), sides, np.zeros(4, int), mass)
+    weighed = AttentionShares(ROLES, names, names, np.array(["color"] * 4), sides, np.zeros(4, int), mass)
     answers = answers_of({"color": follower(4)})
     settings = {
         "format": FORMAT, "kind": "attention", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
         "categories": ["color"],
     }  # fmt: skip
     check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
-    further = {WEIGHED: weighed.to_bytes()}
+    further = {ATTENTION_FILE: weighed.to_bytes()}
     written = effects_csv(answers, run.suite, kind="attention", further=further)
     save(run.location, settings, key_of(settings), answers, written, check, further)
     return weighed

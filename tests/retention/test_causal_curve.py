@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import Answers, save
+from probe_kit.intervene.store.answers import ConditionOutcomes, save
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.retention import retention
 from probe_kit.retention.displays import CausalCurveDisplay, causal_curve, gallery
@@ -20,7 +20,7 @@ mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
 
 
-def store(run: ArrayRun, kind: str, answers: Answers, **asked: str) -> None:
+def store(run: ArrayRun, kind: str, answers: ConditionOutcomes, **asked: str) -> None:
     categories = list(dict.fromkeys(answers.categories.tolist()))
     settings = {
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
@@ -30,21 +30,21 @@ def store(run: ArrayRun, kind: str, answers: Answers, **asked: str) -> None:
     save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
 
 
-def inside(answers: Answers, condition: str = "|all", **shares: float) -> Answers:
+def inside(answers: ConditionOutcomes, condition: str = "|all", **shares: float) -> ConditionOutcomes:
     """shares: by place (`__` for `.`), how many of the episodes go where the exchange brings them."""
     count = answers.episodes.size
     rows = [
         np.where(np.arange(count) < share * count, answers.of("exchanged"), answers.of("plain"))
         for share in shares.values()
     ]
-    lateral = np.vstack([answers.lateral, *rows])
+    lateral = np.vstack([answers.displacement, *rows])
     names = tuple(f"{name.replace('__', '.')}{condition}" for name in shares)
     return replace(
         answers,
         conditions=(*answers.conditions, *names),
-        lateral=lateral,
-        changed=np.abs(lateral - lateral[0]),
-        ledger=np.zeros((*lateral.shape, 5)),
+        displacement=lateral,
+        max_action_change=np.abs(lateral - lateral[0]),
+        edit_log=np.zeros((*lateral.shape, 5)),
     )
 
 
@@ -85,7 +85,7 @@ def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
     rows = {row.category: row for row in retention([run]).rows}
     assert (rows["color"].used, rows["shape"].used) == ("used", "encoded, unused")
     assert rows["shape"].used_note == "positive control: color"
-    assert (rows["color"].follows, rows["color"].against) == (1.0, 0.0)
+    assert (rows["color"].follow_rate, rows["color"].reversal_rate) == (1.0, 0.0)
 
 
 def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
@@ -102,12 +102,12 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     answers = answers_of({"color": follower(48)})
     both = {
         "backbone.*": inside(answers, backbone__00=1.0, backbone__01=0.0),
-        "memory.*": inside(answers, memory__00=1.0, memory__01=0.0),
+        "kv.*": inside(answers, kv__00=1.0, kv__01=0.0),
     }
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
     (row,) = (row for row in retention([run]).rows if row.category == "color")
-    assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at memory.00")
+    assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at kv.00")
     display = CausalCurveDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])

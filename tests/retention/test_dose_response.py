@@ -38,13 +38,13 @@ def steered(run: ArrayRun) -> None:
     answers = replace(
         answers,
         conditions=("plain", *(f"backbone.01|image|{name}" for name in turned)),
-        lateral=lateral,
-        changed=np.abs(lateral - lateral[0]),
-        ledger=np.ones((*lateral.shape, 5)),
+        displacement=lateral,
+        max_action_change=np.abs(lateral - lateral[0]),
+        edit_log=np.ones((*lateral.shape, 5)),
     )
     settings = {
         "format": FORMAT, "kind": "steer", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": ["color"], "toward": "wrong",
+        "categories": ["color"], "target_side": "wrong",
     }  # fmt: skip
     check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
     written = effects_csv(answers, run.suite, "wrong")
@@ -55,11 +55,11 @@ def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: Array
     steered(run)
     display = DoseResponseDisplay.from_run(run, "color").plot()
     assert display.place == "backbone.01 image"
-    np.testing.assert_allclose(display.doses, [0, 2, 4])
+    np.testing.assert_allclose(display.coefficients, [0, 2, 4])
     np.testing.assert_allclose(display.net, [0, 50, 100])
     np.testing.assert_allclose((display.left + display.right) / 2, display.net)
     np.testing.assert_allclose(display.controls, [[np.nan, 0, 12.5]])
-    np.testing.assert_allclose(display.norm_ratio, 1)
+    np.testing.assert_allclose(display.relative_change, 1)
     assert display.significant.tolist() == [False, True, True]
     assert display.ax_ is not None
     labels = [line.get_label() for line in display.ax_.get_lines()]

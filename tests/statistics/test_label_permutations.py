@@ -2,9 +2,9 @@ import numpy as np
 
 from probe_kit.statistics.label_permutations import (
     exchange_groups,
-    max_statistic_p,
     flip_groups,
     flip_items,
+    max_statistic_p,
     pointwise_p,
     smallest_p,
 )

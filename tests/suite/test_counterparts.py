@@ -3,12 +3,12 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.suite import Suite
-from probe_kit.suite.counterparts import twins_of
+from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Item, other_side
 
 
 def test_every_item_of_the_embedded_generators_has_its_twin(small_suite: Suite) -> None:
-    twins = twins_of(small_suite.items)
+    twins = counterparts_of(small_suite.items)
     assert twins.keys() == {item.item_id for item in small_suite.items}
     for item in small_suite.items:
         twin = twins[item.item_id]
@@ -25,11 +25,11 @@ def test_every_item_of_the_embedded_generators_has_its_twin(small_suite: Suite) 
 @pytest.fixture
 def pair(small_suite: Suite) -> tuple[Item, Item]:
     one = small_suite.items[0]
-    return one, twins_of(small_suite.items)[one.item_id]
+    return one, counterparts_of(small_suite.items)[one.item_id]
 
 
 def test_an_item_whose_twin_is_not_there_has_none(pair: tuple[Item, Item]) -> None:
-    assert twins_of(pair[:1]) == {}
+    assert counterparts_of(pair[:1]) == {}
 
 
 @pytest.mark.parametrize(
@@ -39,12 +39,12 @@ def test_what_asks_for_the_same_or_shows_another_picture_is_no_twin(pair: tuple[
     one, twin = pair
     same = {"instruction": one.instruction, "correct_side": one.correct_side}
     other = replace(twin, **{name: same.get(name, "another")})
-    assert twins_of([one, other]) == {}
+    assert counterparts_of([one, other]) == {}
 
 
 def test_an_item_of_one_picture_twice_has_no_twin(pair: tuple[Item, Item]) -> None:
     alike = [replace(own, left_pixels_sha256=own.right_pixels_sha256) for own in pair]
-    assert twins_of(alike) == {}
+    assert counterparts_of(alike) == {}
 
 
 def test_how_the_pictures_lie_plays_no_part(pair: tuple[Item, Item]) -> None:
@@ -56,12 +56,12 @@ def test_how_the_pictures_lie_plays_no_part(pair: tuple[Item, Item]) -> None:
         right_pixels_sha256=twin.left_pixels_sha256,
         correct_side=other_side(twin.correct_side),
     )
-    assert twins_of([one, turned])[one.item_id] is turned
+    assert counterparts_of([one, turned])[one.item_id] is turned
 
 
 def test_ids_and_pair_ids_play_no_part(pair: tuple[Item, Item]) -> None:
     """So that a converted suite, whose ids are its source's, has twins as well."""
     one, twin = pair
     other = replace(twin, pair_id="elsewhere-7", item_id="zzz")
-    assert twins_of([one, other])[one.item_id] is other
-    assert twins_of([one, other, twin])[one.item_id] is min(other, twin, key=lambda item: item.item_id)
+    assert counterparts_of([one, other])[one.item_id] is other
+    assert counterparts_of([one, other, twin])[one.item_id] is min(other, twin, key=lambda item: item.item_id)

@@ -16,7 +16,7 @@ from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene import Answers, Follow
+from probe_kit.intervene import ConditionOutcomes, ImageSwap
 from probe_kit.intervene.results.results import effects_csv
 from probe_kit.intervene.store.answers import save
 from probe_kit.intervene.store.settings import key_of, settings_of
@@ -109,18 +109,18 @@ def write_little_run(
 
 def intervene_on_little_run(run: Run) -> None:
     """A stored intervention on its episodes, with answers drawn instead of inferred."""
-    settings, episodes = settings_of(Follow(), run), run.episodes
+    settings, episodes = settings_of(ImageSwap(), run), run.episodes
     draw = np.random.default_rng(derive_seed("little", run.settings_sha256))
     names = {"episodes": "episode_id", "items": "item_id", "groups": "group_id", "categories": "category"}
     lateral = draw.normal(size=(2, len(episodes)))
-    answers = Answers(
+    answers = ConditionOutcomes(
         conditions=("plain", "exchanged"),
         **{own: episodes[name].to_numpy(dtype=str) for own, name in names.items()},
         sides=episodes["side_correct"].to_numpy(dtype=str),
-        lateral=lateral,
-        changed=np.abs(lateral - lateral[0]),
-        ledger=np.zeros((*lateral.shape, 5)),
-        apart=np.zeros(len(episodes)),
+        displacement=lateral,
+        max_action_change=np.abs(lateral - lateral[0]),
+        edit_log=np.zeros((*lateral.shape, 5)),
+        replay_error=np.zeros(len(episodes)),
     )
     check = {
         "episodes": len(episodes),

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from torch import nn
 
-from probe_kit.hooks import ModelCard, Observation, Prompt, AnswerModel, Reading, Roles, Site, Stream, Tap
+from probe_kit.hooks import AnswerModel, ModelCard, Observation, Prompt, Reading, Roles, Site, Stream, Tap
 
 Liking = Callable[[str, str], float]
 """The logit of an option (without its lead) behind a question."""

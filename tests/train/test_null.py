@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from probe_kit.statistics.label_permutations import max_statistic_p, flip_groups, pointwise_p
+from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, pointwise_p
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples

@@ -25,7 +25,7 @@ from probe_kit.suite.wording import side_words
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-    from probe_kit.hooks import Prompt, AnswerModel, Reading, Roles
+    from probe_kit.hooks import AnswerModel, Prompt, Reading, Roles
 
 
 @dataclass(frozen=True)

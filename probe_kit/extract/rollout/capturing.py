@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-    from probe_kit.hooks import Model, Roles, Site, ActivationCache
+    from probe_kit.hooks import ActivationCache, Model, Roles, Site
 
 # Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
 SMALL = 10_000_000
@@ -92,7 +92,9 @@ class Capturer:
                 "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
             )
 
-    def _keep(self, tape: "ActivationCache", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers") -> None:
+    def _keep(
+        self, tape: "ActivationCache", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers"
+    ) -> None:
         """Hand one episode's share of a capture to its buffers."""
         import torch
 

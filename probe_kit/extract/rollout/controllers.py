@@ -146,7 +146,7 @@ class PolicyController:
         if capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
-        self._ledger: list[dict[str, Any]] = []
+        self._edit_log: list[dict[str, Any]] = []
 
     def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
@@ -201,7 +201,7 @@ class PolicyController:
             "policy": self.policy.card.to_json(),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
-            **({"edits": self._ledger} if self._edits else {}),
+            **({"edits": self._edit_log} if self._edits else {}),
         }
 
     @contextmanager
@@ -210,11 +210,11 @@ class PolicyController:
         if not self._edits:
             yield
             return
-        from probe_kit.hooks import applied
+        from probe_kit.hooks import apply_edits
 
-        with applied(self.policy, self._edits, observations, self._vectors) as ledger:
+        with apply_edits(self.policy, self._edits, observations, self._vectors) as edit_log:
             yield
-        self._ledger = [asdict(entry) for entry in ledger.entries]
+        self._edit_log = [asdict(entry) for entry in edit_log.entries]
 
 
 def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.controllers import ActingController, Turn
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
+from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord

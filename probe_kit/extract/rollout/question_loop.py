@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
+from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
 from probe_kit.hooks.checkpoints.third_party import while_acting

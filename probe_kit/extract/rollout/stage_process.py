@@ -6,7 +6,7 @@ from typing import Any
 from probe_kit._system.child_process import Child
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
-from probe_kit.extract.rollout.stage import Answer, Ending, StageRequest, Stage
+from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageRequest
 
 
 class ProcessStage:

@@ -16,8 +16,8 @@ from probe_kit.env import save_gif
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, BufferPool
-from probe_kit.extract.rollout.episode_loop import Failure, EpisodeLoop, Rollout
+from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
+from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
 from probe_kit.extract.rollout.events import Done, Event, Failed
 from probe_kit.extract.rollout.question_loop import Asking
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
@@ -42,7 +42,11 @@ class Worker:
     """
 
     def __init__(
-        self, writer: RunWriter, settings: RunSettings, controller: ActingController | AnswerController, episodes: int
+        self,
+        writer: RunWriter,
+        settings: RunSettings,
+        controller: ActingController | AnswerController,
+        episodes: int,
     ) -> None:
         self._writer, self._settings, self._controller = writer, settings, controller
         self._episodes = episodes

@@ -28,11 +28,11 @@ from probe_kit.extract.store.format.trajectories import create_trajectories, has
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import (
     Provenance,
+    check_other_provenance,
     keep_provenance,
     name_of,
     provenance_here,
     read_provenances,
-    check_other_provenance,
 )
 from probe_kit.hashing import canonical_json
 

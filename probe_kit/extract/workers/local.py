@@ -9,7 +9,9 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.workers.scheduler import Scheduler
 
 
-def run_here(prepared: Prepared, writer: RunWriter, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
+def run_here(
+    prepared: Prepared, writer: RunWriter, scheduler: Scheduler, on_event: Callable[[Event], None]
+) -> None:
     """Play every episode in this process, with the model that is loaded."""
     assert prepared.controller is not None
     episodes = len(writer.remaining())

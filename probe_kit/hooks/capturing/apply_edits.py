@@ -36,22 +36,22 @@ class Entry:
 
 
 @dataclass
-class Ledger:
+class EditLog:
     """What was changed while the context was open, in the order in which it fired."""
 
     entries: list[Entry] = field(default_factory=list)
 
 
 @contextmanager
-def applied(
+def apply_edits(
     model: Model, edits: Sequence[Edit], seen: Sequence[Observation], vectors: Vectors | None = None
-) -> Iterator[Ledger]:
+) -> Iterator[EditLog]:
     """Apply `edits` while the model runs once on `seen`; several at one site act in their order.
 
     Raises UsageError for a vector that is missing, has another hash or does not fit, UnknownSiteError for a site
     without roles, and what `capture_context.edit` raises.
     """
-    ledger, roles, given = Ledger(), model.token_roles(seen), dict(vectors or {})
+    edit_log, roles, given = EditLog(), model.token_roles(seen), dict(vectors or {})
     changes: dict[Site, list[Callable[[Tensor], Tensor]]] = defaultdict(list)
     for own in edits:
         vector = _vector(own, given)
@@ -60,7 +60,7 @@ def applied(
             if site.stream not in roles:
                 raise UsageError(f"{site} has no token roles, so that no token can be chosen in it")
             mask = np.stack([_tokens(row, own.roles) for row in roles[site.stream]])
-            changes[site].append(_change(own, site, mask, vector, ledger))
+            changes[site].append(_change(own, site, mask, vector, edit_log))
 
     def chain(site: Site) -> Callable[[Tensor], Tensor]:
         def rewrite(activation: Tensor) -> Tensor:
@@ -71,7 +71,7 @@ def applied(
         return rewrite
 
     with edit(model, {site: chain(site) for site in changes}):
-        yield ledger
+        yield edit_log
 
 
 def _vector(own: Edit, given: Vectors) -> NDArray[np.float32] | None:
@@ -89,7 +89,7 @@ def _tokens(row: Roles, roles: tuple[str, ...] | None) -> NDArray[np.bool_]:
 
 
 def _change(
-    own: Edit, site: Site, mask: NDArray[np.bool_], vector: NDArray[np.float32] | None, ledger: Ledger
+    own: Edit, site: Site, mask: NDArray[np.bool_], vector: NDArray[np.float32] | None, edit_log: EditLog
 ) -> Callable[[Tensor], Tensor]:
     """A function from (B, T, D) to the edited copy, which notes in the ledger what it did."""
 
@@ -99,7 +99,7 @@ def _change(
         after = torch.where(where[..., None], _target(own, site, before, vector), before)
         moved, norm = (after - before).norm(dim=-1)[where], before.norm(dim=-1)[where]
         if moved.numel():
-            ledger.entries.append(Entry(str(site), moved.numel(), float(norm.mean()), float(moved.mean())))
+            edit_log.entries.append(Entry(str(site), moved.numel(), float(norm.mean()), float(moved.mean())))
         return torch.where(where[..., None], after.to(activation.dtype), activation)
 
     return change

@@ -23,10 +23,10 @@ from probe_kit.hooks.capturing.activation_cache import ActivationCache
 from probe_kit.hooks.contract.model import Model, Tap
 from probe_kit.hooks.contract.sites import Site
 
-__all__ = ["Edit", "Reduce", "ActivationCache", "capture", "edit"]
+__all__ = ["ActivationCache", "EditFunction", "Reduce", "capture", "edit"]
 
 Reduce = Callable[[Site, Tensor], Tensor]
-Edit = Callable[[Tensor], Tensor]
+EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], None]
 _listening: WeakSet[Model] = WeakSet()
 
@@ -61,7 +61,7 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
 
 
 @contextmanager
-def edit(model: Model, edits: Mapping[Site, Edit]) -> Iterator[None]:
+def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
     """Replace activations while the model runs once, at exactly the place where `capture` reads them.
 
     edits: per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype.

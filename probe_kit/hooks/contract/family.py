@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
-from probe_kit.hooks.checkpoints.third_party import while_loading, naming_checkpoint
+from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.default_scene import BRIDGE, DefaultScene
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options

@@ -7,10 +7,10 @@ from typing import Any, Literal, get_args
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 
-InterventionKind = Literal["follow", "edit", "memory", "attention", "tiles"]
-Readout = Literal["chunk", "shadow"]
+InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles"]
+Readout = Literal["first-chunk", "per-step"]
 _UNDECLARED = {
-    "memory": "its adapter declares no memory. Interchange residual sites instead, or declare `Model.memory`",
+    "kv": "its adapter declares no memory. Interchange residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Exchange the memory or single roles instead: what an exchange "
     "moves is read, whatever attention weighs",
     "tiles": "its adapter does not say which picture token comes of which patch. Exchange all of `image`, or "
@@ -28,7 +28,7 @@ class Interventions:
     edits: per stored stream the quantities that can be rewritten; None for all that its streams have.
     unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
     the actions bit for bit, which makes it a control.
-    memory: whether it keeps keys and values of the prompt that what acts reads, see `Model.memory`.
+    prompt_kv: whether it keeps keys and values of the prompt that what acts reads, see `Model.prompt_kv`.
     first_affected_token: the first output that an edit of backbone or memory reaches through the memory: 0, or 1 where the
     prompt's own pass already chooses the first token.
     attention: whether it tells how much attention what acts pays to every token of the prompt.
@@ -41,11 +41,11 @@ class Interventions:
 
     edits: Mapping[str, tuple[str, ...]] | None = None
     unread: tuple[str, ...] = ()
-    memory: bool = False
+    prompt_kv: bool = False
     first_affected_token: int = 0
     attention: bool = False
     tiles: bool = False
-    readout: Readout = "chunk"
+    readout: Readout = "first-chunk"
     instead: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
@@ -54,7 +54,7 @@ class Interventions:
 
     def supports(self, kind: InterventionKind) -> bool:
         """Whether `kind` can be asked for."""
-        own = {"memory": self.memory, "attention": self.attention, "tiles": self.tiles}
+        own = {"kv": self.prompt_kv, "attention": self.attention, "tiles": self.tiles}
         return own.get(kind, True)
 
     def check(self, kind: InterventionKind, family: str) -> None:

@@ -103,7 +103,7 @@ class Model(ABC):
     """A network that can be listened to: what capture, edits, verification and the store need.
 
     streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
-    memory: the keys and values that the part which acts reads of the backbone, block by block, as a stream of the
+    prompt_kv: the keys and values that the part which acts reads of the backbone, block by block, as a stream of the
     quantities `MEMORY`; captured and edited by naming their sites, such as `memory.02.values`; None where a family
     has none. Its tokens are the backbone's.
     role_names: per stream, every role its tokens can play.
@@ -112,7 +112,7 @@ class Model(ABC):
     card: ModelCard
     streams: Mapping[str, Stream]
     further_streams: Mapping[str, Stream] = MappingProxyType({})
-    memory: Stream | None = None
+    prompt_kv: Stream | None = None
     role_names: Mapping[str, tuple[str, ...]]
 
     def __repr__(self) -> str:
@@ -143,14 +143,14 @@ class Model(ABC):
 
     def every_stream(self) -> dict[str, Stream]:
         """What is stored, what is captured by name only, and the memory."""
-        memory = {} if self.memory is None else {self.memory.name: self.memory}
+        memory = {} if self.prompt_kv is None else {self.prompt_kv.name: self.prompt_kv}
         return {**self.streams, **self.further_streams, **memory}
 
     def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """As `roles`, and those of the memory's tokens."""
         roles = self.roles(seen)
-        if self.memory is not None:
-            roles[self.memory.name] = roles[self.tokens_of(self.memory.name)]
+        if self.prompt_kv is not None:
+            roles[self.prompt_kv.name] = roles[self.tokens_of(self.prompt_kv.name)]
         return roles
 
     def patch_order(self) -> NDArray[np.int64]:
@@ -165,7 +165,7 @@ class Model(ABC):
 
     def tokens_of(self, stream: str) -> str:
         """The stored stream whose tokens a stream has: the backbone for the memory, else itself."""
-        if self.memory is None or stream != self.memory.name:
+        if self.prompt_kv is None or stream != self.prompt_kv.name:
             return stream
         return first_of("backbone", self.streams.values()) or stream
 

@@ -11,9 +11,9 @@ Part = Literal["backbone", "action", "vision", "bridge"]
 PARTS: tuple[Part, ...] = get_args(Part)
 QUANTITIES = ("residual", "attention", "mlp", "final_norm")
 """What the streams of today's families have; a family may declare others."""
-MEMORY = ("keys", "values")
+KV = ("keys", "values")
 """What a memory has, per block and token: all heads side by side, as attention reads them, keys after rotation."""
-MEMORY_STREAM = "memory"
+KV_STREAM = "kv"
 
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
@@ -132,9 +132,9 @@ class Stream:
         return range(self.layers - 1, self.layers) if quantity == "final_norm" else range(self.layers - 1)
 
 
-def memory_stream(blocks: int, width: int) -> Stream:
+def kv_stream(blocks: int, width: int) -> Stream:
     """The memory of a backbone of so many blocks; width: heads times size of a head."""
-    return Stream(MEMORY_STREAM, blocks + 1, width, part="bridge", label="memory of the prompt", quantities=MEMORY)
+    return Stream(KV_STREAM, blocks + 1, width, part="bridge", label="memory of the prompt", quantities=KV)
 
 
 def part_of(stream: str) -> Part:

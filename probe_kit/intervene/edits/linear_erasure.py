@@ -52,15 +52,15 @@ class Method:
 
 
 @dataclass(frozen=True)
-class Tokens:
+class PaddedTokens:
     """Tokens of N episodes at T positions. values: (N, T, D), anything where not present. present: (N, T)."""
 
     values: Array
     present: NDArray[np.bool_]
 
-    def only(self, rows: NDArray[np.int64]) -> "Tokens":
+    def only(self, rows: NDArray[np.int64]) -> "PaddedTokens":
         """Some of the episodes."""
-        return Tokens(self.values[rows], self.present[rows])
+        return PaddedTokens(self.values[rows], self.present[rows])
 
     def usable(self, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(T,) positions at which either answer has `FEWEST` episodes."""
@@ -101,7 +101,7 @@ class Eraser:
         return np.asarray(values - found)
 
 
-def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Eraser:
+def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) -> Eraser:
     """What erases the answer from such tokens. left: (N,) the answer.
 
     Raises UsageError if no position has episodes enough of either answer, or if there are fewer directions than
@@ -123,7 +123,7 @@ def fit_eraser(tokens: Tokens, left: NDArray[np.bool_], method: Method) -> Erase
 
 
 def fit_control(
-    tokens: Tokens, left: NDArray[np.bool_], method: Method, own: Eraser, draw: np.random.Generator
+    tokens: PaddedTokens, left: NDArray[np.bool_], method: Method, own: Eraser, draw: np.random.Generator
 ) -> Eraser:
     """The same taken away for no answer: as many random directions of the data's own covariance, beside `own`.
 
@@ -191,7 +191,7 @@ def leace_direction(centred: Array, label: Array, shrinkage: float | None = None
     return (along, read / strength) if strength > 0 else (np.zeros(width), np.zeros(width))
 
 
-def _check(tokens: Tokens, left: NDArray[np.bool_]) -> None:
+def _check(tokens: PaddedTokens, left: NDArray[np.bool_]) -> None:
     if not tokens.usable(left).any():
         raise UsageError(
             f"no position has {FEWEST} episodes of either answer among {len(left)} to learn from; expected more "
@@ -208,7 +208,7 @@ def _check_more(method: Method, there: int) -> None:
         )
 
 
-def _answer(tokens: Tokens, left: NDArray[np.bool_]) -> Array:
+def _answer(tokens: PaddedTokens, left: NDArray[np.bool_]) -> Array:
     """(N, T) the answer as ±½, centred at every position over who is present there."""
     values = np.where(tokens.present, left[:, None] - 0.5, 0.0)
     means = values.sum(axis=0) / np.maximum(tokens.present.sum(axis=0), 1)

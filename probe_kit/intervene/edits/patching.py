@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from probe_kit.hooks import Policy, ActivationCache
+    from probe_kit.hooks import ActivationCache, Policy
 
 
 @dataclass
-class Ledger:
+class EditLog:
     """What was done in one inference.
 
     fires: how often an edited site fired. still: of these, the fires that moved nothing. norm, moved: sums over
@@ -28,43 +28,43 @@ class Ledger:
     """
 
     fires: int = 0
-    still: int = 0
+    no_op_fires: int = 0
     norm: float = 0.0
     moved: float = 0.0
     largest: float = 0.0
 
     @classmethod
-    def sum(cls, ledgers: Sequence["Ledger"]) -> "Ledger":
+    def sum(cls, edit_logs: Sequence["EditLog"]) -> "EditLog":
         """Of several inferences, or of several streams of one."""
         return cls(
-            sum(one.fires for one in ledgers),
-            sum(one.still for one in ledgers),
-            sum(one.norm for one in ledgers),
-            sum(one.moved for one in ledgers),
-            max((one.largest for one in ledgers), default=0.0),
+            sum(one.fires for one in edit_logs),
+            sum(one.no_op_fires for one in edit_logs),
+            sum(one.norm for one in edit_logs),
+            sum(one.moved for one in edit_logs),
+            max((one.largest for one in edit_logs), default=0.0),
         )
 
     def row(self) -> NDArray[np.float64]:
         """(5,) as stored; `norm` and `moved` per fire."""
         per = max(self.fires, 1)
-        return np.array([self.fires, self.still, self.norm / per, self.moved / per, self.largest])
+        return np.array([self.fires, self.no_op_fires, self.norm / per, self.moved / per, self.largest])
 
 
-LEDGER = ("fires", "still", "norm", "moved", "largest")
+LOG_FIELDS = ("fires", "still", "norm", "moved", "largest")
 """What the columns of a stored ledger are."""
 
 
-Where = Union["Tensor", slice]
+TokenIndex = Union["Tensor", slice]
 """Positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
 EVERY = slice(None)
 
 
 @dataclass(frozen=True)
-class Tokens:
+class TokenSelection:
     """Some tokens of a stream. count: how many it has. where: which of them."""
 
     count: int
-    where: Where
+    where: TokenIndex
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], device: str) -> Self:
@@ -79,24 +79,24 @@ class Tokens:
         return cls(mask.size, torch.from_numpy(found).to(device))
 
 
-class Change(Protocol):
+class TokenEdit(Protocol):
     """What becomes of the tokens of a site."""
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """(1, T', D) float32 tokens in, as many out, and `own` left as it is. where: their positions."""
 
 
 @dataclass(frozen=True)
-class Replaced:
+class ReplaceWith:
     """By the same tokens of another inference."""
 
-    donor: "ActivationCache"
+    source: "ActivationCache"
     tokens: int
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """The donor's."""
         del own
-        other = self.donor[site]
+        other = self.source[site]
         if other.shape[1] != self.tokens:
             raise CaptureError(
                 f"the donor's {site} has {other.shape[1]} tokens; expected {self.tokens}, as before exchanging"
@@ -105,30 +105,30 @@ class Replaced:
 
 
 @dataclass(frozen=True)
-class ReplacedAlong:
+class ReplaceInSubspace:
     """By another inference's component along some directions; the rest stays. basis: (K, D) orthonormal."""
 
-    donor: "ActivationCache"
+    source: "ActivationCache"
     tokens: int
     basis: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """own + (donor − own) P."""
         import torch
 
-        apart = Replaced(self.donor, self.tokens)(site, own, where) - own
+        apart = ReplaceWith(self.source, self.tokens)(site, own, where) - own
         directions = torch.from_numpy(self.basis).to(own.device)
         found: Tensor = own + (apart @ directions.T) @ directions
         return found
 
 
 @dataclass(frozen=True)
-class Moved:
+class AddVector:
     """By a vector (D,), the same for every token."""
 
     vector: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """own + vector."""
         import torch
 
@@ -138,17 +138,19 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Kept:
+class Identity:
     """As they are: a dose of zero, which is written back like any other."""
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """own."""
         del site, where
         return own
 
 
 @contextmanager
-def patched(policy: "Policy", sites: Sequence[Site], tokens: Tokens, change: Change) -> Iterator[Ledger]:
+def apply_patch(
+    policy: "Policy", sites: Sequence[Site], tokens: TokenSelection, change: TokenEdit
+) -> Iterator[EditLog]:
     """Change the tokens of some sites while the policy infers once, for one observation.
 
     The ledger is complete when the context is left. Raises CaptureError for another number of tokens, and what
@@ -156,13 +158,13 @@ def patched(policy: "Policy", sites: Sequence[Site], tokens: Tokens, change: Cha
     """
     from probe_kit.hooks.capturing.capture_context import edit
 
-    ledger, patch = Ledger(), _Patch(tokens, change)
-    with edit(policy, {site: partial(patch.changed, site) for site in sites}):
-        yield ledger
-    patch.into(ledger)
+    edit_log, patch = EditLog(), _Patch(tokens, change)
+    with edit(policy, {site: partial(patch.max_action_change, site) for site in sites}):
+        yield edit_log
+    patch.into(edit_log)
 
 
-def _at(activation: "Tensor", where: Where) -> "Tensor":
+def _at(activation: "Tensor", where: TokenIndex) -> "Tensor":
     """(1, T', D) of (1, T, D), a view where they are neighbours."""
     if where is EVERY:
         return activation
@@ -177,11 +179,11 @@ class _Patch:
     caches, so that every single call here costs ten times what it costs in a loop: they are few.
     """
 
-    tokens: Tokens
-    change: Change
+    tokens: TokenSelection
+    change: TokenEdit
     pairs: "dict[torch.Size, list[Tensor]]" = field(default_factory=dict)
 
-    def changed(self, site: Site, activation: "Tensor") -> "Tensor":
+    def max_action_change(self, site: Site, activation: "Tensor") -> "Tensor":
         """(1, T, D) as it is to pass; raises CaptureError for another shape."""
         count, where = self.tokens.count, self.tokens.where
         if activation.shape[0] != 1 or activation.shape[1] != count:
@@ -199,7 +201,7 @@ class _Patch:
         changed[:, where] = after
         return changed
 
-    def into(self, ledger: Ledger) -> None:
+    def into(self, edit_log: EditLog) -> None:
         """Add all fires up. One transfer for those of one shape: a GPU waits at each."""
         import torch
 
@@ -209,8 +211,8 @@ class _Patch:
             norms = torch.linalg.vector_norm(both, dim=-1).tolist()
             for before, after in zip(norms[::2], norms[1::2], strict=True):
                 moved, largest = sum(after) / len(after), max(after)
-                ledger.fires += 1
-                ledger.still += int(largest == 0)
-                ledger.norm += sum(before) / len(before)
-                ledger.moved += moved
-                ledger.largest = max(ledger.largest, largest)
+                edit_log.fires += 1
+                edit_log.no_op_fires += int(largest == 0)
+                edit_log.norm += sum(before) / len(before)
+                edit_log.moved += moved
+                edit_log.largest = max(edit_log.largest, largest)

@@ -27,7 +27,7 @@ FOLDS = 5
 
 
 @dataclass(frozen=True)
-class Axes:
+class PooledDirections:
     """Unit directions of one site and role, per category and fold.
 
     units: by name and category (F, D) float32. half_gaps: by category (F,), half the distance of the class means
@@ -35,7 +35,7 @@ class Axes:
     """
 
     units: Mapping[tuple[str, str], Vector]
-    half_gaps: Mapping[str, NDArray[np.float64]]
+    half_differences: Mapping[str, NDArray[np.float64]]
     fold_of: Mapping[str, int]
     control_names: tuple[str, ...] = ()
 
@@ -47,9 +47,9 @@ class Axes:
         """(D,) the direction that never saw this episode."""
         return np.asarray(self.units[name, category][self.fold_of[episode]])
 
-    def half_gap(self, episode: str, category: str) -> float:
+    def half_difference(self, episode: str, category: str) -> float:
         """Half the distance of the class means, for this episode."""
-        return float(self.half_gaps[category][self.fold_of[episode]])
+        return float(self.half_differences[category][self.fold_of[episode]])
 
 
 def control_names(count: int) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ def view_of(role: str) -> str:
     return "mean" if role == "all" else f"mean:{role}"
 
 
-def axes_of(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> Axes:
+def fit_directions(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> PooledDirections:
     """Of every category of the run, from what is pooled over the tokens of `role` at `site`.
 
     Raises UsageError for an unknown direction, UnknownSiteError for a site or view that is not stored.
@@ -96,7 +96,7 @@ def axes_of(run: Run, site: Site, role: str, direction: str, controls: int, seed
                 of_fold[name].append(_control(training, [unit, _unit(difference)], draw))
         units |= {(name, category): np.array(found, np.float32) for name, found in of_fold.items()}
         gaps[category] = np.array(widths)
-    return Axes(units, gaps, fold_of, names)
+    return PooledDirections(units, gaps, fold_of, names)
 
 
 def _direction(training: NDArray[np.float64], left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.sites import MEMORY, MEMORY_STREAM, Site
+from probe_kit.hooks.contract.sites import KV, KV_STREAM, Site
 from probe_kit.hooks.contract.views import plays
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _PATTERN = re.compile(r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(@(?P<firs
 
 
 @dataclass(frozen=True)
-class Place:
+class SiteGroup:
     """One layer of a stream, over some of its iterations; of a memory its keys and values together."""
 
     name: str
@@ -33,7 +33,7 @@ class Place:
     @property
     def only_site(self) -> Site:
         """Its one site, where a direction can be found. Raises UnknownSiteError if it has several."""
-        if self.stream == MEMORY_STREAM:
+        if self.stream == KV_STREAM:
             raise UnknownSiteError(
                 f"{self.name} is keys and values, of which a run stores no means, so that no direction is found; "
                 "name a place of another stream, such as backbone.02"
@@ -51,7 +51,7 @@ class Place:
         return self.sites[0].stream
 
 
-def places(pattern: str, policy: "Policy") -> list[Place]:
+def resolve_sites(pattern: str, policy: "Policy") -> list[SiteGroup]:
     """The places that a pattern names.
 
     `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
@@ -60,24 +60,24 @@ def places(pattern: str, policy: "Policy") -> list[Place]:
     none.
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
-    if match is not None and match["stream"] == MEMORY_STREAM:
-        policy.interventions.check("memory", policy.card.family)
+    if match is not None and match["stream"] == KV_STREAM:
+        policy.interventions.check("kv", policy.card.family)
     if match is None or match["stream"] not in streams:
         raise UnknownSiteError(
             f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02 or expert.03@0-4, "
             f"of the streams {', '.join(streams)}"
         )
     stream = streams[match["stream"]]
-    every = range(stream.layers if stream is not policy.memory else stream.layers - 1)
+    every = range(stream.layers if stream is not policy.prompt_kv else stream.layers - 1)
     layers = every if match["layer"] == "*" else [int(match["layer"])]
     return [_place(stream, layer, match["first"], match["last"]) for layer in layers]
 
 
-def _place(stream: "Stream", layer: int, first: str | None, last: str | None) -> Place:
+def _place(stream: "Stream", layer: int, first: str | None, last: str | None) -> SiteGroup:
     name = f"{stream.name}.{layer:02d}"
     if first is not None:
         name += f"@{first}" if last is None else f"@{first}-{last}"
-    quantities = MEMORY if stream.name == MEMORY_STREAM else ("residual",)
+    quantities = KV if stream.name == KV_STREAM else ("residual",)
     low, high = int(first or 0), int(last or first or 0)
     sites = tuple(
         site
@@ -90,7 +90,7 @@ def _place(stream: "Stream", layer: int, first: str | None, last: str | None) ->
     if len(sites) != expected or (stream.iterations is None and first is not None):
         there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
         raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
-    return Place(name, sites)
+    return SiteGroup(name, sites)
 
 
 def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> NDArray[np.bool_]:

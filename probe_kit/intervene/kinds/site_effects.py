@@ -13,29 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.edits.patching import LEDGER
-from probe_kit.intervene.kinds.image_swap.effects import following, net_interval
-from probe_kit.intervene.store.answers import EXCHANGED, PLAIN, UNCHANGED, Answers
+from probe_kit.intervene.edits.patching import LOG_FIELDS
+from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects, net_interval
+from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
-HALF = 0.5
+LOCALISATION_SHARE = 0.5
 """Share of the whole effect that a place must carry to be called one where it passes."""
 
 
 @dataclass(frozen=True)
-class Named:
+class ConditionName:
     """The parts of a condition's name: `place|role|direction|dose`, the last two where there are any."""
 
     place: str
     role: str = ""
     direction: str = ""
-    dose: str = ""
+    coefficient: str = ""
 
     @classmethod
-    def of(cls, condition: str) -> "Named":
+    def of(cls, condition: str) -> "ConditionName":
         """Take a name apart."""
         return cls(*condition.split("|"))
 
@@ -44,14 +44,14 @@ class Named:
         """Whether its direction is a random one that another is held against."""
         return self.direction.startswith(CONTROL)
 
-    def is_control_of(self, other: "Named") -> bool:
+    def is_control_of(self, other: "ConditionName") -> bool:
         """Whether `other`, no control itself, is held against this one."""
-        same = (self.place, self.role, self.dose) == (other.place, other.role, other.dose)
+        same = (self.place, self.role, self.coefficient) == (other.place, other.role, other.coefficient)
         return self.is_control and bool(other.direction) and not other.is_control and same
 
 
 @dataclass(frozen=True)
-class Passing:
+class PatchEffect:
     """What a change at one place did, in one category.
 
     effect: share of what the whole exchange does to where the action goes; None if that does nothing, so that a
@@ -68,7 +68,7 @@ class Passing:
     place: str
     role: str
     direction: str
-    dose: str
+    coefficient: str
     is_control: bool
     n_episodes: int
     n_items: int
@@ -77,94 +77,102 @@ class Passing:
     net_ci: tuple[float, float]
     net_left: float
     net_right: float
-    shift: float
-    control_shift: float | None
+    mean_displacement: float
+    control_displacement: float | None
     t: float
     p: float | None
     p_fwe: float | None
-    changed: float
+    max_action_change: float
     fires: int
-    still: int
-    norm_ratio: float
+    no_op_fires: int
+    relative_change: float
     key: str = ""
 
     @property
-    def is_located(self) -> bool:
+    def is_localised(self) -> bool:
         """Whether it carries half of the effect, beyond chance among all that was tried."""
-        enough = self.effect is not None and self.effect >= HALF
+        enough = self.effect is not None and self.effect >= LOCALISATION_SHARE
         return enough and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
 
     @property
     def name(self) -> str:
         """What was changed, in a few words."""
-        return " ".join(filter(None, (self.place, self.role, self.direction, self.dose and f"dose {self.dose}")))
+        return " ".join(
+            filter(None, (self.place, self.role, self.direction, self.coefficient and f"dose {self.coefficient}"))
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
         return asdict(self)
 
 
-def passing(answers: Answers, suite: str, toward: str = "exchanged", key: str = "") -> list[Passing]:
+def patch_effects(
+    outcomes: ConditionOutcomes, suite: str, target_side: str = "exchanged", key: str = ""
+) -> list[PatchEffect]:
     """One per category and change. toward: `exchanged`, or the side that was steered to, see `Steer`."""
     return [
-        row for category, own in answers.by_category() for row in _of_category(own, category, suite, toward, key)
+        row
+        for category, own in outcomes.by_category()
+        for row in _of_category(own, category, suite, target_side, key)
     ]
 
 
-def pushed_to(answers: Answers, toward: str) -> NDArray[np.float64]:
+def pushed_to(outcomes: ConditionOutcomes, target_side: str) -> NDArray[np.float64]:
     """(E,) the side that is pushed to, +1 for left."""
     fixed = {"left": 1.0, "right": -1.0}
-    if toward in fixed:
-        return np.full(answers.toward.size, fixed[toward])
-    return answers.toward if toward == "correct" else -answers.toward
+    if target_side in fixed:
+        return np.full(outcomes.correct_sign.size, fixed[target_side])
+    return outcomes.correct_sign if target_side == "correct" else -outcomes.correct_sign
 
 
-def _of_category(answers: Answers, category: str, suite: str, toward: str, key: str) -> list[Passing]:
-    push, plain = pushed_to(answers, toward), answers.of(PLAIN)
-    rows = [row for row, name in enumerate(answers.conditions) if name not in UNCHANGED]
+def _of_category(
+    outcomes: ConditionOutcomes, category: str, suite: str, target_side: str, key: str
+) -> list[PatchEffect]:
+    push, plain = pushed_to(outcomes, target_side), outcomes.of(CLEAN)
+    rows = [row for row, name in enumerate(outcomes.conditions) if name not in UNCHANGED]
     if not rows:
         return []
-    names = [Named.of(answers.conditions[row]) for row in rows]
-    shifts = push * (answers.lateral[rows] - plain)
+    names = [ConditionName.of(outcomes.conditions[row]) for row in rows]
+    displacements = push * (outcomes.displacement[rows] - plain)
     controls = controls_of(names)
     tested = [at for at, name in enumerate(names) if not name.is_control]
     seed = derive_seed("sign flips", suite, category)
-    t, p, p_fwe = max_t(beyond_controls(shifts, controls, tested), answers.items, answers.groups, seed)
+    t, p, p_fwe = max_t(beyond_controls(displacements, controls, tested), outcomes.items, outcomes.groups, seed)
     place_of = {at: place for place, at in enumerate(tested)}
-    share = _shares(answers, rows, suite)
+    share = _shares(outcomes, rows, suite)
     found = []
     for at, name in enumerate(names):
-        turned = _turned(push, plain, answers.lateral[rows[at]])
+        turned = _turned(push, plain, outcomes.displacement[rows[at]])
         tested_at = place_of.get(at)
         found.append(
-            Passing(
+            PatchEffect(
                 category=category,
                 place=name.place,
                 role=name.role,
                 direction=name.direction,
-                dose=name.dose,
+                coefficient=name.coefficient,
                 is_control=name.is_control,
                 n_episodes=plain.size,
-                n_items=np.unique(answers.items).size,
+                n_items=np.unique(outcomes.items).size,
                 effect=None if share is None else float(share[at]),
                 net=float(turned.mean()),
-                net_ci=net_interval(turned, answers, suite),
+                net_ci=net_interval(turned, outcomes, suite),
                 net_left=_mean(turned[push > 0]),
                 net_right=_mean(turned[push < 0]),
-                shift=float(shifts[at].mean()),
-                control_shift=float(shifts[controls[at]].mean()) if controls[at] else None,
+                mean_displacement=float(displacements[at].mean()),
+                control_displacement=float(displacements[controls[at]].mean()) if controls[at] else None,
                 t=0.0 if tested_at is None else float(t[tested_at]),
                 p=None if tested_at is None else float(p[tested_at]),
                 p_fwe=None if tested_at is None else float(p_fwe[tested_at]),
-                changed=float(answers.changed[rows[at]].max()),
+                max_action_change=float(outcomes.max_action_change[rows[at]].max()),
                 key=key,
-                **ledger_sums(answers.ledger[rows[at]]),
+                **ledger_sums(outcomes.edit_log[rows[at]]),
             )
         )
     return found
 
 
-def controls_of(names: Sequence[Named]) -> list[list[int]]:
+def controls_of(names: Sequence[ConditionName]) -> list[list[int]]:
     """For every condition, which others it is held against."""
     return [[at for at, other in enumerate(names) if other.is_control_of(name)] for name in names]
 
@@ -175,9 +183,9 @@ def beyond_controls(values: Values, controls: Sequence[list[int]], tested: Seque
     return np.array(beyond).reshape(len(tested), values.shape[1])
 
 
-def ledger_sums(ledger: Values) -> dict[str, Any]:
-    """`fires`, `still` and `norm_ratio` of one condition. ledger: (E, 5), see `patching.LEDGER`."""
-    of = dict(zip(LEDGER, ledger.T, strict=True))
+def ledger_sums(edit_log: Values) -> dict[str, Any]:
+    """`fires`, `still` and `relative_change` of one condition. ledger: (E, 5), see `patching.LEDGER`."""
+    of = dict(zip(LOG_FIELDS, edit_log.T, strict=True))
     norm = float((of["norm"] * of["fires"]).sum())
     return {
         "fires": int(of["fires"].sum()),
@@ -186,22 +194,22 @@ def ledger_sums(ledger: Values) -> dict[str, Any]:
     }
 
 
-def _turned(push: Values, plain: Values, changed: Values) -> Values:
+def _turned(push: Values, plain: Values, max_action_change: Values) -> Values:
     """(E,) 1 where the action turns to the side it is pushed to, −1 where it turns from it, else 0."""
     turned: NDArray[np.float64] = (push * changed > 0).astype(float) - (push * plain > 0)
     return turned
 
 
-def _shares(answers: Answers, rows: Sequence[int], suite: str) -> NDArray[np.float64] | None:
+def _shares(outcomes: ConditionOutcomes, rows: Sequence[int], suite: str) -> NDArray[np.float64] | None:
     """(S,) of what the exchange does; None if there was no exchange, or it does nothing."""
-    if EXCHANGED not in answers.conditions:
+    if IMAGE_SWAP not in outcomes.conditions:
         return None
-    (whole,) = following(answers, suite)
-    if min(whole.p_follows, whole.p_against) >= SIGNIFICANCE:
+    (whole,) = image_swap_effects(outcomes, suite)
+    if min(whole.follow_p, whole.reversal_p) >= SIGNIFICANCE:
         return None
-    plain = answers.of(PLAIN)
-    total = answers.of(EXCHANGED) - plain
-    found: NDArray[np.float64] = ((answers.lateral[rows] - plain) * total).sum(axis=1) / (total**2).sum()
+    plain = outcomes.of(CLEAN)
+    total = outcomes.of(IMAGE_SWAP) - plain
+    found: NDArray[np.float64] = ((outcomes.displacement[rows] - plain) * total).sum(axis=1) / (total**2).sum()
     return found
 
 

@@ -3,23 +3,25 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.image_swap.effects import WORTH, Following
-from probe_kit.intervene.kinds.image_swap.verdict import Judgement
-from probe_kit.intervene.kinds.instruction_swap.effects import Sensitivity
-from probe_kit.intervene.kinds.site_effects import Passing
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
+from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict
+from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity
+from probe_kit.intervene.kinds.site_effects import PatchEffect
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
 _LEGEND = (
     "follows: goes to the correct picture, and to the other side once the two are exchanged; against: the "
-    f"reverse; net: follows − against, {WORTH} of which count; p: exact, by item and by group, the larger one"
+    f"reverse; net: follows − against, {SMALLEST_EFFECT_OF_INTEREST} of which count; p: exact, by item and by group, the larger one"
 )
 
 
-def following_table(rows: Sequence[Following], verdicts: Mapping[str, Judgement], of: str) -> "ResponsiveTable":
+def following_table(
+    rows: Sequence[ImageSwapEffect], verdicts: Mapping[str, UseVerdict], of: str
+) -> "ResponsiveTable":
     """One line per category. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
     reasons = dict.fromkeys(f"{name}: {one.reason}" for name, one in verdicts.items() if one.reason)
     return ResponsiveTable(
@@ -48,9 +50,9 @@ _WORDS_LEGEND = (
 )
 
 
-def words_table(rows: Sequence[Following], steps: Sequence[Sensitivity], of: str) -> "ResponsiveTable":
+def words_table(rows: Sequence[ImageSwapEffect], steps: Sequence[InputSensitivity], of: str) -> "ResponsiveTable":
     """One line per category. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
     return ResponsiveTable(
         title=f"Is the question read? {of}",
@@ -78,20 +80,20 @@ def words_table(rows: Sequence[Following], steps: Sequence[Sensitivity], of: str
     )  # fmt: skip
 
 
-def _following_part(title: str, rows: Sequence[Following]) -> "Part":
+def _following_part(title: str, rows: Sequence[ImageSwapEffect]) -> "Part":
     from probe_kit._terminal.responsive_table import Part
 
     columns = ("follows %", "against %", "net [95 %]", "p", "median shift cm", "n (items)")
     return Part(title, columns, tuple(_cells(row) for row in rows))
 
 
-def _cells(row: Following) -> "tuple[Cell, ...]":
+def _cells(row: ImageSwapEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
     low, high = row.net_ci
     texts = (
-        f"{100 * row.follows:.1f}", f"{100 * row.against:.1f}", f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
-        f"{row.p_follows:.2g}", f"{100 * row.shift:.2f}", f"{row.n_episodes} ({row.n_items})",
+        f"{100 * row.follow_rate:.1f}", f"{100 * row.reversal_rate:.1f}", f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
+        f"{row.follow_p:.2g}", f"{100 * row.median_displacement:.2f}", f"{row.n_episodes} ({row.n_items})",
     )  # fmt: skip
     return tuple(map(Cell, texts))
 
@@ -103,9 +105,9 @@ _CHANGE_LEGEND = (
 )
 
 
-def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "ResponsiveTable":
+def passing_table(rows: Sequence[PatchEffect], kind: str, of: str) -> "ResponsiveTable":
     """One line per category and change; controls stand beside what they are held against. of: model, suite."""
-    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     shown = [row for row in rows if not row.is_control]
     return ResponsiveTable(
@@ -113,7 +115,7 @@ def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "ResponsiveTab
         caption=_CHANGE_LEGEND,
         name="category · change",
         names=tuple(f"{row.category} · {row.name}" for row in shown),
-        styles=tuple("bold" if row.is_located else "" for row in shown),
+        styles=tuple("bold" if row.is_localised else "" for row in shown),
         parts=(
             Part(
                 "What the action does",
@@ -124,14 +126,14 @@ def passing_table(rows: Sequence[Passing], kind: str, of: str) -> "ResponsiveTab
     )
 
 
-def _change_cells(row: Passing) -> "tuple[Cell, ...]":
+def _change_cells(row: PatchEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
     low, high = row.net_ci
     texts = (
         "n/a" if row.effect is None else f"{row.effect:.2f}", f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
-        f"{row.net_left:+.2f} / {row.net_right:+.2f}", f"{100 * row.shift:+.2f}",
-        "–" if row.control_shift is None else f"{100 * row.control_shift:+.2f}",
-        "–" if row.p_fwe is None else f"{row.p_fwe:.2g}", f"{row.norm_ratio:.2f}",
+        f"{row.net_left:+.2f} / {row.net_right:+.2f}", f"{100 * row.mean_displacement:+.2f}",
+        "–" if row.control_displacement is None else f"{100 * row.control_displacement:+.2f}",
+        "–" if row.p_fwe is None else f"{row.p_fwe:.2g}", f"{row.relative_change:.2f}",
     )  # fmt: skip
     return tuple(map(Cell, texts))

@@ -10,33 +10,33 @@ from numpy.typing import NDArray
 
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.contract.interventions import InterventionKind
-from probe_kit.intervene.edits.patching import LEDGER, Ledger
-from probe_kit.intervene.replay.session import Bench, Chunk, Question
-from probe_kit.intervene.store.answers import EXCHANGED, PLAIN
-from probe_kit.intervene.store.settings import Asked
+from probe_kit.intervene.edits.patching import LOG_FIELDS, EditLog
+from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
+from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP
+from probe_kit.intervene.store.settings import InterventionSettings
 
 
 @dataclass
-class Turn:
+class ConditionContext:
     """One question on the bench, with what its conditions share.
 
     memo: what one condition computed and another needs as well, by its name.
     """
 
-    bench: Bench
-    question: Question
+    session: ReplaySession
+    replay_input: ReplayInput
     memo: dict[Any, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Played:
+class ConditionResult:
     """The actions (chunk, 7) of one inference, and what was changed in it, if anything.
 
     mass: (B, I, H, R) what attention was paid in it, if it was asked for; see `weighed.Weighed`.
     """
 
     chunk: Chunk
-    ledger: Ledger | None = None
+    edit_log: EditLog | None = None
     mass: NDArray[np.float32] | None = None
 
 
@@ -47,111 +47,111 @@ class Condition(Protocol):
     def name(self) -> str:
         """What tells it from the others of its intervention."""
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Make the inference."""
 
 
-class Intervention(Asked, ABC):
+class Intervention(InterventionSettings, ABC):
     """What is asked, and the conditions that answer it."""
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """What of the interventions a family must support for it."""
         return ("edit",)
 
     @property
-    def learns(self) -> bool:
+    def fits_first(self) -> bool:
         """Whether items are inferred beforehand, for directions or erasers of their tokens."""
         return False
 
-    def playable(self, bench: Bench, items: Sequence[str]) -> list[str]:
+    def eligible_items(self, session: ReplaySession, items: Sequence[str]) -> list[str]:
         """Those of the items' ids that it can be asked of; the others are passed over, and counted."""
-        del bench
+        del session
         return list(items)
 
-    def play(self, bench: Bench, item: str, conditions: "Sequence[Condition]") -> "Replayed":
+    def play(self, session: ReplaySession, item: str, conditions: "Sequence[Condition]") -> "ReplayBatch":
         """What the conditions give for the episodes of one item."""
-        return replay(bench, bench.questions(item), conditions)
+        return replay(session, session.replay_inputs(item), conditions)
 
-    def told(self, conditions: "Sequence[Condition]", found: "Replayed") -> dict[str, Any]:
+    def certificate_entries(self, conditions: "Sequence[Condition]", found: "ReplayBatch") -> dict[str, Any]:
         """What else its certificate says of its conditions and what they gave, as plain JSON."""
         del conditions, found
         return {}
 
-    def files(self, run: Run, conditions: "Sequence[Condition]", found: "Replayed") -> dict[str, bytes]:
+    def extra_files(self, run: Run, conditions: "Sequence[Condition]", found: "ReplayBatch") -> dict[str, bytes]:
         """What else is stored, by the file's name."""
         del run, conditions, found
         return {}
 
     @abstractmethod
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
-        """All of them, in the order in which they are stored; the first is `Plain`."""
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
+        """All of them, in the order in which they are stored; the first is `CleanRun`."""
 
 
 @dataclass(frozen=True)
-class Plain:
+class CleanRun:
     """As the run made it."""
 
-    name: str = PLAIN
+    name: str = CLEAN
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Nothing is changed."""
-        return Played(turn.bench.act(turn.question.seen, turn.question.seed))
+        return ConditionResult(context.session.act(context.replay_input.seen, context.replay_input.seed))
 
 
 @dataclass(frozen=True)
-class Exchanged:
+class ImagesSwapped:
     """The same state and noise before the same two pictures in each other's place."""
 
-    name: str = EXCHANGED
+    name: str = IMAGE_SWAP
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Only what is seen is another."""
-        return Played(turn.bench.act(turn.question.exchanged, turn.question.seed))
+        return ConditionResult(context.session.act(context.replay_input.exchanged, context.replay_input.seed))
 
 
-Noted = tuple[int, int, NDArray[np.float32]]
+AttentionRecord = tuple[int, int, NDArray[np.float32]]
 """The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
 
 
 @dataclass(frozen=True)
-class Replayed:
+class ReplayBatch:
     """What K conditions gave for E episodes.
 
-    rows: (E,) in the run's episodes. lateral: (K, E) metres, see `Bench.lateral`. changed: (K, E) the largest
+    rows: (E,) in the run's episodes. lateral: (K, E) metres, see `ReplaySession.lateral`. changed: (K, E) the largest
     difference of any action from the plain one's. ledger: (K, E, 5) what was changed, see `patching.LEDGER`.
-    apart: (E,) of the plain one from the stored one; NaN where the run does not say. outcomes: (K, E) where the
-    cube ended, correct, wrong or oob, for episodes that were played to their end; then `lateral` is the cube's,
+    replay_error: (E,) of the plain one from the stored one; NaN where the run does not say. outcomes: (K, E) where the
+    cube ended, correct, wrong or oob, for episodes that were played to their end; then `displacement` is the cube's,
     and `changed` and `apart` are of the trajectory. None where nothing was carried out. mass: (N, B, I, H, R) the
     attention of N inferences, inferences: (N, 2) of which row and call they are; None where nobody asked for it.
     """
 
     rows: NDArray[np.int64]
-    lateral: NDArray[np.float64]
-    changed: NDArray[np.float64]
-    ledger: NDArray[np.float64]
-    apart: NDArray[np.float64]
-    outcomes: NDArray[np.str_] | None = None
+    displacement: NDArray[np.float64]
+    max_action_change: NDArray[np.float64]
+    edit_log: NDArray[np.float64]
+    replay_error: NDArray[np.float64]
+    episode_outcomes: NDArray[np.str_] | None = None
     mass: NDArray[np.float32] | None = None
     inferences: NDArray[np.int64] | None = None
 
-    def with_mass(self, noted: "Sequence[Noted]") -> "Replayed":
+    def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
         """With the attention of its inferences, if any was noted."""
-        if not noted:
+        if not attention_records:
             return self
-        rows, calls, masses = zip(*noted, strict=True)
+        rows, calls, masses = zip(*attention_records, strict=True)
         return replace(self, mass=np.stack(masses), inferences=np.stack([rows, calls], axis=1).astype(np.int64))
 
     @classmethod
-    def none_yet(cls, questions: Sequence["Question"], conditions: Sequence["Condition"]) -> "Replayed":
+    def none_yet(cls, replay_inputs: Sequence["ReplayInput"], conditions: Sequence["Condition"]) -> "ReplayBatch":
         """Room for what is going to be played."""
-        shape = len(conditions), len(questions)
+        shape = len(conditions), len(replay_inputs)
         return cls(
-            np.array([question.row for question in questions], np.int64),
+            np.array([replay_input.row for replay_input in replay_inputs], np.int64),
             np.empty(shape),
             np.zeros(shape),
-            np.zeros((*shape, len(LEDGER))),
-            np.empty(len(questions)),
+            np.zeros((*shape, len(LOG_FIELDS))),
+            np.empty(len(replay_inputs)),
         )
 
     @property
@@ -160,9 +160,9 @@ class Replayed:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
-    def joined(cls, parts: Sequence["Replayed"]) -> "Replayed":
+    def joined(cls, parts: Sequence["ReplayBatch"]) -> "ReplayBatch":
         """One after the other."""
-        axes = {"lateral": 1, "changed": 1, "ledger": 1, "outcomes": 1}
+        axes = {"displacement": 1, "max_action_change": 1, "edit_log": 1, "episode_outcomes": 1}
         return cls(
             **{
                 name: np.concatenate([getattr(part, name) for part in parts], axis=axes.get(name, 0))
@@ -171,19 +171,21 @@ class Replayed:
         )
 
 
-def replay(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
+def replay(
+    session: ReplaySession, replay_inputs: Sequence[ReplayInput], conditions: Sequence[Condition]
+) -> ReplayBatch:
     """Play every condition on every question; the first one is the plain one."""
-    found = Replayed.none_yet(questions, conditions)
-    noted: list[Noted] = []
-    for column, question in enumerate(questions):
-        turn = Turn(bench, question)
-        plain = conditions[0].play(turn).chunk
-        found.apart[column] = bench.apart(question, plain)
+    found = ReplayBatch.none_yet(replay_inputs, conditions)
+    attention_records: list[AttentionRecord] = []
+    for column, replay_input in enumerate(replay_inputs):
+        context = ConditionContext(session, replay_input)
+        plain = conditions[0].play(context).chunk
+        found.replay_error[column] = session.replay_error(replay_input, plain)
         for number, condition in enumerate(conditions):
-            played = condition.play(turn) if number else Played(plain)
-            found.lateral[number, column] = bench.lateral(played.chunk, question.seen)
-            found.changed[number, column] = float(np.abs(played.chunk - plain).max())
-            if played.ledger is not None:
-                found.ledger[number, column] = played.ledger.row()
-            noted += [] if played.mass is None else [(question.row, 0, played.mass)]
-    return found.with_mass(noted)
+            played = condition.play(context) if number else ConditionResult(plain)
+            found.displacement[number, column] = session.lateral_displacement(played.chunk, replay_input.seen)
+            found.max_action_change[number, column] = float(np.abs(played.chunk - plain).max())
+            if played.edit_log is not None:
+                found.edit_log[number, column] = played.edit_log.row()
+            attention_records += [] if played.mass is None else [(replay_input.row, 0, played.mass)]
+    return found.with_mass(attention_records)

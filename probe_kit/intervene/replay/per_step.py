@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from probe_kit.extract.rollout.stage import Answer, Ending
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.edits.patching import Ledger
-from probe_kit.intervene.replay.conditions import Condition, Noted, Replayed, Turn
-from probe_kit.intervene.replay.rollout import Carried, apart_from_stored, executed, planned_of
-from probe_kit.intervene.replay.session import Bench, Chunk, Question
+from probe_kit.intervene.edits.patching import EditLog
+from probe_kit.intervene.replay.conditions import AttentionRecord, Condition, ConditionContext, ReplayBatch
+from probe_kit.intervene.replay.rollout import RolloutResult, apart_from_stored, executed, planned_of
+from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 
 
 @dataclass(frozen=True)
@@ -27,62 +27,66 @@ class _Evaluated:
     noted: what attention was asked for, a call each.
     """
 
-    lateral: NDArray[np.float64]
-    changed: NDArray[np.float64]
-    ledger: NDArray[np.float64]
-    plain: Carried
-    noted: list[Noted]
+    displacement: NDArray[np.float64]
+    max_action_change: NDArray[np.float64]
+    edit_log: NDArray[np.float64]
+    plain: RolloutResult
+    attention_records: list[AttentionRecord]
 
 
-def shadowed(bench: Bench, questions: Sequence[Question], conditions: Sequence[Condition]) -> Replayed:
+def evaluate_per_step(
+    session: ReplaySession, replay_inputs: Sequence[ReplayInput], conditions: Sequence[Condition]
+) -> ReplayBatch:
     """Every condition along every episode; the first one, which changes nothing, is carried out.
 
-    `lateral` is where the hand began plus what all calls' actions would add across, in metres from the middle,
+    `displacement` is where the hand began plus what all calls' actions would add across, in metres from the middle,
     left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
     """
-    found = Replayed.none_yet(questions, conditions)
-    noted: list[Noted] = []
-    for column, question in enumerate(questions):
-        own = _evaluated(bench, question, conditions)
-        found.apart[column] = apart_from_stored(bench, question, own.plain)
-        found.lateral[:, column], found.changed[:, column] = own.lateral, own.changed
-        found.ledger[:, column] = own.ledger
-        noted += own.noted
-    return found.with_mass(noted)
+    found = ReplayBatch.none_yet(replay_inputs, conditions)
+    attention_records: list[AttentionRecord] = []
+    for column, replay_input in enumerate(replay_inputs):
+        own = _evaluated(session, replay_input, conditions)
+        found.replay_error[column] = apart_from_stored(session, replay_input, own.plain)
+        found.displacement[:, column], found.max_action_change[:, column] = own.displacement, own.max_action_change
+        found.edit_log[:, column] = own.edit_log
+        attention_records += own.attention_records
+    return found.with_mass(attention_records)
 
 
-def _evaluated(bench: Bench, question: Question, conditions: Sequence[Condition]) -> _Evaluated:
-    stage, planned = bench.stage, planned_of(bench, question)
+def _evaluated(session: ReplaySession, replay_input: ReplayInput, conditions: Sequence[Condition]) -> _Evaluated:
+    stage, planned = session.stage, planned_of(session, replay_input)
     seen: Answer = stage.begin(planned, False)
     assert isinstance(seen, Observation)
-    lateral = np.full(len(conditions), bench.across(seen.state[:2].astype(np.float64)))
+    displacement = np.full(len(conditions), session.lateral_offset(seen.state[:2].astype(np.float64)))
     changed, past = np.zeros(len(conditions)), list[Chunk]()
-    ledgers: list[list[Ledger]] = [[] for _ in conditions]
-    noted: list[Noted] = []
+    edit_logs: list[list[EditLog]] = [[] for _ in conditions]
+    attention_records: list[AttentionRecord] = []
     for call in count():
         assert isinstance(seen, Observation)
         other = stage.look_exchanged().observation
         seed = derive_seed(planned.policy_seed, "inference", call)
-        turn = Turn(bench, replace(question, seen=seen, exchanged=other, seed=seed, tiles=stage.tile_masks()))
-        plain = conditions[0].play(turn)
+        context = ConditionContext(
+            session, replace(replay_input, seen=seen, exchanged=other, seed=seed, tiles=stage.tile_masks())
+        )
+        plain = conditions[0].play(context)
         for number, condition in enumerate(conditions):
-            played = condition.play(turn) if number else plain
-            lateral[number] += _added(bench, executed(bench, [*past, played.chunk]), seen)
+            played = condition.play(context) if number else plain
+            displacement[number] += _lateral_change(session, executed(session, [*past, played.chunk]), seen)
             changed[number] = max(changed[number], float(np.abs(played.chunk - plain.chunk).max()))
-            ledgers[number] += [] if played.ledger is None else [played.ledger]
-            noted += [] if played.mass is None else [(question.row, call, played.mass)]
+            edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
+            attention_records += [] if played.mass is None else [(replay_input.row, call, played.mass)]
         past.append(plain.chunk)
-        seen = stage.advance(executed(bench, past))
+        seen = stage.advance(executed(session, past))
         if isinstance(seen, Ending):
             break
     assert isinstance(seen, Ending)
     assert seen.trajectory is not None
     where = float(seen.outcome["cube_x"]), float(seen.outcome["cube_y"])
-    carried = Carried(str(seen.outcome["outcome"]), where, seen.trajectory, Ledger.sum(ledgers[0]))
-    rows = np.array([Ledger.sum(one).row() for one in ledgers])
-    return _Evaluated(lateral, changed, rows, carried, noted)
+    carried = RolloutResult(str(seen.outcome["outcome"]), where, seen.trajectory, EditLog.sum(edit_logs[0]))
+    rows = np.array([EditLog.sum(one).row() for one in edit_logs])
+    return _Evaluated(displacement, changed, rows, carried, attention_records)
 
 
-def _added(bench: Bench, actions: Chunk, seen: Observation) -> float:
+def _lateral_change(session: ReplaySession, actions: Chunk, seen: Observation) -> float:
     """How far the actions would move the hand across, in metres; left is positive."""
-    return bench.lateral(actions, seen) - bench.across(seen.state[:2].astype(np.float64))
+    return session.lateral_displacement(actions, seen) - session.lateral_offset(seen.state[:2].astype(np.float64))

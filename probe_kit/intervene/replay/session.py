@@ -26,7 +26,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.suite.counterparts import twins_of
+from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
 from probe_kit.train.controls.baselines import embedded_suite_of, suite_of
 
@@ -46,7 +46,7 @@ class Progress(Protocol):
 
 
 @dataclass(frozen=True)
-class Source:
+class ReplaySource:
     """Where a run's policy, pictures and files are found again; what is found must have the run's hashes.
 
     suite: folder; None for the embedded suite. checkpoint, options, weights_seed, device: as for `probe-kit
@@ -62,7 +62,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Question:
+class ReplayInput:
     """The first inference of one episode, and what is seen when the two pictures are exchanged.
 
     row: in the run's episodes. seed: of the inference. tiles: (H, W) where in its picture each tile's own is seen.
@@ -83,17 +83,17 @@ class Question:
     stored: Chunk | None = None
 
 
-class Bench:
+class ReplaySession:
     """A policy and a scene; a context manager, because it holds a simulator.
 
-    items: of the run's suite, by id. twins: of those that have one, see `twins_of`. learning: is told of items
+    items: of the run's suite, by id. twins: of those that have one, see `counterparts_of`. learning: is told of items
     that are inferred beforehand, for directions and erasers.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
-        self.items, self.twins = items, twins_of(items.values())
-        self.learning: Progress | None = None
+        self.items, self.counterparts = items, counterparts_of(items.values())
+        self.on_fit_progress: Progress | None = None
         self.stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
@@ -104,7 +104,7 @@ class Bench:
     def __exit__(self, *_: object) -> None:
         self.stage.close()
 
-    def questions(self, item_id: str) -> list[Question]:
+    def replay_inputs(self, item_id: str) -> list[ReplayInput]:
         """The committed episodes of one item, their first frames drawn again, both layouts of one state.
 
         Raises OtherFramesError if a frame is not the one that the run began with.
@@ -123,7 +123,7 @@ class Bench:
                 frames[other], tiles = self.stage.look_exchanged(), self.stage.tile_masks()
             self._check_frame(record, frames[own])
             found.append(
-                Question(
+                ReplayInput(
                     row=int(row),
                     episode_id=str(record["episode_id"]),
                     item_id=item_id,
@@ -174,34 +174,36 @@ class Bench:
         with while_acting(self.run.model, self.policy.card.checkpoint):
             return np.asarray(self.policy.act([seen], [seed])[0], np.float32)
 
-    def apart(self, question: Question, chunk: Chunk) -> float:
+    def replay_error(self, replay_input: ReplayInput, chunk: Chunk) -> float:
         """By how much a plain inference differs from what the run carried out; NaN where it does not say.
 
         Raises CaptureChangedActionError if it is another action altogether.
         """
-        if question.stored is None:
+        if replay_input.stored is None:
             return nan
-        known = min(len(question.stored), len(chunk))
-        largest = float(np.abs(chunk[:known] - question.stored[:known]).max())
+        known = min(len(replay_input.stored), len(chunk))
+        largest = float(np.abs(chunk[:known] - replay_input.stored[:known]).max())
         if not largest <= FAR:
             raise CaptureChangedActionError(
-                f"the first action of {question.episode_id}, inferred again, differs from the stored one by "
+                f"the first action of {replay_input.episode_id}, inferred again, differs from the stored one by "
                 f"{largest:.3g}; expected the same. The policy has other options than the run's, or is not "
                 "deterministic"
             )
         return largest
 
-    def lateral(self, chunk: Chunk, seen: Observation) -> float:
+    def lateral_displacement(self, chunk: Chunk, seen: Observation) -> float:
         """Where the chunk would bring the hand, in metres from the middle between the tiles; left is positive."""
         end = np.asarray(seen.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
-        return self.across(end)
+        return self.lateral_offset(end)
 
-    def across(self, point: NDArray[np.float64]) -> float:
+    def lateral_offset(self, point: NDArray[np.float64]) -> float:
         """How far a point (2,) is from the middle between the tiles, in metres; left is positive."""
         return float((point - self._middle) @ self._across)
 
 
-def open_bench(run: Run, source: Source, load: "Callable[[Run, Source], Policy] | None" = None) -> Bench:
+def open_session(
+    run: Run, source: ReplaySource, load: "Callable[[Run, ReplaySource], Policy] | None" = None
+) -> ReplaySession:
     """Load the run's policy and set up its scene.
 
     load: how the policy is found, if not by its name. Raises SettingsMismatchError if it is another one,
@@ -211,7 +213,7 @@ def open_bench(run: Run, source: Source, load: "Callable[[Run, Source], Policy] 
     suite = suite_of(run.whole, source.suite or _embedded(run))
     policy = (load or load_policy_of)(run, source)
     _check_policy(run, policy)
-    return Bench(run, policy, scene, {item.item_id: item for item in suite.items})
+    return ReplaySession(run, policy, scene, {item.item_id: item for item in suite.items})
 
 
 def _embedded(run: Run) -> Path:
@@ -224,7 +226,7 @@ def _embedded(run: Run) -> Path:
     return folder
 
 
-def load_policy_of(run: Run, source: Source) -> "Policy":
+def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     """The policy that a run names."""
     from probe_kit.hooks import load_policy
 

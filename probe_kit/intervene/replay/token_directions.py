@@ -13,13 +13,19 @@ import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.intervene.edits.linear_erasure import Method
-from probe_kit.intervene.edits.pooled_directions import DIRECTIONS, MEAN_DIFFERENCE, Vector, axes_of, control_names
-from probe_kit.intervene.edits.sites import Place
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.replay.token_features import by_episode, fit_by_fold, gather
+from probe_kit.intervene.edits.pooled_directions import (
+    DIRECTIONS,
+    MEAN_DIFFERENCE,
+    Vector,
+    control_names,
+    fit_directions,
+)
+from probe_kit.intervene.edits.sites import SiteGroup
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_features import by_episode, collect_token_features, fit_by_fold
 
 
-class Bases(Protocol):
+class DirectionBasis(Protocol):
     """Directions by name, each found without the episode that it is used on."""
 
     @property
@@ -31,7 +37,7 @@ class Bases(Protocol):
 
 
 @dataclass(frozen=True)
-class TokenAxes:
+class TokenDirections:
     """Of one site and role. bases: by name and episode, (K, D) float32."""
 
     bases: Mapping[tuple[str, str], Vector]
@@ -54,14 +60,14 @@ def check_direction(direction: str) -> None:
         )
 
 
-def bases_of(
-    bench: Bench,
+def fit_token_directions(
+    session: ReplaySession,
     items: Sequence[str],
-    wanted: Mapping[Place, Sequence[str]],
+    wanted: Mapping[SiteGroup, Sequence[str]],
     direction: str,
     controls: int,
     seed: int,
-) -> dict[tuple[Place, str], Bases]:
+) -> dict[tuple[SiteGroup, str], DirectionBasis]:
     """By place and role what `direction` means there: of the run's columns, or of the tokens of these items (ids).
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
@@ -71,16 +77,16 @@ def bases_of(
     """
     if ":" not in direction:
         return {
-            (place, role): axes_of(bench.run, place.only_site, role, direction, controls, seed)
+            (place, role): fit_directions(session.run, place.only_site, role, direction, controls, seed)
             for place, roles in wanted.items()
             for role in roles
         }
-    bases: dict[tuple[Place, str], dict[tuple[str, str], Vector]] = {}
-    for place, role, category, own in gather(bench, items, wanted):
+    bases: dict[tuple[SiteGroup, str], dict[tuple[str, str], Vector]] = {}
+    for place, role, category, own in collect_token_features(session, items, wanted):
         fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
         found = bases.setdefault((place, role), {})
         for name, of_episode in by_episode(own, fits).items():
             found |= {
                 (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
             }
-    return {cell: TokenAxes(found, control_names(controls)) for cell, found in bases.items()}
+    return {cell: TokenDirections(found, control_names(controls)) for cell, found in bases.items()}

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.linear_erasure import Eraser, Method, Tokens, fit_control, fit_eraser
+from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens, fit_control, fit_eraser
 from probe_kit.intervene.edits.pooled_directions import FOLDS, control_names
-from probe_kit.intervene.edits.sites import Place, token_mask
-from probe_kit.intervene.replay.session import Bench, Question
+from probe_kit.intervene.edits.sites import SiteGroup, token_mask
+from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
 from probe_kit.statistics.folds import Fold, grouped_folds
 
 Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
@@ -21,7 +21,7 @@ _Row = tuple[str, str, bool, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class Gathered:
+class TokenFeatures:
     """The tokens of one category at one site and role, of N episodes.
 
     episodes, groups: (N,). left: (N,) whether the correct picture lies left. tokens: at position t the role's
@@ -31,12 +31,12 @@ class Gathered:
     episodes: tuple[str, ...]
     groups: NDArray[np.str_]
     left: NDArray[np.bool_]
-    tokens: Tokens
+    tokens: PaddedTokens
 
 
-def gather(
-    bench: Bench, items: Sequence[str], wanted: Mapping[Place, Sequence[str]]
-) -> Iterator[tuple[Place, str, str, Gathered]]:
+def collect_token_features(
+    session: ReplaySession, items: Sequence[str], wanted: Mapping[SiteGroup, Sequence[str]]
+) -> Iterator[tuple[SiteGroup, str, str, TokenFeatures]]:
     """Place, role, category and what was gathered there, from one plain inference per episode and place.
 
     items: by id, all of their episodes. wanted: roles by place. What is held at a time is of one place and
@@ -45,34 +45,36 @@ def gather(
     sites = {place: place.only_site for place, roles in wanted.items() if roles}
     of_category: dict[str, list[str]] = {}
     for item in items:
-        of_category.setdefault(bench.items[item].category, []).append(item)
+        of_category.setdefault(session.items[item].category, []).append(item)
     done = 0
     for place, site in sites.items():
         for category, own in of_category.items():
             rows: dict[str, list[_Row]] = {role: [] for role in wanted[place]}
             for item in own:
-                for question in bench.questions(item):
-                    _infer(bench, question, site, rows)
+                for replay_input in session.replay_inputs(item):
+                    _infer(session, replay_input, site, rows)
                 done += 1
-                if bench.learning is not None:
-                    bench.learning(done, len(sites) * len(items), item)
+                if session.on_fit_progress is not None:
+                    session.on_fit_progress(done, len(sites) * len(items), item)
             for role in list(rows):
-                yield place, role, category, _together(rows.pop(role))
+                yield place, role, category, _pad(rows.pop(role))
 
 
-def _infer(bench: Bench, question: Question, site: Site, rows: Mapping[str, list[_Row]]) -> None:
+def _infer(session: ReplaySession, replay_input: ReplayInput, site: Site, rows: Mapping[str, list[_Row]]) -> None:
     """Add the episode's row to those of every role."""
     from probe_kit.hooks import capture
 
-    with capture(bench.policy, [site]) as tape:
-        bench.act(question.seen, question.seed)
+    with capture(session.policy, [site]) as tape:
+        session.act(replay_input.seen, replay_input.seed)
     passing = tape[site][0].double().cpu().numpy()
     for role, found in rows.items():
-        mask = token_mask(bench.policy, question.seen, site.stream, role)
-        found.append((question.episode_id, question.group_id, question.side_correct == "left", passing[mask]))
+        mask = token_mask(session.policy, replay_input.seen, site.stream, role)
+        found.append(
+            (replay_input.episode_id, replay_input.group_id, replay_input.side_correct == "left", passing[mask])
+        )
 
 
-def _together(rows: Sequence[_Row]) -> Gathered:
+def _pad(rows: Sequence[_Row]) -> TokenFeatures:
     """Sequences of different lengths side by side, their first tokens together."""
     episodes, groups, left, values = zip(*rows, strict=True)
     longest = max(len(own) for own in values)
@@ -80,11 +82,11 @@ def _together(rows: Sequence[_Row]) -> Gathered:
     present = np.zeros((len(rows), longest), bool)
     for row, own in enumerate(values):
         tokens[row, : len(own)], present[row, : len(own)] = own, True
-    return Gathered(tuple(episodes), np.array(groups), np.array(left), Tokens(tokens, present))
+    return TokenFeatures(tuple(episodes), np.array(groups), np.array(left), PaddedTokens(tokens, present))
 
 
 def fit_by_fold(
-    own: Gathered, site: Site, role: str, method: Method, controls: int, seed: int, category: str
+    own: TokenFeatures, site: Site, role: str, method: Method, controls: int, seed: int, category: str
 ) -> Fits:
     """An eraser called `method` and its controls, for every fold of the groups of one category.
 
@@ -96,7 +98,7 @@ def fit_by_fold(
     return [(fold, _fitted(own, fold, method, controls, draw)) for fold in folds]
 
 
-def by_episode(own: Gathered, fits: Fits) -> dict[str, dict[str, Eraser]]:
+def by_episode(own: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:
     """By name and episode, what never saw that episode."""
     found: dict[str, dict[str, Eraser]] = {}
     for fold, fitted in fits:
@@ -106,7 +108,7 @@ def by_episode(own: Gathered, fits: Fits) -> dict[str, dict[str, Eraser]]:
 
 
 def _fitted(
-    own: Gathered, fold: Fold, method: Method, controls: int, draw: np.random.Generator
+    own: TokenFeatures, fold: Fold, method: Method, controls: int, draw: np.random.Generator
 ) -> dict[str, Eraser]:
     training, left = own.tokens.only(fold.train), own.left[fold.train]
     eraser = fit_eraser(training, left, method)

@@ -7,17 +7,17 @@ from typing import Any
 from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import PARTIAL, Bundle, read_bundles
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.intervene.kinds.attention.attention_mass import foremost_attention
-from probe_kit.intervene.results.site_maps import keys_inside
+from probe_kit.intervene.kinds.attention.attention_mass import preferred_attention
+from probe_kit.intervene.results.site_maps import keys_in_use
 from probe_kit.intervene.store.answers import ATTENTION, stored_interventions
-from probe_kit.intervene.store.selection import foremost
+from probe_kit.intervene.store.selection import preferred_by_category
 from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
     {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout"}
 )
-"""What every intervention is asked; the rest of its settings is its kind's own."""
+"""What every intervention is parameters; the rest of its settings is its kind's own."""
 
 
 TABLED = frozenset({"follow", "interchange", "steer", ATTENTION})
@@ -30,7 +30,7 @@ class StoredIntervention:
 
     state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
     that it says, of more episodes or newly; `other episodes` if the run has others by now; `other version` if this
-    version cannot read it. asked: what its kind was asked besides, as stored.
+    version cannot read it. parameters: what its kind was parameters besides, as stored.
     """
 
     key: str
@@ -40,14 +40,16 @@ class StoredIntervention:
     categories: tuple[str, ...] = ()
     items: int | None = None
     wording: str = ""
-    asked: Mapping[str, Any] | None = None
+    parameters: Mapping[str, Any] | None = None
 
     @property
     def words(self) -> str:
         """In a line."""
         if not self.kind:
             return f"written by another version of probe_kit, which this one cannot read; {self._when}"
-        own = [f"{name} {_plain(value)}" for name, value in (self.asked or {}).items() if value not in (None, [])]
+        own = [
+            f"{name} {_plain(value)}" for name, value in (self.parameters or {}).items() if value not in (None, [])
+        ]
         parts = [self.kind, f"of {', '.join(self.categories)}"]
         parts += [f"{self.items} items each"] * (self.items is not None)
         parts += [f"wording {self.wording}"] * bool(self.wording)
@@ -81,8 +83,8 @@ def unfinished_interventions(location: Location) -> dict[str, int]:
 
 def _used(run: RunReader) -> set[str]:
     """Keys of what is read, and of the kinds of which nothing takes another's place."""
-    found = {told.stored.key for told in foremost(run, "follow").values()} | keys_inside(run)
-    found |= {told.stored.key for told, _ in foremost_attention(run).values()}
+    found = {result.stored.key for result in preferred_by_category(run, "follow").values()} | keys_in_use(run)
+    found |= {result.stored.key for result, _ in preferred_attention(run).values()}
     return found | {one.key for one in stored_interventions(run) if one.settings["kind"] not in TABLED}
 
 
@@ -99,7 +101,7 @@ def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredInterven
         categories=tuple(map(str, settings["categories"])),
         items=settings.get("items"),
         wording=str(settings.get("wording") or ""),
-        asked={name: value for name, value in settings.items() if name not in COMMON},
+        parameters={name: value for name, value in settings.items() if name not in COMMON},
     )
 
 

@@ -10,27 +10,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.errors import NoProbesError
-from probe_kit.intervene.kinds.attention.attention_mass import Weighed
-from probe_kit.intervene.kinds.closed_loop.effects import CarriedOut, carried_out
-from probe_kit.intervene.kinds.erase.effects import Erasing, erased
+from probe_kit.intervene.kinds.attention.attention_mass import AttentionShares
+from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect, closed_loop_effects
+from probe_kit.intervene.kinds.erase.effects import ErasureEffect, erasure_effects
 from probe_kit.intervene.kinds.frames import frame_of
-from probe_kit.intervene.kinds.image_swap.effects import Following, following, stored_following
-from probe_kit.intervene.kinds.image_swap.verdict import Judgement, encoded_in, judgements
-from probe_kit.intervene.kinds.instruction_swap.effects import sensitivity
-from probe_kit.intervene.kinds.site_effects import Passing, passing
-from probe_kit.intervene.results.site_maps import stored_carriers, stored_places
+from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, image_swap_effects, stored_image_swaps
+from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_all, encoded_in
+from probe_kit.intervene.kinds.instruction_swap.effects import input_sensitivity
+from probe_kit.intervene.kinds.site_effects import PatchEffect, patch_effects
+from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
 from probe_kit.intervene.store.answers import (
+    ATTENTION_FILE,
     ERASE,
-    EXCHANGED,
+    IMAGE_SWAP,
     NOISE,
     PICTURES,
-    READABLE,
-    WEIGHED,
-    Answers,
-    Stored,
+    PROBE_ACCURACY,
+    ConditionOutcomes,
+    StoredIntervention,
     find_stored,
 )
-from probe_kit.intervene.store.settings import SHADOW
+from probe_kit.intervene.store.settings import PER_STEP
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import load_results
@@ -49,7 +49,7 @@ LARGE = 2.0
 
 
 @dataclass(frozen=True)
-class Effects:
+class InterventionResult:
     """One intervention: what was asked, what it gave, and what that means.
 
     key: name of its folder. label: of the run. settings, certificate: as stored. verdicts: by category, from this
@@ -62,9 +62,9 @@ class Effects:
     random_weights: bool
     settings: dict[str, Any]
     certificate: dict[str, Any]
-    answers: Answers = field(repr=False)
-    attention: Weighed | None = field(default=None, repr=False)
-    verdicts: dict[str, Judgement] = field(default_factory=dict)
+    outcomes: ConditionOutcomes = field(repr=False)
+    attention: AttentionShares | None = field(default=None, repr=False)
+    verdicts: dict[str, UseVerdict] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -72,44 +72,48 @@ class Effects:
         return str(self.settings["kind"])
 
     @cached_property
-    def rows(self) -> list[Following]:
+    def rows(self) -> list[ImageSwapEffect]:
         """What the exchange of the pictures did, one per category; empty if no first action was asked for it."""
-        if self.answers.outcomes is not None or EXCHANGED not in self.answers.conditions:
+        if self.outcomes.episode_outcomes is not None or IMAGE_SWAP not in self.outcomes.conditions:
             return []
-        return following(self.answers, self.suite, self.key)
+        return image_swap_effects(self.outcomes, self.suite, self.key)
 
     @cached_property
-    def changes(self) -> list[Passing]:
+    def changes(self) -> list[PatchEffect]:
         """What changes inside the network did to first actions, one per category and change; else empty."""
-        if self.answers.outcomes is not None or self.kind == ERASE:
+        if self.outcomes.episode_outcomes is not None or self.kind == ERASE:
             return []
-        return passing(self.answers, self.suite, str(self.settings.get("toward", EXCHANGED)), self.key)
+        return patch_effects(self.outcomes, self.suite, str(self.settings.get("toward", IMAGE_SWAP)), self.key)
 
     @cached_property
-    def carried_out(self) -> list[CarriedOut]:
+    def closed_loop_effects(self) -> list[ClosedLoopEffect]:
         """What changes did to whole episodes, one per category and condition; empty but for a closed loop."""
-        return [] if self.answers.outcomes is None else carried_out(self.answers, self.suite, self.key)
+        return (
+            []
+            if self.outcomes.episode_outcomes is None
+            else closed_loop_effects(self.outcomes, self.suite, self.key)
+        )
 
     @cached_property
-    def erased(self) -> list[Erasing]:
+    def erasure_effects(self) -> list[ErasureEffect]:
         """What is left of an answer in first actions, one per category and condition; empty but for `erase`."""
         if self.kind != ERASE:
             return []
-        return erased(self.answers, self.suite, self.key, self.certificate.get(READABLE, {}))
+        return erasure_effects(self.outcomes, self.suite, self.key, self.certificate.get(PROBE_ACCURACY, {}))
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One line per category, with the fields of `Following` and the verdict; or per change, of `Passing`, of
-        `Erasing` or, in a closed loop, of `CarriedOut`; or per block, iteration, head and role, of `Attending`.
+        """One line per category, with the fields of `ImageSwapEffect` and the verdict; or per change, of `PatchEffect`, of
+        `ErasureEffect` or, in a closed loop, of `ClosedLoopEffect`; or per block, iteration, head and role, of `Attending`.
         """
-        if self.answers.outcomes is not None:
+        if self.outcomes.episode_outcomes is not None:
             return frame_of(self.carried_out)
         if self.kind == ERASE:
             return frame_of(self.erased)
         if self.attention is not None:
             return self.attention.frame()
         if self.kind == WORDS:
-            return words_frame(self.answers, self.suite, self.key)
+            return words_frame(self.outcomes, self.suite, self.key)
         if self.kind != FOLLOW:
             return frame_of(self.changes)
         frame = frame_of(self.rows)
@@ -122,7 +126,7 @@ class Effects:
     def notes(self) -> tuple[str, ...]:
         """What a reader must know, a sentence each."""
         return (
-            *self._replayed(),
+            *self._replay_items(),
             *self._passed_over(),
             *self._few_groups(),
             *self._one_step(),
@@ -140,7 +144,7 @@ class Effects:
     def _few_groups(self) -> list[str]:
         if self.attention is not None:
             return []
-        counts = {category: np.unique(own.groups).size for category, own in self.answers.by_category()}
+        counts = {category: np.unique(own.groups).size for category, own in self.outcomes.by_category()}
         return [
             f"{category}: with {count} group{'s' * (count != 1)} of items no p can be below {0.5**count:.2g}, so "
             "that nothing is beyond chance. Play more (--items)."
@@ -159,21 +163,25 @@ class Effects:
     def _one_step(self) -> list[str]:
         if self.attention is not None:
             return []
-        is_shadow = self.certificate.get("supported", {}).get("readout") == "shadow"
-        if self.settings.get("readout") == SHADOW:
+        is_shadow = self.certificate.get("supported", {}).get("readout") == "per-step"
+        if self.settings.get("readout") == PER_STEP:
             return [
                 "Shadow: every condition was evaluated at every inference of the unedited episode, and what its "
                 "actions would add across is summed up; nothing of it was carried out."
             ]
-        if not is_shadow or self.answers.outcomes is not None:
+        if not is_shadow or self.outcomes.episode_outcomes is not None:
             return []
         return [
             "This family's inference is one action in greedy bins: what the first one does says little of where "
-            "the hand will go, and small effects stay within a bin. Ask with --readout shadow."
+            "the hand will go, and small effects stay within a bin. Ask with --readout per-step."
         ]
 
     def _large_doses(self) -> list[str]:
-        large = {row.name: row.norm_ratio for row in self.changes if row.dose and row.norm_ratio > LARGE}
+        large = {
+            row.name: row.relative_change
+            for row in self.changes
+            if row.coefficient and row.relative_change > LARGE
+        }
         return [
             f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
             for name, ratio in large.items()
@@ -184,7 +192,7 @@ class Effects:
             f"{row.category}, {row.name}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
             "hand is broken, and this enters no verdict."
             for row in self.carried_out
-            if row.hand_broken
+            if row.disrupted
         ]
 
     def _less_than_exchanging(self) -> list[str]:
@@ -202,7 +210,7 @@ class Effects:
             ),
         ]
 
-    def _replayed(self) -> tuple[str, ...]:
+    def _replay_items(self) -> tuple[str, ...]:
         check = self.certificate["replay"]
         if check["compared"] == 0:
             return (
@@ -217,7 +225,7 @@ class Effects:
 
     @property
     def _plain(self) -> str:
-        return "plain inferences" if self.answers.outcomes is None else "trajectories at dose 0"
+        return "plain inferences" if self.outcomes.episode_outcomes is None else "trajectories at dose 0"
 
     def to_json(self) -> str:
         """Key, settings, certificate and the table as JSON."""
@@ -239,7 +247,7 @@ class Effects:
         of = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
         from probe_kit.intervene.kinds.site_table import following_table, passing_table, words_table
 
-        if self.answers.outcomes is not None:
+        if self.outcomes.episode_outcomes is not None:
             from probe_kit.intervene.kinds.closed_loop.table import carried_out_table
 
             return carried_out_table(self.carried_out, of)
@@ -252,13 +260,13 @@ class Effects:
 
             return weighed_table(self.attention, self.suite, of)
         if self.kind == WORDS:
-            return words_table(self.rows, sensitivity(self.answers), of)
+            return words_table(self.rows, input_sensitivity(self.outcomes), of)
         if self.kind != FOLLOW:
             return passing_table(self.changes, self.kind, of)
         return following_table(self.rows, self.verdicts, of)
 
 
-def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> Effects:
+def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
     """The stored intervention whose key begins with `key`, or the newest (of `kind`), with verdicts as of now.
 
     Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
@@ -266,24 +274,24 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
     return effects_of(run, find_stored(run, key, kind))
 
 
-def effects_of(run: RunReader, stored: Stored) -> Effects:
+def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
     """Read one stored intervention."""
-    answers = stored.answers()
-    own = following(answers, run.suite, stored.key) if stored.settings["kind"] == FOLLOW else []
-    return Effects(
+    outcomes = stored.outcomes()
+    own = image_swap_effects(outcomes, run.suite, stored.key) if stored.settings["kind"] == FOLLOW else []
+    return InterventionResult(
         key=stored.key,
         label=run.label,
         suite=run.suite,
         random_weights=run.random_weights,
         settings=dict(stored.settings),
         certificate=stored.certificate(),
-        answers=answers,
-        attention=Weighed.of(stored),
+        outcomes=outcomes,
+        attention=AttentionShares.of(stored),
         verdicts=verdicts_of(run, own),
     )
 
 
-def verdicts_of(run: RunReader, shown: Sequence[Following] = ()) -> dict[str, Judgement]:
+def verdicts_of(run: RunReader, shown: Sequence[ImageSwapEffect] = ()) -> dict[str, UseVerdict]:
     """By category, from all interventions and the newest probes that are stored with a run.
 
     shown: what an exchange of pictures did that is to be judged, whatever else is stored of these categories.
@@ -292,14 +300,14 @@ def verdicts_of(run: RunReader, shown: Sequence[Following] = ()) -> dict[str, Ju
         results = load_results(run)
     except NoProbesError:
         results = None
-    found = {**stored_following(run), **{row.category: row for row in shown}}
-    return judgements(found, encoded_in(results), stored_places(run), stored_carriers(run))
+    found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
+    return classify_all(found, encoded_in(results), stored_localised_sites(run), stored_carrying_directions(run))
 
 
 def effects_csv(
-    answers: Answers,
+    outcomes: ConditionOutcomes,
     suite: str,
-    toward: str = EXCHANGED,
+    target_side: str = IMAGE_SWAP,
     kind: str = "",
     further: Mapping[str, bytes] = MappingProxyType({}),
 ) -> str:
@@ -307,25 +315,25 @@ def effects_csv(
 
     further: what else is stored, by the file's name.
     """
-    if WEIGHED in further:
-        return Weighed.from_bytes(further[WEIGHED]).frame().to_csv(index=False)
+    if ATTENTION_FILE in further:
+        return AttentionShares.from_bytes(further[ATTENTION_FILE]).frame().to_csv(index=False)
     if kind == ERASE:
         # What probes read stands in the certificate.
-        frame = frame_of(erased(answers, suite))
+        frame = frame_of(erasure_effects(outcomes, suite))
         return frame.drop(columns=["key", "readable_before", "readable"]).to_csv(index=False)
-    if answers.outcomes is not None:
-        return frame_of(carried_out(answers, suite)).drop(columns="key").to_csv(index=False)
-    if {PICTURES, NOISE} <= set(answers.conditions):
-        return words_frame(answers, suite).drop(columns="key").to_csv(index=False)
-    changes = passing(answers, suite, toward)
-    frame = frame_of(changes) if changes else frame_of(following(answers, suite))
+    if outcomes.episode_outcomes is not None:
+        return frame_of(closed_loop_effects(outcomes, suite)).drop(columns="key").to_csv(index=False)
+    if {PICTURES, NOISE} <= set(outcomes.conditions):
+        return words_frame(outcomes, suite).drop(columns="key").to_csv(index=False)
+    changes = patch_effects(outcomes, suite, target_side)
+    frame = frame_of(changes) if changes else frame_of(image_swap_effects(outcomes, suite))
     return frame.drop(columns="key").to_csv(index=False)
 
 
-def words_frame(answers: Answers, suite: str, key: str = "") -> "pd.DataFrame":
-    """One line per category: the fields of `Following`, of exchanged words, and of `Sensitivity`."""
-    frame = frame_of(following(answers, suite, key))
-    steps = sensitivity(answers)
+def words_frame(outcomes: ConditionOutcomes, suite: str, key: str = "") -> "pd.DataFrame":
+    """One line per category: the fields of `ImageSwapEffect`, of exchanged words, and of `Sensitivity`."""
+    frame = frame_of(image_swap_effects(outcomes, suite, key))
+    steps = input_sensitivity(outcomes)
     for name in ("words", "pictures", "noise", "words_changed", "pictures_changed"):
         frame[name] = [getattr(row, name) for row in steps]
     return frame

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from probe_kit.hooks.contract.sites import MEMORY_STREAM
+from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL
-from probe_kit.intervene.kinds.site_effects import Named, Passing, passing
-from probe_kit.intervene.store.answers import EXCHANGED
-from probe_kit.intervene.store.selection import Joined, Rank, joined, told_of
+from probe_kit.intervene.kinds.site_effects import ConditionName, PatchEffect, patch_effects
+from probe_kit.intervene.store.answers import IMAGE_SWAP
+from probe_kit.intervene.store.selection import PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.train.data.run_reader import RunReader
 
 BACKBONE = "backbone"
@@ -20,7 +20,7 @@ WHOLE, USUAL, WRONG = "none", "mean-difference", "wrong"
 """Settings: no direction, that of the class means, and the side to which steering goes if nothing is said."""
 
 
-def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
+def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
     """By category, the maps: what happens where tokens are taken over whole, a row for every place and role.
 
     The backbone first and the memory last, shallow before deep. Raises RunDamagedError.
@@ -28,133 +28,135 @@ def stored_passing(run: RunReader) -> dict[str, list[Passing]]:
     return _by_category(run, _maps(run))
 
 
-def stored_along(run: RunReader) -> dict[str, list[Passing]]:
+def stored_subspace_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
     """By category, what is carried along single directions, and by the random ones beside them."""
     return _by_category(run, _along(run))
 
 
-def stored_steering(run: RunReader) -> dict[str, dict[str, list[Passing]]]:
+def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     """By category and place (`backbone.02 image`), what steering did at every dose, controls included.
 
     Another direction than that of the class means, and another side than the wrong one, stand apart
     (`backbone.02 image, probe, toward left`).
     """
-    found: dict[str, dict[str, list[Passing]]] = {}
+    found: dict[str, dict[str, list[PatchEffect]]] = {}
     for one, rows in _rows_of(_steering(run), run.suite):
         found.setdefault(one.group.like.category, {})[_in_words(one)] = rows
     return found
 
 
-def keys_inside(run: RunReader) -> set[str]:
+def keys_in_use(run: RunReader) -> set[str]:
     """Of the stored interventions of which any number is in a map, a direction or a steering above."""
     every = [*_maps(run), *_along(run), *_steering(run)]
     return {one.group.sources[name].stored.key for one in every for name in one.conditions}
 
 
-def located_in(rows: Sequence[Passing]) -> tuple[str, ...]:
+def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     """The places, each once, that carry half of the effect or more when their tokens are taken over whole."""
-    return tuple(dict.fromkeys(row.place for row in rows if row.is_located and not row.direction))
+    return tuple(dict.fromkeys(row.place for row in rows if row.is_localised and not row.direction))
 
 
-def stored_places(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """By category, `located_in` of its maps; without categories that nobody searched.
+def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
+    """By category, `localised_sites` of its maps; without categories that nobody searched.
 
     Searched is one of which all tokens of some layer of the backbone were exchanged, or of which a place was
     found. That a single role, iteration or block carries nothing says nothing of the others.
     """
-    maps = stored_passing(run)
+    maps = stored_site_effects(run)
     searched = {
         category
         for category, rows in maps.items()
         if any(row.role == ALL and row.place.startswith(f"{BACKBONE}.") for row in rows)
     }
-    found = {category: located_in(rows) for category, rows in maps.items()}
+    found = {category: localised_sites(rows) for category, rows in maps.items()}
     return {category: places for category, places in found.items() if places or category in searched}
 
 
-def stored_carriers(run: RunReader) -> dict[str, tuple[str, ...]]:
+def stored_carrying_directions(run: RunReader) -> dict[str, tuple[str, ...]]:
     """By category, the directions that carry half of the effect, beyond random ones: `mean-difference at
     backbone.02 image`.
     """
     return {
         category: tuple(f"{row.direction} at {row.place} {row.role}" for row in rows if _is_carrier(row))
-        for category, rows in stored_along(run).items()
+        for category, rows in stored_subspace_effects(run).items()
     }
 
 
-def _is_carrier(row: Passing) -> bool:
-    return row.is_located and row.control_shift is not None
+def _is_carrier(row: PatchEffect) -> bool:
+    return row.is_localised and row.control_displacement is not None
 
 
 @dataclass(frozen=True)
-class _Chosen:
+class _Selection:
     """The conditions that stand for a subject. merit: of several, the largest is chosen."""
 
-    group: Joined
+    group: PooledConditions
     conditions: tuple[str, ...]
     merit: tuple[Rank, int, tuple[str, str]]
 
 
-def _maps(run: RunReader) -> list[_Chosen]:
-    told = [own for own in told_of(run, "interchange") if _direction(own.stored.settings) == WHOLE]
-    return _chosen(joined(told), ())
+def _maps(run: RunReader) -> list[_Selection]:
+    result = [own for own in stored_results(run, "interchange") if _direction(own.stored.settings) == WHOLE]
+    return _chosen(pool_conditions(result), ())
 
 
-def _along(run: RunReader) -> list[_Chosen]:
-    told = [own for own in told_of(run, "interchange") if _direction(own.stored.settings) != WHOLE]
-    return _chosen(joined(told, ("direction", "seed")), ("direction",))
+def _along(run: RunReader) -> list[_Selection]:
+    result = [own for own in stored_results(run, "interchange") if _direction(own.stored.settings) != WHOLE]
+    return _chosen(pool_conditions(result, ("direction", "seed")), ("direction",))
 
 
-def _steering(run: RunReader) -> list[_Chosen]:
-    return _chosen(joined(told_of(run, "steer"), ("direction", "seed", "toward")), ("direction", "toward"))
+def _steering(run: RunReader) -> list[_Selection]:
+    return _chosen(
+        pool_conditions(stored_results(run, "steer"), ("direction", "seed", "toward")), ("direction", "toward")
+    )
 
 
-def _chosen(groups: Sequence[Joined], setting: Sequence[str]) -> list[_Chosen]:
+def _chosen(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
     """One per category, place, role and values of these settings, by depth within a category."""
-    found: dict[str, dict[tuple[str, ...], _Chosen]] = {}
+    found: dict[str, dict[tuple[str, ...], _Selection]] = {}
     for group in groups:
         values = [str(group.like.stored.settings.get(name)) for name in setting]
         own = found.setdefault(group.like.category, {})
         for subject, conditions in _by_place(group).items():
             made = max(group.sources[name].made for name in conditions)
-            candidate = _Chosen(group, conditions, (group.like.rank, len(conditions), made))
+            candidate = _Selection(group, conditions, (group.like.rank, len(conditions), made))
             before = own.setdefault((*subject, *values), candidate)
             if before.merit < candidate.merit:
                 own[*subject, *values] = candidate
     return [own[subject] for own in found.values() for subject in sorted(own, key=_depth)]
 
 
-def _by_place(group: Joined) -> dict[tuple[str, str], tuple[str, ...]]:
+def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]:
     """The conditions of every place and role, controls and doses among them."""
     found: dict[tuple[str, str], list[str]] = {}
     for condition in sorted(group.sources):
-        named = Named.of(condition)
+        named = ConditionName.of(condition)
         found.setdefault((named.place, named.role), []).append(condition)
     return {cell: tuple(names) for cell, names in found.items()}
 
 
-def _rows_of(chosen: Sequence[_Chosen], suite: str) -> Iterator[tuple[_Chosen, list[Passing]]]:
+def _rows_of(chosen: Sequence[_Selection], suite: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
     """The numbers of each, tested against everything that its group tried in the same stream."""
-    tested: dict[tuple[int, str], dict[str, Passing]] = {}
+    tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for one in chosen:
         stream = _stream(one.conditions[0])
         at = id(one.group), stream
         if at not in tested:
-            tested[at] = _tested(one.group, stream, suite)
+            tested[at] = _test_together(one.group, stream, suite)
         yield one, [tested[at][name] for name in one.conditions]
 
 
-def _tested(group: Joined, stream: str, suite: str) -> dict[str, Passing]:
+def _test_together(group: PooledConditions, stream: str, suite: str) -> dict[str, PatchEffect]:
     conditions = sorted(name for name in group.sources if _stream(name) == stream)
-    toward = str(group.like.stored.settings.get("toward", EXCHANGED))
-    rows = passing(group.answers(conditions), suite, toward)
+    target_side = str(group.like.stored.settings.get("toward", IMAGE_SWAP))
+    rows = patch_effects(group.outcomes(conditions), suite, target_side)
     return {
         name: replace(row, key=group.sources[name].stored.key) for name, row in zip(conditions, rows, strict=True)
     }
 
 
-def _by_category(run: RunReader, chosen: Sequence[_Chosen]) -> dict[str, list[Passing]]:
-    found: dict[str, list[Passing]] = {}
+def _by_category(run: RunReader, chosen: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
+    found: dict[str, list[PatchEffect]] = {}
     for one, rows in _rows_of(chosen, run.suite):
         found.setdefault(one.group.like.category, []).extend(rows)
     return found
@@ -164,15 +166,15 @@ def _direction(settings: Mapping[str, Any]) -> str:
     return str(settings.get("direction", WHOLE))
 
 
-def _in_words(steered: _Chosen) -> str:
-    named, settings = Named.of(steered.conditions[0]), steered.group.like.stored.settings
-    direction, toward = str(settings.get("direction", USUAL)), str(settings.get("toward", WRONG))
-    further = [direction] * (direction != USUAL) + [f"toward {toward}"] * (toward != WRONG)
+def _in_words(steered: _Selection) -> str:
+    named, settings = ConditionName.of(steered.conditions[0]), steered.group.like.stored.settings
+    direction, target_side = str(settings.get("direction", USUAL)), str(settings.get("toward", WRONG))
+    further = [direction] * (direction != USUAL) + [f"toward {target_side}"] * (target_side != WRONG)
     return ", ".join([f"{named.place} {named.role}", *further])
 
 
 def _stream(condition: str) -> str:
-    return Named.of(condition).place.partition(".")[0]
+    return ConditionName.of(condition).place.partition(".")[0]
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
@@ -181,5 +183,5 @@ def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
     stream, _, rest = place.partition(".")
     layer, _, iterations = rest.partition("@")
     first, _, last = iterations.partition("-")
-    part = {BACKBONE: 0, MEMORY_STREAM: 2}.get(stream, 1)
+    part = {BACKBONE: 0, KV_STREAM: 2}.get(stream, 1)
     return part, stream, int(layer), int(first or 0), int(last or first or 0), role != ALL, role, *values

@@ -27,21 +27,21 @@ from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import stamp_of_run
 
-PLAIN, EXCHANGED = "plain", "exchanged"
+CLEAN, IMAGE_SWAP = "plain", "exchanged"
 """Conditions: as the run made it, and before the same two pictures in each other's place."""
 PICTURES, NOISE = "pictures", "noise"
 """Of `words`, where the words are what is exchanged: the pictures instead, and only the noise drawn anew."""
-ERASE, READABLE = "erase", "readable"
+ERASE, PROBE_ACCURACY = "erase", "readable"
 """A kind, and what its certificate calls what probes read behind its conditions."""
-ATTENTION, NOTED, WEIGHED = "attention", "noted", "attention.npz"
+ATTENTION, RECORDED, ATTENTION_FILE = "attention", "noted", "attention.npz"
 """A kind, its condition in which somebody notes the weights, and the file in which they are."""
-UNCHANGED = frozenset({PLAIN, EXCHANGED, PICTURES, NOISE, NOTED})
+UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, PICTURES, NOISE, RECORDED})
 """Conditions in which nothing inside the network is changed."""
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
 
 
 @dataclass(frozen=True)
-class Answers:
+class ConditionOutcomes:
     """What K conditions gave for E episodes of a run; see `conditions.Replayed`.
 
     conditions: names of the K, the plain one first. episodes, items, groups, categories, sides: (E,), `sides`
@@ -57,33 +57,33 @@ class Answers:
     groups: NDArray[np.str_]
     categories: NDArray[np.str_]
     sides: NDArray[np.str_]
-    lateral: NDArray[np.float64]
-    changed: NDArray[np.float64]
-    ledger: NDArray[np.float64]
-    apart: NDArray[np.float64]
-    outcomes: NDArray[np.str_] | None = None
+    displacement: NDArray[np.float64]
+    max_action_change: NDArray[np.float64]
+    edit_log: NDArray[np.float64]
+    replay_error: NDArray[np.float64]
+    episode_outcomes: NDArray[np.str_] | None = None
 
     def of(self, condition: str) -> NDArray[np.float64]:
         """(E,) lateral of one condition."""
-        return np.asarray(self.lateral[self.conditions.index(condition)])
+        return np.asarray(self.displacement[self.conditions.index(condition)])
 
     @property
-    def toward(self) -> NDArray[np.float64]:
+    def correct_sign(self) -> NDArray[np.float64]:
         """(E,) +1 where the correct picture lies left, −1 where it lies right."""
         return np.where(self.sides == "left", 1.0, -1.0)
 
-    def only(self, category: str) -> "Answers":
+    def only(self, category: str) -> "ConditionOutcomes":
         """The episodes of one category."""
         chosen = self.categories == category
-        axes = {"lateral": 1, "changed": 1, "ledger": 1, "outcomes": 1}
+        axes = {"displacement": 1, "max_action_change": 1, "edit_log": 1, "episode_outcomes": 1}
         cut: dict[str, Any] = {
             name: np.compress(chosen, value, axes.get(name, 0))
             for name, value in vars(self).items()
             if name != "conditions" and value is not None
         }
-        return Answers(self.conditions, **cut)
+        return ConditionOutcomes(self.conditions, **cut)
 
-    def by_category(self) -> "list[tuple[str, Answers]]":
+    def by_category(self) -> "list[tuple[str, ConditionOutcomes]]":
         """Every category with its episodes, in the order of the episodes."""
         return [(name, self.only(name)) for name in dict.fromkeys(map(str, self.categories))]
 
@@ -96,7 +96,7 @@ class Answers:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> "Answers":
+    def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
         """Read back."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
             found: dict[str, Any] = {
@@ -106,7 +106,7 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredIntervention:
     """One stored intervention. settings: see `settings.settings_of`. created: when it was made."""
 
     bundle: Bundle
@@ -127,9 +127,9 @@ class Stored:
         """ISO time, UTC."""
         return str(self.bundle.head.get("created", ""))
 
-    def answers(self) -> Answers:
+    def outcomes(self) -> ConditionOutcomes:
         """What was measured. Raises RunDamagedError if it was changed."""
-        return Answers.from_bytes(self.bundle.read(EPISODES))
+        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES))
 
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked. Raises RunDamagedError if it was changed."""
@@ -141,7 +141,7 @@ def save(
     run: Location,
     settings: Mapping[str, Any],
     key: str,
-    answers: Answers,
+    outcomes: ConditionOutcomes,
     effects: str,
     certificate: Mapping[str, Any],
     further: Mapping[str, bytes] = MappingProxyType({}),
@@ -151,7 +151,7 @@ def save(
         tidy_bundle(run, INTERVENTIONS, key)
         return
     files = {
-        EPISODES: answers.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
+        EPISODES: outcomes.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
     }  # fmt: skip
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings), "created": now}, files)
@@ -162,13 +162,13 @@ def is_stored(run: Location, key: str) -> bool:
     return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
 
 
-def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored]:
+def stored_interventions(run: RunReader, kind: str | None = None) -> list[StoredIntervention]:
     """Those of the episodes that the run has now, in the wording it is in, oldest first.
 
     kind: only these. Those of another format, written by another version of probe_kit, are passed over. Raises
     RunDamagedError if any of the run was changed or lost its settings.
     """
-    found = [Stored(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    found = [StoredIntervention(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
     wanted = {
         "format": FORMAT, "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
         "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),
@@ -177,7 +177,7 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
     return sorted(fitting, key=lambda one: (one.created, one.key))
 
 
-def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Stored:
+def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> StoredIntervention:
     """The one whose key begins with `key`, or the newest of `kind`.
 
     Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.

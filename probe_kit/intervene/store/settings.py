@@ -9,17 +9,17 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import sha256_json
 
 FORMAT = 1  # raise when stored numbers would be others
-Readout = Literal["chunk", "shadow"]
+Readout = Literal["first-chunk", "per-step"]
 READOUTS: Mapping[str, str] = {
-    "chunk": "where the first inference's actions would bring the hand, with nothing carried out",
-    "shadow": "what every inference of the unedited episode would add across, with only the plain one carried out",
+    "first-chunk": "where the first inference's actions would bring the hand, with nothing carried out",
+    "per-step": "what every inference of the unedited episode would add across, with only the plain one carried out",
 }
-CHUNK: Readout = "chunk"
-SHADOW: Readout = "shadow"
+FIRST_CHUNK: Readout = "first-chunk"
+PER_STEP: Readout = "per-step"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
+class InterventionSettings:
     """What is asked of every kind of intervention.
 
     categories: of the run; None for all. items: so many of each category, the first ones; None for all.
@@ -28,7 +28,7 @@ class Asked:
 
     categories: tuple[str, ...] | None = None
     items: int | None = None
-    readout: Readout = CHUNK
+    readout: Readout = FIRST_CHUNK
 
     def __post_init__(self) -> None:
         if self.items is not None and self.items < 1:
@@ -41,11 +41,11 @@ class Asked:
         """Its name on the command line."""
         raise NotImplementedError
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """What else decides its numbers, as plain JSON."""
         return {}
 
-    def chosen(self, run: Run) -> tuple[str, ...]:
+    def categories_in(self, run: Run) -> tuple[str, ...]:
         """Its categories. Raises UnknownCategoryError for one that the run lacks."""
         known = list(dict.fromkeys(run.episodes["category"].astype(str)))
         for category in self.categories or ():
@@ -56,30 +56,30 @@ class Asked:
         return self.categories or tuple(known)
 
 
-def items_of(run: Run, asked: Asked) -> list[str]:
+def items_of(run: Run, intervention: InterventionSettings) -> list[str]:
     """The items that are replayed, category by category. Raises UsageError if there is none."""
     episodes, chosen = run.episodes, []
-    for category in asked.chosen(run):
+    for category in intervention.categories_in(run):
         names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
-        chosen += list(dict.fromkeys(names))[: asked.items]
+        chosen += list(dict.fromkeys(names))[: intervention.items]
     if not chosen:
         raise UsageError(f"{run.location} has no episode yet; extract some first")
     return chosen
 
 
-def settings_of(asked: Asked, run: Run) -> dict[str, Any]:
+def settings_of(intervention: InterventionSettings, run: Run) -> dict[str, Any]:
     """Everything that decides the numbers, as plain JSON; its hash is the key."""
     return {
         "format": FORMAT,
-        "kind": asked.kind,
+        "kind": intervention.kind,
         "run_settings": run.settings_sha256,
         "stamp": run.stamp,
         "weights": run.weights_sha256,
         "wording": run.wording,
-        "categories": list(asked.chosen(run)),
-        "items": asked.items,
-        "readout": asked.readout,
-        **asked.own_settings(),
+        "categories": list(intervention.categories_in(run)),
+        "items": intervention.items,
+        "readout": intervention.readout,
+        **intervention.parameters(),
     }
 
 

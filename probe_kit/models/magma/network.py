@@ -16,7 +16,7 @@ from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
 from probe_kit.models.magma.pictures import Grid, Picture
 from probe_kit.models.magma.vision import Projector, VisionTower, map_size, stitched, whole_picture
-from probe_kit.models.prompt_kv import Memory
+from probe_kit.models.prompt_kv import PromptKV
 
 Choose = Callable[[Tensor], Tensor]
 """Ids (B,) from logits (B, V)."""
@@ -54,7 +54,7 @@ class MagmaNetwork(nn.Module):
             config.vision, self.vision_tower.width, int(config.text.hidden_size)
         )
         self.language_model: Any = LlamaForCausalLM(config.text)
-        self.memory = Memory(int(config.text.num_hidden_layers))
+        self.prompt_kv = PromptKV(int(config.text.num_hidden_layers))
 
     # -- pictures ----------------------------------------------------------------------------------------
 
@@ -110,7 +110,7 @@ class MagmaNetwork(nn.Module):
 
     def read(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> "Decoding":
         """One pass over the prompts, to go on from token by token."""
-        return Decoding(self.language_model, self.embed(prompts, pictures), self.memory)
+        return Decoding(self.language_model, self.embed(prompts, pictures), self.prompt_kv)
 
     def decode(
         self,
@@ -142,15 +142,15 @@ class MagmaNetwork(nn.Module):
 class Decoding:
     """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones.
 
-    memory: where what is kept of the prompts passes once.
+    prompt_kv: where what is kept of the prompts passes once.
     """
 
-    def __init__(self, language_model: Any, packed: Packed, memory: Memory) -> None:
+    def __init__(self, language_model: Any, packed: Packed, prompt_kv: PromptKV) -> None:
         self.language_model, self._mask = language_model, packed.mask
         self._cache = DynamicCache(config=language_model.config)
         self._positions = positions(packed.mask)
         self.logits = self._run(language_model, packed.embeddings)
-        memory(self._cache.layers)
+        prompt_kv(self._cache.layers)
 
     def feed(self, ids: Tensor, through: Any = None) -> Tensor:
         """(B, V) logits behind one more token (B,) per row.
@@ -179,7 +179,7 @@ class Decoding:
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
     """The network in eval mode.
 
-    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
+    device: `meta` for a network whose parameters have names and shapes but no prompt_kv, to be filled with
     `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
     Raises CheckpointError if the parts do not fit together.
     """

@@ -14,7 +14,7 @@ from transformers import AutoModelForCausalLM, DynamicCache
 from probe_kit.models.building import build_empty
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
-from probe_kit.models.prompt_kv import Memory
+from probe_kit.models.prompt_kv import PromptKV
 
 
 class Projector(nn.Module):
@@ -64,7 +64,7 @@ class PrismaticNetwork(nn.Module):
         self.vision_backbone = VisionBackbone(config.towers)
         self.projector = Projector(self.vision_backbone.width, config.text.hidden_size, config.fused)
         self.language_model: Any = AutoModelForCausalLM.from_config(config.text)
-        self.memory = Memory(int(config.text.num_hidden_layers))
+        self.prompt_kv = PromptKV(int(config.text.num_hidden_layers))
 
     @property
     def patches(self) -> int:
@@ -119,7 +119,7 @@ class PrismaticNetwork(nn.Module):
                 logits_to_keep=1,
             )
             if not chosen:  # the prompt is read; the tokens behind it read what is kept of it
-                self.memory(cache.layers)
+                self.prompt_kv(cache.layers)
             logits.append(output.logits[:, -1])
             chosen.append(choose(logits[-1]))
             if len(chosen) == steps:

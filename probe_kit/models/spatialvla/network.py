@@ -13,7 +13,7 @@ from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, Zoe
 
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.models.building import build_empty
-from probe_kit.models.prompt_kv import Memory
+from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, estimate_depth, fill_depth_buffers
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project
@@ -69,7 +69,7 @@ class SpatialVLANetwork(nn.Module):
         self.vision_tower: Any = SiglipVisionModel(config.vision)
         self.multi_modal_projector = Projector(width, int(config.text.hidden_size))
         self.language_model: Any = Gemma2ForCausalLM(config.text)
-        self.memory = Memory(int(config.text.num_hidden_layers))
+        self.prompt_kv = PromptKV(int(config.text.num_hidden_layers))
         if config.depth is not None:
             config.depth.backbone_config._attn_implementation = EAGER
             self.vision_zoe_model: Any = ZoeDepthForDepthEstimation(config.depth)
@@ -166,7 +166,7 @@ class SpatialVLANetwork(nn.Module):
         for step in range(steps):
             logits.append(self(embeddings, mask, cache, keep=1).logits[:, -1])
             if step == 0:  # the prompt is read; the tokens behind it read what is kept of it
-                self.memory(cache.layers)
+                self.prompt_kv(cache.layers)
             chosen.append(_best(logits[-1], None if slots is None else slots[step]))
             following = chosen[-1] if fed is None or step == steps - 1 else fed[:, step]
             embeddings = self.embed(following[:, None])

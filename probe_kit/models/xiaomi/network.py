@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 
-from probe_kit.models.prompt_kv import Memory
+from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.qwen import QwenInputs, build_empty, fill_rotary
 from probe_kit.models.xiaomi.config import FlowConfig, XiaomiConfig
 from probe_kit.models.xiaomi.transformer import Cache, FlowTransformer, Projector, TimeEmbedder
@@ -47,13 +47,13 @@ class XiaomiNetwork(nn.Module):
         self.t_embedder = TimeEmbedder(flow.width)
         self.t_projector = Projector(flow.width, 6 * flow.width, layers=1, bias=True)
         self.sink = nn.Embedding(1, flow.width)
-        self.memory = Memory(int(config.vlm.text_config.num_hidden_layers))
+        self.prompt_kv = PromptKV(int(config.vlm.text_config.num_hidden_layers))
 
     def read(self, inputs: QwenInputs) -> Prompt:
         """One pass of the vision-language model; its output head is not called, nothing reads it."""
         keywords = inputs.keywords(self.vlm.model)
         seen = self.vlm.model(**keywords, use_cache=True).past_key_values
-        self.memory(seen.layers)
+        self.prompt_kv(seen.layers)
         caches = [(layer.keys, layer.values) for layer in seen.layers[-len(self.dit.layers) :]]
         return Prompt(caches, inputs.mask.bool(), keywords["position_ids"].amax(dim=-1, keepdim=True))
 

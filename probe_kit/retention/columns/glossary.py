@@ -23,7 +23,7 @@ GLOSSARY = MappingProxyType(
             "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the "
             "decision itself, as a noisy action or as the tokens before."
         ),
-        "follows / against": (
+        "follow / reversal": (
             "With the two pictures exchanged, and nothing else: share of episodes whose action then turns from "
             "the correct picture's side to the other one, and share in which it does the reverse."
         ),

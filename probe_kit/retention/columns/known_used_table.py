@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.retention.columns.text import number, percent, with_limits
 from probe_kit.retention.columns.text_table import PlainTable
 from probe_kit.retention.compare.known_used import OVERALL, PAIRS, Comparison, Joined, KnownUsed
@@ -123,7 +123,9 @@ def _spell_test(one: Comparison) -> str:
     return f"{one.only_first} against {one.only_second}, {number(one.p, 4)}{corrected}"
 
 
-def _table(title: str, caption: str, rows: Sequence[Joined], parts: Sequence[tuple[str, Columns]]) -> ResponsiveTable:
+def _table(
+    title: str, caption: str, rows: Sequence[Joined], parts: Sequence[tuple[str, Columns]]
+) -> ResponsiveTable:
     found = []
     for question, columns in parts:
         shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]

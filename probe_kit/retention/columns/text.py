@@ -111,8 +111,10 @@ RULE_COLUMNS: list[Column] = [
 
 FOLLOWED_COLUMNS: list[Column] = [
     (
-        "follows / against",
-        lambda row: "–" if row.follows is None else f"{percent(row.follows)} / {percent(row.against)}",
+        "follow / reversal",
+        lambda row: (
+            "–" if row.follow_rate is None else f"{percent(row.follow_rate)} / {percent(row.reversal_rate)}"
+        ),
     ),
     ("used", lambda row: row.used or "–"),
 ]
@@ -121,7 +123,7 @@ FOLLOWED_COLUMNS: list[Column] = [
 
 def followed(rows: Sequence[RetentionRow]) -> bool:
     """Whether any row was intervened on."""
-    return any(row.follows is not None for row in rows)
+    return any(row.follow_rate is not None for row in rows)
 
 
 ANSWER_SCORES: list[Column] = [

@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
-from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Axis, Weighed, stored_attention
+from probe_kit.intervene.kinds.attention.attention_mass import (
+    CORRECT,
+    OTHER,
+    AttentionShares,
+    Axis,
+    stored_attention,
+)
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.retention.displays.base.style import layer_axis, series
@@ -54,7 +60,7 @@ class AttentionDisplay(Panelled):
         return cls._of(found, category, Certificate.of_run(run))
 
     @classmethod
-    def _of(cls, weighed: Weighed, category: str, certificate: Certificate) -> Self:
+    def _of(cls, weighed: AttentionShares, category: str, certificate: Certificate) -> Self:
         left_out = {ALL, "special", *TILE_ROLES}
         blocks = np.unique(weighed.frame(("block",))["block"].to_numpy(np.int64))
         roles = tuple(role for role in weighed.shares() if role not in left_out)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.hooks.contract.sites import MEMORY_STREAM
+from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL
-from probe_kit.intervene.kinds.site_effects import Passing
-from probe_kit.intervene.results.site_maps import BACKBONE, stored_passing
+from probe_kit.intervene.kinds.site_effects import PatchEffect
+from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import Certificate
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
@@ -62,7 +62,9 @@ class CausalCurveDisplay(Panelled):
         return cls._of(run, results, category, view, shown_passing(run).get(category, []))
 
     @classmethod
-    def _of(cls, run: RunReader, results: ProbeResults, category: str, view: str, rows: Sequence[Passing]) -> Self:
+    def _of(
+        cls, run: RunReader, results: ProbeResults, category: str, view: str, rows: Sequence[PatchEffect]
+    ) -> Self:
         if not rows:
             raise NoInterventionsError(
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
@@ -70,11 +72,11 @@ class CausalCurveDisplay(Panelled):
             )
         scores = scores_of(results, category, view)
         scores = scores[scores["stream"] == BACKBONE].sort_values("layer")
-        by_role: dict[str, list[Passing]] = {}
+        by_role: dict[str, list[PatchEffect]] = {}
         for row in rows:
             if _stream(row) == BACKBONE:
                 by_role.setdefault(row.role, []).append(row)
-        read = [row for row in rows if _stream(row) == MEMORY_STREAM]
+        read = [row for row in rows if _stream(row) == KV_STREAM]
         return cls(
             category=category,
             chance=curve_of(results, category, view).chance,
@@ -108,7 +110,7 @@ class CausalCurveDisplay(Panelled):
         axes.set_ylim(-12, 108)
 
 
-def shown_passing(run: RunReader) -> dict[str, list[Passing]]:
+def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
     """By category, what a figure by layers shows of the maps: the backbone at every role, the memory as a whole.
 
     Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
@@ -118,9 +120,9 @@ def shown_passing(run: RunReader) -> dict[str, list[Passing]]:
             row
             for row in rows
             if "@" not in row.place
-            and (_stream(row) == BACKBONE or (_stream(row) == MEMORY_STREAM and row.role == ALL))
+            and (_stream(row) == BACKBONE or (_stream(row) == KV_STREAM and row.role == ALL))
         ]
-        for category, rows in stored_passing(run).items()
+        for category, rows in stored_site_effects(run).items()
     }
     return {category: rows for category, rows in found.items() if rows}
 
@@ -132,7 +134,7 @@ def causal_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "
     return in_panels([CausalCurveDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
 
 
-def _points(rows: Sequence[Passing]) -> Points:
+def _points(rows: Sequence[PatchEffect]) -> Points:
     return Points(
         np.array([_layer(row) for row in rows], np.int64),
         np.array([100 * row.net for row in rows]),
@@ -140,9 +142,9 @@ def _points(rows: Sequence[Passing]) -> Points:
     )
 
 
-def _stream(row: Passing) -> str:
+def _stream(row: PatchEffect) -> str:
     return row.place.partition(".")[0]
 
 
-def _layer(row: Passing) -> int:
+def _layer(row: PatchEffect) -> int:
     return int(row.place.partition(".")[2])

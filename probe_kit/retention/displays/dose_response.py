@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.kinds.site_effects import Passing
+from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import Certificate
@@ -26,24 +26,24 @@ Percent = NDArray[np.float64]
 
 @dataclass
 class DoseResponseDisplay(Panelled):
-    """By dose, the share of episodes that turn to the side they are pushed to, minus those that turn from it.
+    """By coefficient, the share of episodes that turn to the side they are pushed to, minus those that turn from it.
 
-    doses: (K,) in half gaps between the class means, ascending, 0 among them. net, left, right: (K,) percent, of
+    coefficients: (K,) in half gaps between the class means, ascending, 0 among them. net, left, right: (K,) percent, of
     all episodes and of those that are pushed to either side, one of which may be saturated. controls: (C, K)
-    percent of random directions of the same norm, NaN at a dose at which none was played. norm_ratio: (K,) how far
-    tokens were moved, in their own norms; what a dose of more than about two norms does is little evidence.
+    percent of random directions of the same norm, NaN at a coefficient at which none was played. norm_ratio: (K,) how far
+    tokens were moved, in their own norms; what a coefficient of more than about two norms does is little evidence.
     significant: (K,) beyond the controls, family-wise.
     """
 
     measure: ClassVar[str] = "% of episodes that turn"
     category: str
     place: str
-    doses: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
     net: Percent
     left: Percent
     right: Percent
     controls: Percent
-    norm_ratio: NDArray[np.float64]
+    relative_change: NDArray[np.float64]
     significant: NDArray[np.bool_]
     certificate: Certificate
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
@@ -65,22 +65,22 @@ class DoseResponseDisplay(Panelled):
         return cls._of(found[chosen], category, chosen, Certificate.of_run(run))
 
     @classmethod
-    def _of(cls, rows: Sequence[Passing], category: str, place: str, certificate: Certificate) -> Self:
-        own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.dose))
-        doses = np.array([float(row.dose) for row in own])
+    def _of(cls, rows: Sequence[PatchEffect], category: str, place: str, certificate: Certificate) -> Self:
+        own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.coefficient))
+        coefficients = np.array([float(row.coefficient) for row in own])
         names = dict.fromkeys(row.direction for row in rows if row.is_control)
-        nets = {(row.direction, float(row.dose)): 100 * row.net for row in rows}
+        nets = {(row.direction, float(row.coefficient)): 100 * row.net for row in rows}
         return cls(
             category=category,
             place=place,
-            doses=doses,
+            coefficients=coefficients,
             net=np.array([100 * row.net for row in own]),
             left=np.array([100 * row.net_left for row in own]),
             right=np.array([100 * row.net_right for row in own]),
-            controls=np.array([[nets.get((name, dose), np.nan) for dose in doses] for name in names]).reshape(
-                len(names), len(doses)
-            ),
-            norm_ratio=np.array([row.norm_ratio for row in own]),
+            controls=np.array(
+                [[nets.get((name, coefficient), np.nan) for coefficient in coefficients] for name in names]
+            ).reshape(len(names), len(coefficients)),
+            relative_change=np.array([row.relative_change for row in own]),
             significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in own]),
             certificate=certificate,
         )
@@ -94,18 +94,18 @@ class DoseResponseDisplay(Panelled):
         """A line for all episodes and one for either side, over the band of the controls."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
         if self.controls.size:
-            # Nothing was added at dose 0, by a control either.
-            played = np.where(self.doses == 0, 0.0, self.controls)
+            # Nothing was added at coefficient 0, by a control either.
+            played = np.where(self.coefficients == 0, 0.0, self.controls)
             axes.fill_between(
-                self.doses, played.min(axis=0), played.max(axis=0), color=GREY, alpha=0.35, lw=0,
+                self.coefficients, played.min(axis=0), played.max(axis=0), color=GREY, alpha=0.35, lw=0,
                 label="random directions of the same norm",
             )  # fmt: skip
         lines = {"all episodes": self.net, "pushed to the left": self.left, "pushed to the right": self.right}
         for position, (label, percent) in enumerate(lines.items()):
-            filled = self.significant if position == 0 else np.zeros(self.doses.size, bool)
-            draw_series(axes, series(position), self.doses, percent, filled, label)
-        axes.set_xticks(self.doses, [f"{dose:g}\n{ratio:.1f}×" for dose, ratio in zip(
-            self.doses, self.norm_ratio, strict=True)])  # fmt: skip
+            filled = self.significant if position == 0 else np.zeros(self.coefficients.size, bool)
+            draw_series(axes, series(position), self.coefficients, percent, filled, label)
+        axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{ratio:.1f}×" for coefficient, ratio in zip(
+            self.coefficients, self.relative_change, strict=True)])  # fmt: skip
         axes.set_ylim(-108, 108)
         axes.set_xlabel("half gaps between the class means; below: in norms of the tokens", fontsize=7.5)
 

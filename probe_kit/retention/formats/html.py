@@ -177,7 +177,7 @@ _BEHAVIOUR = [
     _Column("p (Holm)", difference_test, lambda _: None, "p (difference)"),
     *(
         _Column(
-            f"{name} %" if name != "used" else name, cell, lambda row: row.follows_net, name,
+            f"{name} %" if name != "used" else name, cell, lambda row: row.net_follow_rate, name,
             strong=lambda row: row.used == "used", note=lambda row: row.used_note,
         )
         for name, cell in FOLLOWED_COLUMNS

@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences

@@ -97,7 +97,7 @@ class Story:
 
     def to_rich(self) -> "ResponsiveTable":
         """A line per category: known, encoded and used, with the share each rests on."""
-        from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+        from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
         marks = {True: "yes", False: "no", None: "not asked"}
         cells = tuple(
@@ -128,7 +128,12 @@ def stories(rows: Sequence[RetentionRow]) -> list[Story]:
     asked = [row for row in rows if row.category != MEAN and _asks_for_the_answer(row)]
     acted: dict[str, list[RetentionRow]] = {}
     for row in rows:
-        if row.kind == "acts" and row.category != MEAN and not row.capture_only and row.prefix_accuracy is not None:
+        if (
+            row.kind == "acts"
+            and row.category != MEAN
+            and not row.capture_only
+            and row.prefix_accuracy is not None
+        ):
             acted.setdefault(row.run, []).append(row)
     return [_story([row for row in own if row.view == own[0].view], asked) for own in acted.values()]
 

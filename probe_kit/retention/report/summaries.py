@@ -52,7 +52,9 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
     rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
-    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.capture_only else rate]
+    found = [
+        Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.capture_only else rate
+    ]
     if mean.prefix_accuracy is not None:
         found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
     if mean.action_accuracy is not None:

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.image_swap.effects import stored_following
-from probe_kit.intervene.results.site_maps import stored_carriers, stored_places
-from probe_kit.retention.behaviour.success_rate import SuccessRate, capture_only, sensitivity, success_rate, units_of
+from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
+from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
+from probe_kit.retention.behaviour.success_rate import (
+    SuccessRate,
+    capture_only,
+    sensitivity,
+    success_rate,
+    units_of,
+)
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.bootstrap_draws import (
     UNBOUNDED,
@@ -72,8 +78,8 @@ def run_rows(
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
-    judged, found = Judged.of(run, settings.rule, settings.last_steps), stored_following(run)
-    located, carried = (stored_places(run), stored_carriers(run)) if found else ({}, {})
+    judged, found = Judged.of(run, settings.rule, settings.last_steps), stored_image_swaps(run)
+    located, carried = (stored_localised_sites(run), stored_carrying_directions(run)) if found else ({}, {})
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)

@@ -14,7 +14,7 @@ _AVERAGED = (
     "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
     "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
     "action_twin", "action_first_accuracy", "accuracy_text", "accuracy_logits", "accuracy_debiased",
-    "p_unreadable", "option_mass", "letter_bias", "p_near_tie", "follows", "against", "follows_net",
+    "p_unreadable", "option_mass", "letter_bias", "p_near_tie", "follow_rate", "reversal_rate", "net_follow_rate",
 )  # fmt: skip
 _OF_THE_RUN = ("kind", "prompt", "picture", "picture_size", "asked_for", "score")
 

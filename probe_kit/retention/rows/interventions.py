@@ -6,15 +6,15 @@ Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from probe_kit.intervene.kinds.image_swap.effects import Following
-from probe_kit.intervene.kinds.image_swap.verdict import control_for, judge
+from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
+from probe_kit.intervene.kinds.image_swap.verdict import classify_use, control_for
 from probe_kit.retention.rows.parts import Followed
 from probe_kit.retention.rows.row import RetentionRow
 
 
 def with_following(
     row: RetentionRow,
-    found: Mapping[str, Following],
+    found: Mapping[str, ImageSwapEffect],
     located: Mapping[str, Sequence[str]],
     carried: Mapping[str, Sequence[str]],
 ) -> RetentionRow:
@@ -28,13 +28,13 @@ def with_following(
         return row
     encoded = row.prefix_signal if row.prefix_beats else None
     category, control = row.category, control_for(row.category, found)
-    judged = judge(encoded, own, control, located.get(category), carried.get(category, ()))
+    judged = classify_use(encoded, own, control, located.get(category), carried.get(category, ()))
     part = Followed(
-        follows=own.follows,
-        against=own.against,
-        follows_net=own.net,
-        follows_net_ci=own.net_ci,
-        follows_p=own.p_follows,
+        follow_rate=own.follow_rate,
+        reversal_rate=own.reversal_rate,
+        net_follow_rate=own.net_follow_rate,
+        net_follow_rate_ci=own.net_follow_rate_ci,
+        follow_p=own.follow_p,
         used=judged.verdict,
         used_note=judged.reason,
     )

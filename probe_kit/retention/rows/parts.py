@@ -98,11 +98,11 @@ class Followed:
     verdict of that and the row's own probes; used_note: what it rests on, or why there is none.
     """
 
-    follows: float | None = None
-    against: float | None = None
-    follows_net: float | None = None
-    follows_net_ci: Limits | None = None
-    follows_p: float | None = None
+    follow_rate: float | None = None
+    reversal_rate: float | None = None
+    net_follow_rate: float | None = None
+    net_follow_rate_ci: Limits | None = None
+    follow_p: float | None = None
     used: str | None = None
     used_note: str = ""
 

@@ -12,7 +12,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_slug
-from probe_kit.suite.custom.own_items import Origin, Shown, Terms, own_item, check_broken, shown, statistics_of
+from probe_kit.suite.custom.own_items import Origin, Shown, Terms, check_broken, own_item, shown, statistics_of
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.manifest import check_foreign_folder, save_suite

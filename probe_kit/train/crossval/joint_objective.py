@@ -62,7 +62,9 @@ class JointProblems:
         if exact:
             mean, v = self.site.sets.mean[sets], weights[:, :-1]
             shrunk = self.site.sets.scale[sets] ** 2 * v
-            pulled, total = self._blockwise_products(v / self.site.scale, weights[:, -1] - (mean * v).sum(axis=1), sets, inside)
+            pulled, total = self._blockwise_products(
+                v / self.site.scale, weights[:, -1] - (mean * v).sum(axis=1), sets, inside
+            )
             by_feature = shrunk + strength * (pulled / self.site.scale - mean * total[:, None])
             by_axis, measured = by_feature @ self._wide_axes, by_feature / self._divisor[sets]
         else:
@@ -82,7 +84,9 @@ class JointProblems:
         xp, sets = array_namespace(directions), self.set_of[rows]
         mean, along = self._turned_mean[sets], directions[:, :-1]
         shift = directions[:, -1] - (mean * along).sum(axis=1)
-        pulled, total = self._blockwise_products(along, shift, sets, lambda f, block, use: f * curvature[use, block.rows])
+        pulled, total = self._blockwise_products(
+            along, shift, sets, lambda f, block, use: f * curvature[use, block.rows]
+        )
         penalty = (self._square_scale[sets] * (along @ self.site.axes.T)) @ self.site.axes
         strength = self._strength(rows, directions)
         inner = penalty + strength * (pulled - mean * total[:, None])
@@ -141,7 +145,9 @@ class JointProblems:
         count = xp.asarray(self.site.sets.counts[self.set_of], device=weights.device)
         return xp.sqrt((square / count - (total / count) ** 2).clip(0.0))
 
-    def _blockwise_products(self, left: Array, shift: Array, sets: NDArray[np.intp], inside: Inside) -> tuple[Array, Array]:
+    def _blockwise_products(
+        self, left: Array, shift: Array, sets: NDArray[np.intp], inside: Inside
+    ) -> tuple[Array, Array]:
         """Σ inside(f)·x (k, D) and Σ inside(f) (k,) over samples x, with f = left·x + shift.
 
         float64: x are raw samples without the site's mean; float32: samples along the axes.

@@ -18,8 +18,8 @@ from probe_kit.train.crossval.nested_folds import (
     FittedFold,
     Matrix,
     NestedFold,
-    select_c,
     nested_folds,
+    select_c,
 )
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import to_numpy
@@ -33,10 +33,10 @@ __all__ = [
     "FittedFold",
     "NestedFold",
     "SiteProbe",
+    "check_non_finite",
     "cross_validate",
     "nested_folds",
     "probe_site",
-    "check_non_finite",
 ]
 
 

@@ -12,7 +12,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
 from probe_kit.train.data.run_reader import RunReader, Tokens
 from probe_kit.train.solver.backend import Array, to_device, to_numpy
-from probe_kit.train.solver.row_subset import RowSubset, Features
+from probe_kit.train.solver.row_subset import Features, RowSubset
 
 TOKENS = "tokens"
 """View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""

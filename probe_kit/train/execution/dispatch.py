@@ -3,12 +3,22 @@
 from collections.abc import Iterator
 from typing import Any
 
-from probe_kit.train.execution.executor import Columns, ProbeExecutor, ExecutionSettings, Key, Probed, Problems, probe_column
+from probe_kit.train.execution.executor import (
+    Columns,
+    ExecutionSettings,
+    Key,
+    Probed,
+    ProbeExecutor,
+    Problems,
+    probe_column,
+)
 from probe_kit.train.execution.processes import ProcessExecutor
 from probe_kit.train.execution.ray import RayExecutor
 
 
-def probe_columns(columns: Columns, problems: Problems, settings: ExecutionSettings) -> Iterator[tuple[Key, Probed]]:
+def probe_columns(
+    columns: Columns, problems: Problems, settings: ExecutionSettings
+) -> Iterator[tuple[Key, Probed]]:
     """The probes of every column by category, as they are done.
 
     Raises MissingExtraError if Ray is asked for and not installed, WorkerDiedError if a worker process dies, and

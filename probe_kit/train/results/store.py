@@ -20,7 +20,7 @@ from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, t
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.train.data.captured_call import restrict_to_call, captured_calls
+from probe_kit.train.data.captured_call import captured_calls, restrict_to_call
 from probe_kit.train.data.labels import Target
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls

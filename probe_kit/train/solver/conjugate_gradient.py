@@ -22,7 +22,9 @@ class NewtonSteps:
     unsettled: Array
 
 
-def newton_steps(design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array) -> NewtonSteps:
+def newton_steps(
+    design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array
+) -> NewtonSteps:
     """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
 
     penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S.

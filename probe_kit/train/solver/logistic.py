@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train.solver.backend import Array, keep_freed_memory, array_namespace
+from probe_kit.train.solver.backend import Array, array_namespace, keep_freed_memory
 from probe_kit.train.solver.conjugate_gradient import newton_steps
 from probe_kit.train.solver.design_matrix import Design
 

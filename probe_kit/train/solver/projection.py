@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.design_matrix import DenseDesign, Design, StreamedDesign
 from probe_kit.train.solver.principal_axes import principal_axes
-from probe_kit.train.solver.row_subset import RowSubset, Features, module_of
+from probe_kit.train.solver.row_subset import Features, RowSubset, module_of
 from probe_kit.train.solver.standardiser import Standardiser
 
 IN_MEMORY = 2**29

@@ -12,7 +12,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
-from probe_kit.extract.rollout.episode_loop import Failure, EpisodeLoop, Rollout
+from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
 from probe_kit.extract.rollout.stage import Ending, LocalStage, Seen, Stage
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.hooks.contract.observation import Observation

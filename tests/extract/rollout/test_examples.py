@@ -6,7 +6,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.env.simulation.camera import Camera
 from probe_kit.errors import UsageError
-from probe_kit.extract.rollout.examples import example_observations, check_unfit
+from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.hooks import ModelCard
 
 CARD = ModelCard("mine", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 1, 1)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks import Observation, Site, ActivationCache, capture
+from probe_kit.hooks import ActivationCache, Observation, Site, capture
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
 
@@ -59,7 +59,8 @@ def test_what_has_no_rectangular_shape_is_not_stacked(pi0_tiny: Pi0, observation
 
 def test_it_says_what_it_holds(tape: ActivationCache) -> None:
     assert (
-        repr(tape) == "<ActivationCache of 44 sites: backbone.residual: 4 layers; expert.residual: 4 layers x 10 iterations>"
+        repr(tape)
+        == "<ActivationCache of 44 sites: backbone.residual: 4 layers; expert.residual: 4 layers x 10 iterations>"
     )
     assert "2 × 17 × 64" in tape._repr_html_()
     assert repr(ActivationCache()) == "<ActivationCache of 0 sites>"

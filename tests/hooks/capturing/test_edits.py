@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Site, capture
-from probe_kit.hooks.capturing.apply_edits import applied
+from probe_kit.hooks.capturing.apply_edits import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, vector_hash
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
@@ -13,9 +13,9 @@ SITE = Site("backbone", 2)
 
 
 def _tape(policy: Pi0, seen: list[Observation], edits: list[Edit], vectors: dict) -> tuple:
-    with applied(policy, edits, seen, vectors) as ledger, capture(policy, [SITE]) as tape:
+    with apply_edits(policy, edits, seen, vectors) as edit_log, capture(policy, [SITE]) as tape:
         actions = policy.act(seen, [0])
-    return tape[SITE][0].numpy(), actions, ledger
+    return tape[SITE][0].numpy(), actions, edit_log
 
 
 @pytest.fixture
@@ -35,11 +35,11 @@ def test_an_edit_is_data_that_can_be_hashed_and_sent_between_processes() -> None
 
 
 def test_only_tokens_of_the_named_roles_change(pi0_tiny: Pi0, observation: Observation, plain: np.ndarray) -> None:
-    changed, _, ledger = _tape(pi0_tiny, [observation], [Edit("zero", (SITE,), roles=("language",))], {})
+    changed, _, edit_log = _tape(pi0_tiny, [observation], [Edit("zero", (SITE,), roles=("language",))], {})
     language = pi0_tiny.roles([observation])["backbone"][0].mask("language")
     assert (changed[language] == 0).all()
     np.testing.assert_array_equal(changed[~language], plain[~language])
-    (entry,) = ledger.entries
+    (entry,) = edit_log.entries
     assert entry.tokens == language.sum()
     np.testing.assert_allclose(entry.norm, np.linalg.norm(plain[language], axis=1).mean(), rtol=1e-5)
     np.testing.assert_allclose(entry.moved, entry.norm, rtol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, edit, known_families
-from probe_kit.hooks.capturing.apply_edits import applied
+from probe_kit.hooks.capturing.apply_edits import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, vector_hash
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
@@ -20,8 +20,8 @@ def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it
     supported = FAMILIES[name].interventions
     assert supported.edits, "say which quantities of which streams can be rewritten"
     assert {"backbone"} < supported.edits.keys()
-    assert supported.memory or "memory" in supported.instead
-    assert (supported.readout == "shadow") == ("action" in supported.edits)
+    assert supported.prompt_kv or "kv" in supported.instead
+    assert (supported.readout == "per-step") == ("action" in supported.edits)
     assert json.loads(json.dumps(supported.to_json()))["kinds"][:2] == ["follow", "edit"]
 
 
@@ -34,13 +34,13 @@ def test_a_reader_is_refused_because_it_does_not_act(name: str) -> None:
 
 def test_a_family_without_a_memory_says_what_to_exchange_instead() -> None:
     with pytest.raises(UnsupportedInterventionError, match=r"internvla-m1.*last `bridge` site"):
-        FAMILIES["internvla-m1"].check_intervention("memory")
+        FAMILIES["internvla-m1"].check_intervention("kv")
     FAMILIES["internvla-m1"].check_intervention("edit")
 
 
 def test_a_family_that_says_nothing_is_told_how_to_say_it() -> None:
-    with pytest.raises(UnsupportedInterventionError, match=r"declare `Model\.memory`"):
-        Interventions().check("memory", "mine")
+    with pytest.raises(UnsupportedInterventionError, match=r"declare `Model\.prompt_kv`"):
+        Interventions().check("kv", "mine")
     with pytest.raises(UsageError, match="no intervention levitate"):
         Interventions(instead={"levitate": "no"})
 
@@ -49,15 +49,15 @@ def test_another_adapter_over_the_same_network_keeps_its_memory(pi0_tiny: Pi0, o
     """The prompt passes once, however often an adapter is put around it."""
     again = type(pi0_tiny)(pi0_tiny.network, pi0_tiny.folder)
     again.card = pi0_tiny.card
-    site = Site("memory", 0, "keys")
+    site = Site("kv", 0, "keys")
     with capture(again, [site]) as tape:
         again.act([observation], [0])
-    assert tape.fires == {"memory.00.keys": 1}
+    assert tape.fires == {"kv.00.keys": 1}
 
 
 def test_an_edit_of_the_memory_is_what_every_iteration_reads(pi0_tiny: Pi0, observation: Observation) -> None:
     """Zero values everywhere are an expert that reads nothing: then no picture changes an action."""
-    memory = pi0_tiny.memory
+    memory = pi0_tiny.prompt_kv
     assert memory is not None
     nothing = {site: lambda values: values * 0 for site in memory.sites("values")}
     nothing |= {site: lambda keys: keys * 0 for site in memory.sites("keys")}
@@ -71,18 +71,18 @@ def test_an_edit_of_the_memory_is_what_every_iteration_reads(pi0_tiny: Pi0, obse
 
 
 def test_a_donor_of_another_number_of_tokens_is_refused(pi0_tiny: Pi0, observation: Observation) -> None:
-    site = Site("memory", 0, "keys")
+    site = Site("kv", 0, "keys")
     donor = np.zeros((3, 16), np.float32)
     own = Edit("replace", (site,), vector=vector_hash(donor))
     with (
-        pytest.raises(UsageError, match=r"memory\.00\.keys has shape"),
-        applied(pi0_tiny, [own], [observation], {own.vector: donor}),
+        pytest.raises(UsageError, match=r"kv\.00\.keys has shape"),
+        apply_edits(pi0_tiny, [own], [observation], {own.vector: donor}),
     ):
         pi0_tiny.act([observation], [0])
 
 
 def test_the_memory_passes_in_a_random_twin_too(observation: Observation) -> None:
     twin = load_pi0_tiny(random_weights=True)
-    with capture(twin, [Site("memory", 1, "values")]) as tape:
+    with capture(twin, [Site("kv", 1, "values")]) as tape:
         twin.act([observation], [0])
     assert len(tape) == 1

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import ModelCard, Model, Observation, Reading, Roles, Rows, Site, Stream, Tap, capture, edit
+from probe_kit.hooks import Model, ModelCard, Observation, Reading, Roles, Rows, Site, Stream, Tap, capture, edit
 from probe_kit.hooks.testing import example_observations
 
 CARD = ModelCard("guided", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 0, 0)

@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.intervene.edits.linear_erasure import (
     Eraser,
     Method,
-    Tokens,
+    PaddedTokens,
     fit_control,
     fit_eraser,
     leace_direction,
@@ -22,14 +22,14 @@ POSITIONS, WIDTH = 3, 12
 METHODS = [Method.of(name) for name in ("leace", "mean-difference:2", "inlp:3")]
 
 
-def drawn(episodes: int = 120, gap: float = 2.0, seed: int = 0) -> tuple[Tokens, NDArray[np.bool_]]:
+def drawn(episodes: int = 120, gap: float = 2.0, seed: int = 0) -> tuple[PaddedTokens, NDArray[np.bool_]]:
     """Correlated noise, and an answer that lies elsewhere at every position."""
     draw = np.random.default_rng(seed)
     left = draw.permutation(np.arange(episodes) % 2 == 0)
     noise = draw.normal(size=(episodes, POSITIONS, WIDTH)) @ draw.normal(size=(WIDTH, WIDTH))
     where = draw.normal(size=(POSITIONS, WIDTH))
     values = noise + gap * left[:, None, None] * where + 5.0
-    return Tokens(values, np.ones((episodes, POSITIONS), bool)), left
+    return PaddedTokens(values, np.ones((episodes, POSITIONS), bool)), left
 
 
 def test_after_leace_no_linear_probe_reads_anything_in_what_it_was_fitted_on() -> None:
@@ -54,7 +54,7 @@ def test_leace_changes_the_least_of_all_that_leave_nothing_to_read() -> None:
     own = float((np.outer(values @ read, removed) ** 2).sum())
     along = removed / np.linalg.norm(removed)
     assert own < float(((values @ along) ** 2).sum())
-    only = Tokens(tokens.values[:, :1], tokens.present[:, :1])
+    only = PaddedTokens(tokens.values[:, :1], tokens.present[:, :1])
     for rank in range(1, WIDTH + 1):
         rest = fit_eraser(only, left, Method("inlp", rank))(only.values)
         score = LinearRegression().fit(rest[:, 0], left).score(rest[:, 0], left)
@@ -179,7 +179,7 @@ def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, there: int
 def test_controls_that_find_no_room_beside_it_are_refused(way: str, most: int) -> None:
     """In four dimensions a control of three directions has one that is beside, and would be called equal."""
     tokens, left = drawn()
-    narrow = Tokens(tokens.values[..., : 2 * most], tokens.present)
+    narrow = PaddedTokens(tokens.values[..., : 2 * most], tokens.present)
     fits = {rank: fit_eraser(narrow, left, Method.of(f"{way}:{rank}")) for rank in (most, most + 1)}
     control = fit_control(narrow, left, Method.of(f"{way}:{most}"), fits[most], np.random.default_rng(0))
     assert (np.linalg.norm(control.removed, axis=-1) > 0.99).all()

@@ -5,50 +5,50 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.intervene import Answers, Judgement, Passing, judge
-from probe_kit.intervene.kinds.image_swap.effects import following
-from probe_kit.intervene.kinds.site_effects import Named, passing
-from probe_kit.intervene.results.site_maps import located_in
-from tests.intervene.answers import answers_of, follower, habit
+from probe_kit.intervene import ConditionOutcomes, PatchEffect, UseVerdict, classify_use
+from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
+from probe_kit.intervene.kinds.site_effects import ConditionName, patch_effects
+from probe_kit.intervene.results.site_maps import localised_sites
+from tests.intervene.answers import follower, habit, outcomes_of
 
 SUITE = "suite@1#0123456789ab"
 
 
-def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) -> Answers:
+def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) -> ConditionOutcomes:
     """changes: by condition (`__` for `|`, `_` for `-`), metres toward the plain pictures' correct side."""
-    made = answers_of({"color": signs})
+    made = outcomes_of({"color": signs})
     names = [name.replace("__", "|").replace("_", "-") for name in changes]
-    more = np.stack([made.toward * values for values in changes.values()])
-    lateral = np.vstack([made.lateral, more])
+    more = np.stack([made.target_side * values for values in changes.values()])
+    displacement = np.vstack([made.displacement, more])
     return replace(
         made,
         conditions=(*made.conditions, *names),
-        lateral=lateral,
-        changed=np.abs(lateral - lateral[0]),
-        ledger=np.tile([1.0, 0.0, 10.0, 5.0, 9.0], (*lateral.shape, 1)),
+        displacement=displacement,
+        max_action_change=np.abs(displacement - displacement[0]),
+        edit_log=np.tile([1.0, 0.0, 10.0, 5.0, 9.0], (*displacement.shape, 1)),
     )
 
 
-def rows_of(answers: Answers) -> dict[str, Passing]:
-    return {f"{row.place}|{row.role}|{row.direction}".rstrip("|"): row for row in passing(answers, SUITE)}
+def rows_of(outcomes: ConditionOutcomes) -> dict[str, PatchEffect]:
+    return {f"{row.place}|{row.role}|{row.direction}".rstrip("|"): row for row in patch_effects(outcomes, SUITE)}
 
 
 def test_what_carries_all_has_the_effect_one_and_is_located() -> None:
     plain, exchanged = follower(48)
     rows = rows_of(with_changes((plain, exchanged), a__all=exchanged, b__all=plain, c__all=plain * 0.8))
     assert rows["a|all"].effect == pytest.approx(1.0)
-    assert (rows["a|all"].net, rows["a|all"].is_located) == (1.0, True)
-    assert (rows["b|all"].effect, rows["b|all"].p_fwe, rows["b|all"].changed) == (0.0, 1.0, 0.0)
+    assert (rows["a|all"].net, rows["a|all"].is_localised) == (1.0, True)
+    assert (rows["b|all"].effect, rows["b|all"].p_fwe, rows["b|all"].max_action_change) == (0.0, 1.0, 0.0)
     assert rows["c|all"].effect == pytest.approx(0.1)
     assert rows["c|all"].p_fwe < 0.05
-    assert located_in(list(rows.values())) == ("a",)
+    assert localised_sites(list(rows.values())) == ("a",)
 
 
 def test_shares_of_nothing_are_not_given() -> None:
     plain, exchanged = habit(48)
     rows = rows_of(with_changes((plain, exchanged), a__all=exchanged))
     assert rows["a|all"].effect is None
-    assert not rows["a|all"].is_located
+    assert not rows["a|all"].is_localised
 
 
 def test_turning_from_the_pushed_side_counts_against_it() -> None:
@@ -67,7 +67,7 @@ def test_what_controls_do_as_well_is_no_effect() -> None:
     rows = rows_of(with_changes((plain, exchanged), **changes))
     assert rows["a|image|mean-difference"].p_fwe > 0.05
     assert rows["b|image|mean-difference"].p_fwe < 0.05  # has no control
-    assert rows["a|image|mean-difference"].control_shift == pytest.approx(0.05, abs=1e-3)
+    assert rows["a|image|mean-difference"].control_displacement == pytest.approx(0.05, abs=1e-3)
     control = rows["a|image|control-1"]
     assert control.is_control
     assert control.p_fwe is None
@@ -76,23 +76,25 @@ def test_what_controls_do_as_well_is_no_effect() -> None:
 def test_the_ledger_is_summed_and_norms_are_compared() -> None:
     plain, exchanged = follower(8)
     row = rows_of(with_changes((plain, exchanged), a__all=exchanged))["a|all"]
-    assert (row.fires, row.still, row.norm_ratio) == (8, 0, 0.5)
+    assert (row.fires, row.no_op_fires, row.relative_change) == (8, 0, 0.5)
 
 
 def test_names_are_taken_apart() -> None:
-    assert Named.of("backbone.02|image|control-1|2") == Named("backbone.02", "image", "control-1", "2")
-    whole, along = Named.of("backbone.02|image"), Named.of("backbone.02|image|probe")
-    control = Named.of("backbone.02|image|control-1")
+    assert ConditionName.of("backbone.02|image|control-1|2") == ConditionName(
+        "backbone.02", "image", "control-1", "2"
+    )
+    whole, along = ConditionName.of("backbone.02|image"), ConditionName.of("backbone.02|image|probe")
+    control = ConditionName.of("backbone.02|image|control-1")
     assert control.is_control_of(along)
     assert not control.is_control_of(whole)
     assert not along.is_control_of(along)
 
 
 def test_nothing_is_called_used_where_nothing_was_found_inside() -> None:
-    (found,) = following(answers_of({"color": follower(48)}), SUITE)
-    assert judge(True, found, None, ("backbone.02",)) == Judgement("used", "passes at backbone.02")
-    both = ("backbone.00", "memory.02", "backbone.02")
-    assert judge(True, found, None, both).reason == "passes at backbone.00, backbone.02; read at memory.02"
-    assert judge(True, found, None, ("memory.02",)).reason == "read at memory.02"
-    assert judge(True, found, None, ()).verdict == "inconclusive"
-    assert judge(True, found, None).verdict == "used"
+    (found,) = image_swap_effects(outcomes_of({"color": follower(48)}), SUITE)
+    assert classify_use(True, found, None, ("backbone.02",)) == UseVerdict("used", "passes at backbone.02")
+    both = ("backbone.00", "kv.02", "backbone.02")
+    assert classify_use(True, found, None, both).reason == "passes at backbone.00, backbone.02; read at kv.02"
+    assert classify_use(True, found, None, ("kv.02",)).reason == "read at kv.02"
+    assert classify_use(True, found, None, ()).verdict == "inconclusive"
+    assert classify_use(True, found, None).verdict == "used"

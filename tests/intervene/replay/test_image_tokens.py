@@ -9,9 +9,9 @@ import pytest
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks.registry import find_family
-from probe_kit.intervene import ClosedLoop, Erase, Interchange, Source, Steer, intervene_on
-from probe_kit.intervene.replay.image_tokens import TILES, role_mask, tokens_seeing
-from probe_kit.intervene.replay.session import Bench, Question
+from probe_kit.intervene import ClosedLoop, ConceptErasure, Interchange, ReplaySource, Steering, run_intervention
+from probe_kit.intervene.replay.image_tokens import TILES, role_token_mask, tokens_overlapping
+from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
@@ -19,74 +19,74 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def question(bench: Bench, copy: Run) -> Question:
-    return bench.questions(str(copy.episodes["item_id"][0]))[0]
+def replay_input(session: ReplaySession, copy: Run) -> ReplayInput:
+    return session.replay_inputs(str(copy.episodes["item_id"][0]))[0]
 
 
-def test_pictures_differ_where_tiles_are_and_nowhere_else(question: Question) -> None:
+def test_pictures_differ_where_tiles_are_and_nowhere_else(replay_input: ReplayInput) -> None:
     """Up to light that tiles throw on nothing: there is none."""
-    differs = (question.seen.image != question.exchanged.image).any(axis=-1)
-    tiles = question.tiles["left"] | question.tiles["right"]
+    differs = (replay_input.seen.image != replay_input.exchanged.image).any(axis=-1)
+    tiles = replay_input.tiles["left"] | replay_input.tiles["right"]
     assert differs.any()
     assert not (differs & ~tiles).any()
-    assert not (question.tiles["left"] & question.tiles["right"]).any()
-    columns = {side: np.argwhere(mask)[:, 1].mean() for side, mask in question.tiles.items()}
+    assert not (replay_input.tiles["left"] & replay_input.tiles["right"]).any()
+    columns = {side: np.argwhere(mask)[:, 1].mean() for side, mask in replay_input.tiles.items()}
     assert columns["left"] < columns["right"]
 
 
-def test_the_patches_of_a_tile_lie_where_its_pixels_do(bench: Bench, question: Question) -> None:
+def test_the_patches_of_a_tile_lie_where_its_pixels_do(session: ReplaySession, replay_input: ReplayInput) -> None:
     """Across, the middle of the patches is the middle of the pixels."""
     middles = {}
     for role, side in TILES.items():
-        mask = role_mask(bench.policy, question, "backbone", role, {})
-        images = np.flatnonzero(bench.policy.roles([question.seen])["backbone"][0].mask("image"))
+        mask = role_token_mask(session.policy, replay_input, "backbone", role, {})
+        images = np.flatnonzero(session.policy.roles([replay_input.seen])["backbone"][0].mask("image"))
         assert 0 < mask.sum() < images.size / 2
         assert set(np.flatnonzero(mask)) <= set(images)
         grid = mask[images].reshape(6, 6)
         middles[side] = np.argwhere(grid).mean(axis=0)
-        high, wide = question.tiles[side].shape
-        pixels = np.argwhere(question.tiles[side]).mean(axis=0) / (high, wide)
+        high, wide = replay_input.tiles[side].shape
+        pixels = np.argwhere(replay_input.tiles[side]).mean(axis=0) / (high, wide)
         # A picture that is wider than high is padded above and below.
-        across = middles[side][1] + 0.5
-        assert abs(across - 6 * pixels[1]) < 1
+        lateral_offset = middles[side][1] + 0.5
+        assert abs(lateral_offset - 6 * pixels[1]) < 1
     assert middles["left"][0] < middles["right"][0]
 
 
 def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
-    bench: Bench, question: Question
+    session: ReplaySession, replay_input: ReplayInput
 ) -> None:
-    every = np.ones(question.seen.image.shape[:2], bool)
-    seeing = tokens_seeing(bench.policy, question.seen, every).reshape(6, 6)
+    every = np.ones(replay_input.seen.image.shape[:2], bool)
+    seeing = tokens_overlapping(session.policy, replay_input.seen, every).reshape(6, 6)
     assert seeing[1:5].all()
-    assert not tokens_seeing(bench.policy, question.seen, ~every).any()
-    nothing = replace(question, tiles=dict.fromkeys(("left", "right"), ~every))
+    assert not tokens_overlapping(session.policy, replay_input.seen, ~every).any()
+    nothing = replace(replay_input, tiles=dict.fromkeys(("left", "right"), ~every))
     with pytest.raises(EmptyRoleError, match="sees the left tile"):
-        role_mask(bench.policy, nothing, "backbone", "image.left", {})
+        role_token_mask(session.policy, nothing, "backbone", "image.left", {})
 
 
 def test_both_tiles_are_held_against_the_same_plain_patches(
-    bench: Bench, copy: Run, monkeypatch: pytest.MonkeyPatch
+    session: ReplaySession, copy: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (question, _) = bench.questions(str(copy.episodes["item_id"][0]))
-    act, seen = bench.policy.act, []
-    monkeypatch.setattr(bench.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
+    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
+    act, seen = session.policy.act, []
+    monkeypatch.setattr(session.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
     memo: dict[object, object] = {}
-    together = [role_mask(bench.policy, question, "backbone", role, memo) for role in TILES]
+    together = [role_token_mask(session.policy, replay_input, "backbone", role, memo) for role in TILES]
     assert len(seen) == 1 + len(TILES)
     for role, mask in zip(TILES, together, strict=True):
-        np.testing.assert_array_equal(mask, role_mask(bench.policy, question, "backbone", role, {}))
+        np.testing.assert_array_equal(mask, role_token_mask(session.policy, replay_input, "backbone", role, {}))
 
 
 def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy") -> None:
-    asked = Interchange(
-        categories=("color",), items=1, sites=("backbone.00", "memory.01", "expert.00@0"),
+    intervention = Interchange(
+        categories=("color",), items=1, sites=("backbone.00", "kv.01", "expert.00@0"),
         roles=("image", "image.left", "image.right"),
     )  # fmt: skip
-    effects = intervene_on(copy, asked, Source(small_suite.folder), load=lambda *_: twin)
+    effects = run_intervention(copy, intervention, ReplaySource(small_suite.folder), load=lambda *_: twin)
     said = effects.certificate["edits"]
     roles = ("image", *TILES)
-    assert set(said) == {f"{place}|{role}" for place in ("backbone.00", "memory.01") for role in roles}
-    for place, fires in (("backbone.00", 2), ("memory.01", 4)):
+    assert set(said) == {f"{place}|{role}" for place in ("backbone.00", "kv.01") for role in roles}
+    for place, fires in (("backbone.00", 2), ("kv.01", 4)):
         assert all(said[f"{place}|{role}"]["fires"] == fires for role in roles)
         assert said[f"{place}|image.left"]["largest_change"] > 0
         whole = said[f"{place}|image"]["largest"]
@@ -95,16 +95,16 @@ def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy"
 
 @pytest.mark.parametrize("family", ["xiaomi-r0", "magma", "internvla-m1"])
 def test_families_that_cannot_say_are_refused_by_name(family: str) -> None:
-    for asked in (Interchange(roles=("image.left",)), ClosedLoop(cells=("backbone.02|image.right",))):
-        assert "tiles" in asked.needs
+    for intervention in (Interchange(roles=("image.left",)), ClosedLoop(targets=("backbone.02|image.right",))):
+        assert "tiles" in intervention.required_capabilities
         with pytest.raises(UnsupportedInterventionError, match=f"{family} does not support.*tiles.*`image`"):
-            list(map(find_family(family).check_intervention, asked.needs))
+            list(map(find_family(family).check_intervention, intervention.required_capabilities))
 
 
 def test_what_needs_positions_or_means_is_not_asked_of_tiles() -> None:
     with pytest.raises(UsageError, match=r"image\.left is of other patches"):
-        Erase(sites=("backbone.02",), roles=("image.left",))
+        ConceptErasure(sites=("backbone.02",), roles=("image.left",))
     with pytest.raises(UsageError, match=r"image\.left has no mean"):
-        Steer(sites=("backbone.02",), role="image.left")
+        Steering(sites=("backbone.02",), role="image.left")
     with pytest.raises(UsageError, match="exchange them whole"):
         Interchange(roles=("image.right",), direction="mean-difference")

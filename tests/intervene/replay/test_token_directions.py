@@ -8,12 +8,12 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks import Site, capture
-from probe_kit.intervene import ClosedLoop, Interchange, Source, Steer, intervene_on
-from probe_kit.intervene.edits.linear_erasure import Method, Tokens
-from probe_kit.intervene.edits.sites import places
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.replay.token_directions import TokenAxes, bases_of
-from probe_kit.intervene.replay.token_features import Gathered, by_episode, fit_by_fold
+from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
+from probe_kit.intervene.edits.linear_erasure import Method, PaddedTokens
+from probe_kit.intervene.edits.sites import resolve_sites
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_directions import TokenDirections, fit_token_directions
+from probe_kit.intervene.replay.token_features import TokenFeatures, by_episode, fit_by_fold
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -22,7 +22,7 @@ SITE = Site("backbone", 2)
 GROUPS, POSITIONS, WIDTH = 10, 6, 12
 
 
-def marked(mark: np.ndarray, seed: int = 0) -> Gathered:
+def marked(mark: np.ndarray, seed: int = 0) -> TokenFeatures:
     """Four episodes per group: the first half of the tokens is marked for left, the second half for right."""
     draw = np.random.default_rng(seed)
     left = np.tile([True, False], 2 * GROUPS)
@@ -31,7 +31,7 @@ def marked(mark: np.ndarray, seed: int = 0) -> Gathered:
     values += np.where(left[:, None] == first, 0.5, -0.5)[..., None] * mark
     groups = np.repeat([f"g{number}" for number in range(GROUPS)], 4)
     names = tuple(f"episode-{row}" for row in range(left.size))
-    return Gathered(names, groups, left, Tokens(values, np.ones(values.shape[:2], bool)))
+    return TokenFeatures(names, groups, left, PaddedTokens(values, np.ones(values.shape[:2], bool)))
 
 
 def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
@@ -58,7 +58,7 @@ def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
     spoilt = own.tokens.values.copy()
     mine = own.groups == "g4"
     spoilt[mine] = 100 * np.random.default_rng(1).normal(size=spoilt[mine].shape)
-    other = Gathered(own.episodes, own.groups, own.left, Tokens(spoilt, own.tokens.present))
+    other = TokenFeatures(own.episodes, own.groups, own.left, PaddedTokens(spoilt, own.tokens.present))
     after = by_episode(other, fit_by_fold(other, SITE, "image", method, 1, 0, "color"))
     same = [
         np.array_equal(before[str(method)][name].removed, after[str(method)][name].removed)
@@ -68,27 +68,34 @@ def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
     assert not all(same)
 
 
-def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(bench: Bench, copy: Run) -> None:
+def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
+    session: ReplaySession, copy: Run
+) -> None:
     """Held against numpy's decomposition of the tokens that the policy has there."""
     items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))[:6]
-    (place,) = places("backbone.02", bench.policy)
+    (place,) = resolve_sites("backbone.02", session.policy)
     heard: list[tuple[int, int]] = []
-    bench.learning = lambda done, total, _: heard.append((done, total))
-    (axes,) = bases_of(bench, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
-    bench.learning = None
+    session.on_fit_progress = lambda done, total, _: heard.append((done, total))
+    (axes,) = fit_token_directions(session, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
+    session.on_fit_progress = None
     assert heard == [(done, len(items)) for done in range(1, len(items) + 1)]
-    assert isinstance(axes, TokenAxes)
-    questions = [question for item in items for question in bench.questions(item)]
+    assert isinstance(axes, TokenDirections)
+    replay_inputs = [replay_input for item in items for replay_input in session.replay_inputs(item)]
     rows = []
-    for question in questions:
-        with capture(bench.policy, [SITE]) as tape:
-            bench.act(question.seen, question.seed)
-        mask = bench.policy.token_roles([question.seen])["backbone"][0].mask("image")
+    for replay_input in replay_inputs:
+        with capture(session.policy, [SITE]) as tape:
+            session.act(replay_input.seen, replay_input.seed)
+        mask = session.policy.token_roles([replay_input.seen])["backbone"][0].mask("image")
         rows.append(tape[SITE][0].double().cpu().numpy()[mask])
-    values, left = np.array(rows), np.array([question.side_correct == "left" for question in questions])
-    chosen = {name: axes.basis("mean-difference:2", name, "color") for name in (q.episode_id for q in questions)}
-    episode = questions[0].episode_id
-    fold = np.array([np.array_equal(chosen[q.episode_id], chosen[episode]) for q in questions])
+    values, left = (
+        np.array(rows),
+        np.array([replay_input.side_correct == "left" for replay_input in replay_inputs]),
+    )
+    chosen = {
+        name: axes.basis("mean-difference:2", name, "color") for name in (q.episode_id for q in replay_inputs)
+    }
+    episode = replay_inputs[0].episode_id
+    fold = np.array([np.array_equal(chosen[q.episode_id], chosen[episode]) for q in replay_inputs])
     assert 0 < fold.sum() < fold.size
     differences = values[~fold & left].mean(axis=0) - values[~fold & ~left].mean(axis=0)
     _, _, expected = np.linalg.svd(differences, full_matrices=False)
@@ -99,17 +106,19 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(benc
     np.testing.assert_allclose(control @ basis.T, 0, atol=1e-5)
 
 
-def test_tokens_are_taken_over_along_them_and_along_controls(copy: Run, source: Source, twin: "Policy") -> None:
-    asked = Interchange(
+def test_tokens_are_taken_over_along_them_and_along_controls(
+    copy: Run, source: ReplaySource, twin: "Policy"
+) -> None:
+    intervention = Interchange(
         categories=("color",), items=2, sites=("backbone.02",), roles=("image",), direction="mean-difference:2",
         controls=1,
     )  # fmt: skip
-    effects = intervene_on(copy, asked, source, load=lambda *_: twin)
+    effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert [row.direction for row in effects.changes] == ["mean-difference:2", "control-1"]
     own, control = effects.changes
     assert own.fires == control.fires == 4
-    assert min(own.norm_ratio, control.norm_ratio) > 0
-    assert own.control_shift is not None
+    assert min(own.relative_change, control.relative_change) > 0
+    assert own.control_displacement is not None
 
 
 @pytest.mark.parametrize("direction", ["mean-difference:0", "mean-difference:x", "leace", "inlp:2", "zap"])
@@ -117,15 +126,15 @@ def test_tokens_are_taken_over_along_them_and_along_controls(copy: Run, source: 
     "asked",
     [
         lambda direction: Interchange(direction=direction),
-        lambda direction: ClosedLoop(cells=("backbone.02|image",), direction=direction),
-        lambda direction: Steer(sites=("backbone.02",), role="image", direction=direction),
+        lambda direction: ClosedLoop(targets=("backbone.02|image",), direction=direction),
+        lambda direction: Steering(sites=("backbone.02",), role="image", direction=direction),
     ],
 )
-def test_what_is_no_direction_is_refused_before_anything_is_loaded(asked: object, direction: str) -> None:
+def test_what_is_no_direction_is_refused_before_anything_is_loaded(intervention: object, direction: str) -> None:
     with pytest.raises(UsageError, match="direction"):
-        asked(direction)  # type: ignore[operator]
+        intervention(direction)  # type: ignore[operator]
 
 
 def test_no_dose_is_added_along_directions_of_tokens() -> None:
     with pytest.raises(UsageError, match="adds one vector to every token"):
-        Steer(sites=("backbone.02",), role="image", direction="mean-difference:1")
+        Steering(sites=("backbone.02",), role="image", direction="mean-difference:1")

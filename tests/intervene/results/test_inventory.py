@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.extract import Run, open_run
-from probe_kit.intervene import Erase, Follow
+from probe_kit.intervene import ConceptErasure, ImageSwap
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.results import effects_csv
 from probe_kit.intervene.store.answers import save
 from probe_kit.intervene.store.settings import key_of, settings_of
-from tests.intervene.answers import answers_of, follower
+from tests.intervene.answers import follower, outcomes_of
 
 
 @pytest.fixture
@@ -22,9 +22,9 @@ def run(little_runs: Path, tmp_path: Path) -> Run:
     return open_run(shutil.copytree(little_runs / "run", tmp_path / "run"))
 
 
-def store(run: Run, asked: Follow | Erase) -> str:
-    answers, settings = answers_of({"color": follower(24)}), settings_of(asked, run)
-    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {})
+def store(run: Run, intervention: ImageSwap | ConceptErasure) -> str:
+    outcomes, settings = outcomes_of({"color": follower(24)}), settings_of(intervention, run)
+    save(run.location, settings, key_of(settings), outcomes, effects_csv(outcomes, run.suite), {})
     return key_of(settings)
 
 
@@ -36,8 +36,8 @@ def shown(run: Run, *options: str) -> str:
 
 def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> None:
     (first,) = listed_interventions(run)
-    assert (first.kind, first.state, first.categories) == ("follow", "used", ("color",))
-    more, erased = store(run, Follow(items=12)), store(run, Erase(sites=("backbone.01",), controls=2))
+    assert (first.kind, first.state, first.categories) == ("image-swap", "used", ("color",))
+    more, erased = store(run, ImageSwap(items=12)), store(run, ConceptErasure(sites=("backbone.01",), controls=2))
     assert [(one.key, one.state) for one in listed_interventions(run)] == [
         (first.key, "other"), (more, "used"), (erased, "used"),
     ]  # fmt: skip

@@ -10,20 +10,28 @@ from probe_kit.extract import Run
 from probe_kit.hooks import Site
 from probe_kit.intervene import (
     ClosedLoop,
-    Effects,
-    Erase,
+    ConceptErasure,
     Interchange,
-    Source,
-    Steer,
-    intervene_on,
+    InterventionResult,
+    ReplaySource,
+    Steering,
     load_effects,
-    stored_passing,
+    run_intervention,
+    stored_site_effects,
 )
-from probe_kit.intervene.edits.patching import EVERY, Kept, Ledger, Replaced, ReplacedAlong, Tokens, _Patch
-from probe_kit.intervene.edits.pooled_directions import axes_of
-from probe_kit.intervene.edits.sites import places, token_mask
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.results.site_maps import keys_inside
+from probe_kit.intervene.edits.patching import (
+    EVERY,
+    EditLog,
+    Identity,
+    ReplaceInSubspace,
+    ReplaceWith,
+    TokenSelection,
+    _Patch,
+)
+from probe_kit.intervene.edits.pooled_directions import fit_directions
+from probe_kit.intervene.edits.sites import resolve_sites, token_mask
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.results.site_maps import keys_in_use
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -32,37 +40,37 @@ LAST = 3
 
 
 @pytest.fixture(scope="module")
-def whole(copy: Run, source: Source, twin: "Policy") -> Effects:
-    asked = Interchange(
+def whole(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+    intervention = Interchange(
         categories=("color",),
         items=2,
         sites=("backbone.00", "backbone.03", "expert.02@0-1"),
         roles=("all", "language"),
     )
-    return intervene_on(copy, asked, source, load=lambda *_: twin)
+    return run_intervention(copy, intervention, source, load=lambda *_: twin)
 
 
-def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: Effects) -> None:
-    answers = whole.answers
-    np.testing.assert_allclose(answers.of("backbone.00|all"), answers.of("exchanged"), atol=1e-6)
+def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: InterventionResult) -> None:
+    outcomes = whole.outcomes
+    np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
 
 
-def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: Effects) -> None:
+def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: InterventionResult) -> None:
     """The ledger tells it from hooks that missed: they fired, and moved what passed."""
     (row,) = (row for row in whole.changes if (row.place, row.role) == ("backbone.03", "all"))
-    assert row.changed == 0.0
-    assert (row.fires, row.still) == (4, 0)
-    assert row.norm_ratio > 0
+    assert row.max_action_change == 0.0
+    assert (row.fires, row.no_op_fires) == (4, 0)
+    assert row.relative_change > 0
     assert row.p_fwe == 1.0
 
 
-def test_words_are_the_same_before_and_after_the_exchange(whole: Effects) -> None:
+def test_words_are_the_same_before_and_after_the_exchange(whole: InterventionResult) -> None:
     """In the embeddings only pictures differ, so that taking the words over moves nothing."""
     said = whole.certificate["edits"]["backbone.00|language"]
     assert (said["fires"], said["still"], said["largest_change"]) == (4.0, 4.0, 0.0)
 
 
-def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: Effects) -> None:
+def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: InterventionResult) -> None:
     said = whole.certificate["edits"]["expert.02@0-1|all"]
     assert said["fires"] == 2 * 4
     assert "expert.02@0-1|language" not in whole.certificate["edits"]
@@ -72,53 +80,59 @@ def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: Effects) -
     ("sites", "roles", "role"),
     [
         (("backbone.02",), ("imgae",), "imgae"),
-        (("backbone.02",), ("image", "words"), "words"),
+        (("backbone.02",), ("image", "instruction-swap"), "instruction-swap"),
         (("backbone.02",), ("image.wrist",), "image.wrist"),
         (("expert.*",), ("language",), "language"),
-        (("memory.*",), ("action",), "action"),
+        (("kv.*",), ("action",), "action"),
     ],
 )
 def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
-    copy: Run, source: Source, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
+    copy: Run, source: ReplaySource, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
 ) -> None:
-    before = keys_inside(copy)
-    for asked in (
+    before = keys_in_use(copy)
+    for intervention in (
         Interchange(categories=("color",), items=1, sites=sites, roles=roles),
-        Erase(categories=("color",), items=1, sites=sites[:1], roles=roles),
-        ClosedLoop(categories=("color",), items=1, cells=(f"{sites[0]}|{role}",), direction="none", controls=0),
+        ConceptErasure(categories=("color",), items=1, sites=sites[:1], roles=roles),
+        ClosedLoop(categories=("color",), items=1, targets=(f"{sites[0]}|{role}",), direction="none", controls=0),
     ):
         with pytest.raises(UsageError, match=f"plays '{role}'; expected one of all, "):
-            intervene_on(copy, asked, source, load=lambda *_: twin)
-    assert keys_inside(copy) == before
+            run_intervention(copy, intervention, source, load=lambda *_: twin)
+    assert keys_in_use(copy) == before
 
 
-def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: Effects) -> None:
+def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: InterventionResult) -> None:
     assert load_effects(copy, kind="interchange").to_csv() == whole.to_csv()
-    assert {row.place for row in stored_passing(copy)["color"]} == {"backbone.00", "backbone.03", "expert.02@0-1"}
+    assert {row.place for row in stored_site_effects(copy)["color"]} == {
+        "backbone.00",
+        "backbone.03",
+        "expert.02@0-1",
+    }
 
 
 def test_an_interchange_along_a_direction_takes_no_maps_place(
-    copy: Run, source: Source, twin: "Policy", whole: Effects
+    copy: Run, source: ReplaySource, twin: "Policy", whole: InterventionResult
 ) -> None:
-    asked = Interchange(
+    intervention = Interchange(
         categories=("color",), items=1, sites=("backbone.02",), roles=("image",), direction="mean-difference"
     )
-    assert intervene_on(copy, asked, source, load=lambda *_: twin).key != whole.key
-    assert {row.key for row in stored_passing(copy)["color"]} == {whole.key}
+    assert run_intervention(copy, intervention, source, load=lambda *_: twin).key != whole.key
+    assert {row.key for row in stored_site_effects(copy)["color"]} == {whole.key}
 
 
 def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
-    copy: Run, source: Source, twin: "Policy"
+    copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
-    asked = Steer(categories=("color",), items=2, sites=("backbone.02",), role="image", doses=(2.0,), controls=1)
-    effects = intervene_on(copy, asked, source, load=lambda *_: twin)
+    intervention = Steering(
+        categories=("color",), items=2, sites=("backbone.02",), role="image", coefficients=(2.0,), controls=1
+    )
+    effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     edits = effects.certificate["edits"]
     assert edits["backbone.02|image|mean-difference|0"]["largest_change"] == 0.0
     own, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference", "control-1"))
     assert own["moved"] > 0
     assert control["moved"] == pytest.approx(own["moved"], rel=1e-4)
     assert own["largest"] == pytest.approx(own["moved"], rel=0.5)
-    assert {row.dose for row in effects.changes} == {"0", "2"}
+    assert {row.coefficient for row in effects.changes} == {"0", "2"}
 
 
 # -- along what ----------------------------------------------------------------------------------------------
@@ -126,7 +140,7 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
 
 def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Run) -> None:
     """Where it lies is planted; a probe's weights and controls are of length 1 as well."""
-    axes = axes_of(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
+    axes = fit_directions(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
     episodes = copy.episodes
     assert set(axes.fold_of) == set(episodes["episode_id"])
     name, category = str(episodes["episode_id"][0]), str(episodes["category"][0])
@@ -138,7 +152,7 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
     expected = features[others & left].mean(axis=0) - features[others & ~left].mean(axis=0)
     unit = axes.of("mean-difference", name, category)
     np.testing.assert_allclose(unit, expected / np.linalg.norm(expected), atol=1e-5)
-    assert axes.half_gap(name, category) == pytest.approx(np.linalg.norm(expected) / 2, rel=1e-5)
+    assert axes.half_difference(name, category) == pytest.approx(np.linalg.norm(expected) / 2, rel=1e-5)
     groups = dict(zip(episodes["episode_id"].astype(str), episodes["group_id"].astype(str), strict=True))
     assert not {groups[one] for one, of in axes.fold_of.items() if of == fold and one.startswith(category)} & {
         str(group) for group in episodes["group_id"][others]
@@ -151,13 +165,13 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
 
 def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
     with pytest.raises(UsageError, match="expected one of mean-difference, probe"):
-        axes_of(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
+        fit_directions(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
 
 
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
     episode, category = str(copy.episodes["episode_id"][0]), str(copy.episodes["category"][0])
     mean, probe = (
-        axes_of(copy, Site("backbone", 2), "image", name, 0, seed=0).of(name, episode, category)
+        fit_directions(copy, Site("backbone", 2), "image", name, 0, seed=0).of(name, episode, category)
         for name in ("mean-difference", "probe")
     )
     assert 0 < float(mean @ probe) < 0.999
@@ -170,14 +184,14 @@ def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     own, other = (torch.from_numpy(draw.normal(size=(5, 4)).astype(np.float32)) for _ in range(2))
     site, mask = Site("backbone", 0), np.array([True, False, True, True, True])
     basis = np.linalg.qr(draw.normal(size=(4, 4)))[0].astype(np.float32)
-    donor = {site: other[None]}
+    source = {site: other[None]}
     where = torch.from_numpy(np.flatnonzero(mask))
     taken = own[None, where]
-    whole = Replaced(donor, 5)(site, taken, where)  # type: ignore[arg-type]
+    whole = ReplaceWith(source, 5)(site, taken, where)  # type: ignore[arg-type]
     np.testing.assert_array_equal(whole[0].numpy(), other.numpy()[mask])
-    along = ReplacedAlong(donor, 5, basis)(site, taken, where)  # type: ignore[arg-type]
+    along = ReplaceInSubspace(source, 5, basis)(site, taken, where)  # type: ignore[arg-type]
     np.testing.assert_allclose(along.numpy(), whole.numpy(), atol=1e-5)
-    rank_one = ReplacedAlong(donor, 5, basis[:1])(site, taken, where)  # type: ignore[arg-type]
+    rank_one = ReplaceInSubspace(source, 5, basis[:1])(site, taken, where)  # type: ignore[arg-type]
     np.testing.assert_allclose(rank_one.numpy() @ basis[0], whole.numpy() @ basis[0], atol=1e-5)
     np.testing.assert_allclose(rank_one.numpy() @ basis[1], taken.numpy() @ basis[1], atol=1e-5)
 
@@ -186,29 +200,31 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     """Two fires of one shape, one of another; the second moves nothing. By hand."""
     import torch
 
-    ledger, pairs = Ledger(), dict[torch.Size, list[torch.Tensor]]()
+    edit_log, pairs = EditLog(), dict[torch.Size, list[torch.Tensor]]()
     one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
     for before, after in ((one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (one, one), (other, -other)):
         pairs.setdefault(before.shape, []).extend((before[None], after[None]))
-    _Patch(Tokens(2, EVERY), Kept(), pairs).into(ledger)
-    assert (ledger.fires, ledger.still) == (3, 1)
-    assert (ledger.norm, ledger.moved, ledger.largest) == (3.0 + 3.0 + 2.0, 3.0 + 0.0 + 4.0, 4.0)
-    _Patch(Tokens(2, EVERY), Kept()).into(empty := Ledger())
-    assert empty == Ledger()
+    _Patch(TokenSelection(2, EVERY), Identity(), pairs).into(edit_log)
+    assert (edit_log.fires, edit_log.no_op_fires) == (3, 1)
+    assert (edit_log.norm, edit_log.moved, edit_log.largest) == (3.0 + 3.0 + 2.0, 3.0 + 0.0 + 4.0, 4.0)
+    _Patch(TokenSelection(2, EVERY), Identity()).into(empty := EditLog())
+    assert empty == EditLog()
 
 
 # -- where ---------------------------------------------------------------------------------------------------
 
 
 def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
-    assert [place.name for place in places("backbone.*", twin)] == [f"backbone.{n:02d}" for n in range(LAST + 1)]
-    (some,) = places("expert.01@2-4", twin)
+    assert [place.name for place in resolve_sites("backbone.*", twin)] == [
+        f"backbone.{n:02d}" for n in range(LAST + 1)
+    ]
+    (some,) = resolve_sites("expert.01@2-4", twin)
     assert [site.iteration for site in some.sites] == [2, 3, 4]
-    (every,) = places("expert.01", twin)
+    (every,) = resolve_sites("expert.01", twin)
     assert len(every.sites) == twin.streams["expert"].iterations
     with pytest.raises(UnknownSiteError, match="each with directions of its own"):
         _ = every.only_site
-    (memory,) = places("memory.02", twin)
+    (memory,) = resolve_sites("kv.02", twin)
     with pytest.raises(UnknownSiteError, match="no direction is found; name a place of another stream"):
         _ = memory.only_site
 
@@ -216,14 +232,14 @@ def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
 @pytest.mark.parametrize("pattern", ["backbone.9", "backbone.00@1", "expert.01@9-12", "brain.01", "backbone", ""])
 def test_places_that_are_none_are_refused(twin: "Policy", pattern: str) -> None:
     with pytest.raises(UnknownSiteError):
-        places(pattern, twin)
+        resolve_sites(pattern, twin)
 
 
-def test_roles_that_no_token_plays_are_refused(bench: Bench, copy: Run) -> None:
-    (question, _) = bench.questions(str(copy.episodes["item_id"][0]))
-    assert token_mask(bench.policy, question.seen, "backbone", "image").sum() > 1
+def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run) -> None:
+    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
+    assert token_mask(session.policy, replay_input.seen, "backbone", "image").sum() > 1
     with pytest.raises(EmptyRoleError, match="language"):
-        token_mask(bench.policy, question.seen, "backbone", "smell")
+        token_mask(session.policy, replay_input.seen, "backbone", "smell")
 
 
 @pytest.mark.parametrize(
@@ -231,11 +247,11 @@ def test_roles_that_no_token_plays_are_refused(bench: Bench, copy: Run) -> None:
     [
         lambda: Interchange(sites=()),
         lambda: Interchange(controls=2),
-        lambda: Steer(sites=("backbone.02",), role="image", doses=(0.0,)),
-        lambda: Steer(sites=("backbone.02",), role="image", doses=(1.0, 1.0)),
-        lambda: Steer(sites=("backbone.02",), role="image", toward="up"),
+        lambda: Steering(sites=("backbone.02",), role="image", coefficients=(0.0,)),
+        lambda: Steering(sites=("backbone.02",), role="image", coefficients=(1.0, 1.0)),
+        lambda: Steering(sites=("backbone.02",), role="image", target_side="up"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(asked: object) -> None:
+def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
     with pytest.raises(UsageError):
-        asked()  # type: ignore[operator]
+        intervention()  # type: ignore[operator]

@@ -13,64 +13,77 @@ import pytest
 from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import read_bundles, write_bundle
 from probe_kit.hooks import Site
-from probe_kit.intervene import Answers, Weighed, best_cells, judgements, stored_attention, stored_following
+from probe_kit.intervene import (
+    AttentionShares,
+    ConditionOutcomes,
+    best_patch_targets,
+    classify_all,
+    stored_attention,
+    stored_image_swaps,
+)
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.results import effects_csv, effects_of
 from probe_kit.intervene.results.site_maps import (
-    stored_along,
-    stored_carriers,
-    stored_passing,
-    stored_places,
+    stored_carrying_directions,
+    stored_localised_sites,
+    stored_site_effects,
     stored_steering,
+    stored_subspace_effects,
 )
-from probe_kit.intervene.store.answers import WEIGHED, Stored, save
+from probe_kit.intervene.store.answers import ATTENTION_FILE, StoredIntervention, save
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.train import ArrayRun
-from tests.intervene.answers import answers_of, follower, habit
+from tests.intervene.answers import follower, habit, outcomes_of
 
 MANY, FEW = 24, 4
 Moves = Mapping[str, float]
 """By condition, the share of episodes that go where the exchange brings them."""
 
 
-def color(episodes: int = MANY) -> Answers:
-    return answers_of({"color": follower(episodes)})
+def color(episodes: int = MANY) -> ConditionOutcomes:
+    return outcomes_of({"color": follower(episodes)})
 
 
-def unmoved(answers: Answers) -> Answers:
+def unmoved(outcomes: ConditionOutcomes) -> ConditionOutcomes:
     """Where the pictures change nothing."""
-    return replace(answers, lateral=np.stack([answers.of("plain")] * 2))
+    return replace(outcomes, displacement=np.stack([outcomes.of("clean")] * 2))
 
 
-def moved(answers: Answers, moves: Moves) -> Answers:
-    turned = np.arange(answers.episodes.size)
+def moved(outcomes: ConditionOutcomes, moves: Moves) -> ConditionOutcomes:
+    turned = np.arange(outcomes.episodes.size)
     rows = [
-        np.where(turned < share * turned.size, answers.of("exchanged"), answers.of("plain"))
+        np.where(turned < share * turned.size, outcomes.of("image_swap"), outcomes.of("clean"))
         for share in moves.values()
     ]
-    lateral = np.vstack([answers.lateral, *rows])
+    displacement = np.vstack([outcomes.displacement, *rows])
     return replace(
-        answers,
-        conditions=(*answers.conditions, *moves),
-        lateral=lateral,
-        changed=np.abs(lateral - lateral[0]),
-        ledger=np.ones((*lateral.shape, 5)),
+        outcomes,
+        conditions=(*outcomes.conditions, *moves),
+        displacement=displacement,
+        max_action_change=np.abs(displacement - displacement[0]),
+        edit_log=np.ones((*displacement.shape, 5)),
     )
 
 
-def noted(episodes: int, *roles: str) -> tuple[Answers, dict[str, bytes]]:
-    answers = color(episodes)
+def attention_records(episodes: int, *roles: str) -> tuple[ConditionOutcomes, dict[str, bytes]]:
+    outcomes = color(episodes)
     mass = np.full((episodes, 2, 1, 1, len(roles)), 1 / episodes, np.float32)
-    weighed = Weighed(
-        roles, answers.episodes, answers.groups, answers.categories, answers.sides, np.zeros(episodes, int), mass
+    weighed = AttentionShares(
+        roles,
+        outcomes.episodes,
+        outcomes.groups,
+        outcomes.categories,
+        outcomes.sides,
+        np.zeros(episodes, int),
+        mass,
     )
-    return answers, {WEIGHED: weighed.to_bytes()}
+    return outcomes, {ATTENTION_FILE: weighed.to_bytes()}
 
 
-def ended(answers: Answers) -> Answers:
+def ended(outcomes: ConditionOutcomes) -> ConditionOutcomes:
     """Carried out, with nothing turned."""
-    changed = moved(answers, {"backbone.02|image": 0.0})
-    return replace(changed, outcomes=np.full(changed.lateral.shape, "correct"))
+    changed = moved(outcomes, {"backbone.02|image": 0.0})
+    return replace(changed, episode_outcomes=np.full(changed.displacement.shape, "correct"))
 
 
 CONTROL = "backbone.02|image|control-1"
@@ -78,22 +91,22 @@ WRONG = {"toward": "wrong", "direction": "mean-difference", "seed": 0}
 STEERED = {"backbone.01|image|mean-difference|0": 0.0, "backbone.01|image|mean-difference|2": 0.5}
 MAP = {"backbone.00|all": 1.0, "backbone.00|image": 1.0, "backbone.02|all": 1.0, "backbone.02|image": 1.0,
        "backbone.10|all": 0.0}  # fmt: skip
-POOL: dict[str, tuple[str, dict[str, Any], Callable[[], Answers]]] = {
-    "follow": ("follow", {}, lambda: answers_of({"color": follower(MANY), "shape": habit(MANY)})),
-    "follow, few": ("follow", {"items": 2}, lambda: color(FEW)),
-    "follow, shadow": ("follow", {"readout": "shadow"}, lambda: unmoved(color())),
-    "words": ("words", {}, lambda: unmoved(color())),
+POOL: dict[str, tuple[str, dict[str, Any], Callable[[], ConditionOutcomes]]] = {
+    "image-swap": ("image-swap", {}, lambda: outcomes_of({"color": follower(MANY), "shape": habit(MANY)})),
+    "follow, few": ("image-swap", {"items": 2}, lambda: color(FEW)),
+    "follow, shadow": ("image-swap", {"readout": "per-step"}, lambda: unmoved(color())),
+    "instruction-swap": ("instruction-swap", {}, lambda: unmoved(color())),
     "map": ("interchange", {"direction": "none"}, lambda: moved(color(), MAP)),
     "map, few": ("interchange", {"direction": "none", "items": 2},
                  lambda: moved(color(FEW), dict.fromkeys(MAP, 0.0))),
-    "map, shadow": ("interchange", {"direction": "none", "readout": "shadow"},
+    "map, shadow": ("interchange", {"direction": "none", "readout": "per-step"},
                     lambda: moved(unmoved(color()), {"backbone.00|all": 0.0})),
     "end": ("interchange", {"direction": "none", "sites": "backbone.10"},
             lambda: moved(color(), {"backbone.10|all": 0.0, "backbone.10|image": 0.0})),
     "tiles": ("interchange", {"direction": "none", "roles": ["image.left"]},
               lambda: moved(color(), {"backbone.02|image.left": 0.0})),
-    "memory": ("interchange", {"direction": "none", "sites": "memory.*"},
-               lambda: moved(color(), {"memory.00|all": 0.0, "memory.02|all": 1.0})),
+    "kv": ("interchange", {"direction": "none", "sites": "kv.*"},
+               lambda: moved(color(), {"kv.00|all": 0.0, "kv.02|all": 1.0})),
     "expert": ("interchange", {"direction": "none", "sites": "expert.03@0"},
                lambda: moved(color(), {"expert.03@0|all": 0.0})),
     "along": ("interchange", {"direction": "mean-difference", "seed": 0},
@@ -121,12 +134,12 @@ SHARES = {"attention": (MANY, "all", "image"), "attention, few": (FEW, "all", "i
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> ArrayRun:
-    answers = answers_of({"color": follower(MANY), "shape": habit(MANY)})
+    outcomes = outcomes_of({"color": follower(MANY), "shape": habit(MANY)})
     episodes = pd.DataFrame(
         {
-            "episode_id": answers.episodes, "item_id": answers.items, "group_id": answers.groups,
-            "category": answers.categories, "side_correct": answers.sides, "layout": "original",
-            "outcome": "correct", "side_placed": answers.sides,
+            "episode_id": outcomes.episodes, "item_id": outcomes.items, "group_id": outcomes.groups,
+            "category": outcomes.categories, "side_correct": outcomes.sides, "layout": "original",
+            "outcome": "correct", "side_placed": outcomes.sides,
         }
     )  # fmt: skip
     blank = np.zeros((len(episodes), 1))
@@ -142,18 +155,18 @@ def settings_of(run: ArrayRun, name: str) -> dict[str, Any]:
     categories = list(dict.fromkeys(make().categories.tolist()))
     return {
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": categories, "readout": "chunk", **own,
+        "categories": categories, "readout": "first-chunk", **own,
     }  # fmt: skip
 
 
 def store(run: ArrayRun, name: str) -> None:
     kind, own, make = POOL[name]
-    answers, further = noted(*SHARES[name]) if name in SHARES else (make(), {})
+    outcomes, further = attention_records(*SHARES[name]) if name in SHARES else (make(), {})
     settings = settings_of(run, name)
-    toward = str(own.get("toward", "exchanged"))
-    written = effects_csv(answers, run.suite, toward, kind, further)
+    target_side = str(own.get("toward", "image_swap"))
+    written = effects_csv(outcomes, run.suite, target_side, kind, further)
     check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
-    save(run.location, settings, key_of(settings), answers, written, {"replay": check}, further)
+    save(run.location, settings, key_of(settings), outcomes, written, {"replay": check}, further)
 
 
 def made_in(run: ArrayRun, names: list[str]) -> None:
@@ -166,15 +179,15 @@ def made_in(run: ArrayRun, names: list[str]) -> None:
 
 def read(run: ArrayRun) -> dict[str, Any]:
     """Every quantity that verdicts, tables and figures take from what is stored."""
-    found, encoded = stored_following(run), {"color": True, "shape": True}
+    found, encoded = stored_image_swaps(run), {"color": True, "shape": True}
     return {
         "follows": found,
-        "maps": stored_passing(run),
-        "along": stored_along(run),
+        "maps": stored_site_effects(run),
+        "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
         "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
-        "verdicts": judgements(found, encoded, stored_places(run), stored_carriers(run)),
-        "cells": best_cells(run, ["color"]),
+        "verdicts": classify_all(found, encoded, stored_localised_sites(run), stored_carrying_directions(run)),
+        "cells": best_patch_targets(run, ["color"]),
     }
 
 
@@ -206,23 +219,23 @@ def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
     verdict = seen["verdicts"]["color"]
     assert verdict.verdict == "used"
     assert verdict.reason == (
-        "passes at backbone.00, backbone.02; read at memory.02; carried by mean-difference at backbone.02 image"
+        "passes at backbone.00, backbone.02; read at kv.02; carried by mean-difference at backbone.02 image"
     )
     assert seen["verdicts"]["shape"].verdict == "encoded, unused"
-    assert (seen["follows"]["color"].follows, seen["follows"]["color"].n_episodes) == (1.0, MANY)
+    assert (seen["follows"]["color"].follow_rate, seen["follows"]["color"].n_episodes) == (1.0, MANY)
     cells = [(row.place, row.role, row.net) for row in seen["maps"]["color"]]
     assert cells == [
         ("backbone.00", "all", 1.0), ("backbone.00", "image", 1.0), ("backbone.02", "all", 1.0),
         ("backbone.02", "image", 1.0), ("backbone.02", "image.left", 0.0), ("backbone.10", "all", 0.0),
-        ("backbone.10", "image", 0.0), ("expert.03@0", "all", 0.0), ("memory.00", "all", 0.0),
-        ("memory.02", "all", 1.0),
+        ("backbone.10", "image", 0.0), ("expert.03@0", "all", 0.0), ("kv.00", "all", 0.0),
+        ("kv.02", "all", 1.0),
     ]  # fmt: skip
     assert {row.n_episodes for row in seen["maps"]["color"]} == {MANY}
     assert [row.direction for row in seen["along"]["color"]] == [
         "control-1", "mean-difference", "control-1", "probe",
     ]  # fmt: skip
-    doses = {name: [row.dose for row in rows] for name, rows in seen["steering"]["color"].items()}
-    assert doses == {
+    coefficients = {name: [row.coefficient for row in rows] for name, rows in seen["steering"]["color"].items()}
+    assert coefficients == {
         "backbone.01 image, toward left": ["2"], "backbone.01 image": ["0", "2", "4"], "backbone.02 image": ["2"],
     }  # fmt: skip
     assert stored_attention(run)["color"].roles == ("all", "image")
@@ -239,7 +252,7 @@ def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
 
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
     key = key_of(settings_of(run, "follow, few"))
-    effects = effects_of(run, Stored(read_bundles(run.location, INTERVENTIONS)[key]))
+    effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
     assert effects.rows[0].n_episodes == FEW
     assert effects.verdicts["color"].verdict == "inconclusive"
 
@@ -252,9 +265,9 @@ def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun
         (["along a probe"], None),
         (["along"], None),
         (["end"], ()),
-        (["end", "memory"], ("memory.02",)),
-        (["memory", "tiles", "expert"], ("memory.02",)),
-        (["map", "memory"], ("backbone.00", "backbone.02", "memory.02")),
+        (["end", "kv"], ("kv.02",)),
+        (["kv", "tiles", "expert"], ("kv.02",)),
+        (["map", "kv"], ("backbone.00", "backbone.02", "kv.02")),
     ],
 )
 def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
@@ -264,4 +277,4 @@ def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
     alone = replace(run, path=tmp_path)
     for name in names:
         store(alone, name)
-    assert stored_places(alone).get("color") == said
+    assert stored_localised_sites(alone).get("color") == said

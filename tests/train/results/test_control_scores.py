@@ -1,6 +1,6 @@
 import json
 
-from probe_kit.train import BaselineScore, Controls, ControlComparison, TwinScore
+from probe_kit.train import BaselineScore, ControlComparison, Controls, TwinScore
 from probe_kit.train.results.control_scores import has_signal
 
 

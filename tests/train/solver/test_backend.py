@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.train.solver.backend import check_device, array_namespace, to_device, to_numpy
+from probe_kit.train.solver.backend import array_namespace, check_device, to_device, to_numpy
 
 
 def test_numpy_arrays_stay_where_they_are_without_a_device() -> None:

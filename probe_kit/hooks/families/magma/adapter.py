@@ -19,7 +19,7 @@ from torch import Tensor
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.model import Policy, Prompt, AnswerModel, Reading, Tap
+from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -30,7 +30,7 @@ from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import MAPS
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, memory_tap
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
 from probe_kit.hooks.families.shared.sampling import chooser
 from probe_kit.models.magma import (
     ACTION_QUESTION,
@@ -87,7 +87,7 @@ class Magma(Policy, AnswerModel):
             name: Stream(name, len(stage.blocks) + 1, _width(stage), part="vision", quantities=("residual",))
             for name, stage in self._stages.items()
         }
-        self.memory = kept_prompt(self.config.text)
+        self.prompt_kv = kept_prompt(self.config.text)
         self.role_names = {
             "backbone": (f"image.{CAMERA}", SEPARATOR, "language", "special", PADDING),
             "action": ("action",),
@@ -303,8 +303,8 @@ class Magma(Policy, AnswerModel):
         `vision_<k>`: maps of stage k as tokens, one row per crop; the last one is the stage's output.
         """
         stream = self.stream_of(site)
-        if stream is self.memory:
-            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
         if stream.part == "vision":
             blocks = self._stages[site.stream].blocks
             if site.layer == len(blocks):

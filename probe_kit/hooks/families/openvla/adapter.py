@@ -62,7 +62,7 @@ class OpenVLA(PrismaticModel, Policy):
         resize: str = "pil",
     ) -> None:
         super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
-        self.memory = kept_prompt(self.config.text)
+        self.prompt_kv = kept_prompt(self.config.text)
         self.statistics, self.template, self.crop = statistics, prompt, crop
         self.temperature, self.resize = temperature, resize
         self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)

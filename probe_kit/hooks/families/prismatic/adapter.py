@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.model import Model, Prompt, AnswerModel, Reading, Tap
+from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -27,7 +27,7 @@ from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, memory_tap
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kv_tap
 from probe_kit.hooks.families.shared.sampling import Choose, greedy
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
 from probe_kit.models.packing import Packed
@@ -172,8 +172,8 @@ class PrismaticModel(Model):
         A tower's last residual is what the projector reads, class and register tokens in front.
         """
         stream = self.stream_of(site)
-        if stream is self.memory:
-            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
         if stream.part == "vision":
             return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
         return self._language_tap(site)

@@ -8,7 +8,7 @@ from probe_kit.hooks.contract.sites import QUANTITIES
 FLOW = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},
     unread=("backbone",),
-    memory=True,
+    prompt_kv=True,
     attention=True,
     tiles=True,
 )
@@ -17,11 +17,11 @@ FLOW = Interventions(
 TOKENS = Interventions(
     edits={"backbone": QUANTITIES, "action": QUANTITIES},
     unread=("backbone",),
-    memory=True,
+    prompt_kv=True,
     attention=True,
     first_affected_token=1,
     tiles=True,
-    readout="shadow",
+    readout="per-step",
 )
 """One decoder reads the prompt and puts out tokens; the prompt's own pass chooses the first of them."""
 

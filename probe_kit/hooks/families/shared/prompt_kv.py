@@ -1,48 +1,48 @@
-"""What the families share whose acting part reads keys and values of the prompt: see `Model.memory`."""
+"""What the families share whose acting part reads keys and values of the prompt: see `Model.prompt_kv`."""
 
 from typing import Any
 
 from torch import nn
 
 from probe_kit.hooks.contract.model import HeadsTap
-from probe_kit.hooks.contract.sites import Site, Stream, memory_stream
-from probe_kit.models.prompt_kv import Memory
+from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
+from probe_kit.models.prompt_kv import PromptKV
 
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
 """Where the last token of the prompt already belongs to what acts: its keys and values are not the backbone's."""
 
 
-def memory_tap(memory: Memory, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
+def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
     """Where the keys or values of one block pass. tokens: of the prompt, those of the backbone."""
-    passages: nn.ModuleList = getattr(memory, site.quantity)
+    passages: nn.ModuleList = getattr(kv, site.quantity)
     return HeadsTap(passages[site.layer], 1, tokens=tokens)
 
 
 def kept_prompt(text: Any) -> Stream:
-    """The memory of a decoder of transformers' configuration `text`."""
+    """The kv of a decoder of transformers' configuration `text`."""
     heads = int(getattr(text, "num_key_value_heads", None) or text.num_attention_heads)
     size = int(getattr(text, "head_dim", None) or text.hidden_size // text.num_attention_heads)
-    return memory_stream(int(text.num_hidden_layers), heads * size)
+    return kv_stream(int(text.num_hidden_layers), heads * size)
 
 
-def attach_prompt_kv(joint: Any, blocks: int) -> Memory:
-    """The memory of lerobot's `joint`, whose pass over the prompt leaves its keys and values there from now on.
+def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
+    """The kv of lerobot's `joint`, whose pass over the prompt leaves its keys and values there from now on.
 
     lerobot calls its `forward` by name, past all hooks, so the instance gets one that sends the cache through.
     """
-    if isinstance(getattr(joint, "memory", None), Memory):
-        kept: Memory = joint.memory
+    if isinstance(getattr(joint, "prompt_kv", None), PromptKV):
+        kept: PromptKV = joint.prompt_kv
         return kept
-    memory, forward = Memory(blocks), joint.forward
-    joint.memory = memory
+    kv, forward = PromptKV(blocks), joint.forward
+    joint.prompt_kv = kv
 
     def reading(*arguments: Any, **keywords: Any) -> Any:
         result = forward(*arguments, **keywords)
         embeddings = keywords["inputs_embeds"]
         if embeddings[1] is None:  # only the prompt: what follows is made of what is kept here
-            memory(result[1].layers)
+            kv(result[1].layers)
         return result
 
     joint.forward = reading
-    return memory
+    return kv

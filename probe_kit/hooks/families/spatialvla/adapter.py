@@ -30,7 +30,7 @@ from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, memory_tap
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
 from probe_kit.hooks.families.spatialvla.speech import Speech
 from probe_kit.models.packing import Packed
@@ -95,7 +95,7 @@ class SpatialVLA(Policy):
         self.further_streams = {
             "vision": Stream("vision", seeing, int(self.config.vision.hidden_size), part="vision")
         }
-        self.memory = kept_prompt(self.config.text)
+        self.prompt_kv = kept_prompt(self.config.text)
         self.role_names = {
             "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
             "action": ("action",),
@@ -268,8 +268,8 @@ class SpatialVLA(Policy):
         Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not.
         """
         stream = self.stream_of(site)
-        if stream is self.memory:
-            return memory_tap(self.network.memory, site, ALL_BUT_LAST)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
         if stream.part == "vision":
             return _vision_tap(self.tower, site)
         tokens = _PROMPT if stream.part == "backbone" else _LAST

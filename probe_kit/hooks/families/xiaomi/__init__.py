@@ -11,7 +11,7 @@ from probe_kit.hooks.families.shared.capabilities import MERGED
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": ("residual", "attention", "middle", "mlp")},
     unread=("backbone",),
-    memory=True,
+    prompt_kv=True,
     attention=True,
     instead={"tiles": f"{MERGED}Exchange all of `image`"},
 )

@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.shared.attention_weights import Note, weighed
 from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
-from probe_kit.hooks.families.shared.prompt_kv import memory_tap
+from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
 from probe_kit.models.qwen import QwenInputs
@@ -93,7 +93,7 @@ class Xiaomi(QwenVLA):
             ),
         }
         self.further_streams = {"vision": self.vision_stream()}
-        self.memory = self.backbone_memory()
+        self.prompt_kv = self.backbone_kv()
         self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
         self.card = self._card(filled, checkpoint, tokenizer)
 
@@ -232,8 +232,8 @@ class Xiaomi(QwenVLA):
     def tap(self, site: Site) -> Tap:
         """See the module's first lines; the backbone's sites are inputs: they hold what DeepStack added."""
         stream = self.stream_of(site)
-        if stream is self.memory:
-            return memory_tap(self.network.memory, site)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network.prompt_kv, site)
         if stream.name == "backbone":
             return self.backbone_tap(site)
         return self.vision_tap(site) if stream.name == "vision" else self._expert_tap(site)

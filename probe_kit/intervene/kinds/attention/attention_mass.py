@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
-from probe_kit.intervene.store.answers import ATTENTION, WEIGHED, Stored
-from probe_kit.intervene.store.selection import Told, told_of
+from probe_kit.intervene.store.answers import ATTENTION, ATTENTION_FILE, StoredIntervention
+from probe_kit.intervene.store.selection import StoredResult, stored_results
 from probe_kit.statistics.bootstrap import GAINS, units_seed
 from probe_kit.statistics.student import student_interval
 from probe_kit.train.data.run_reader import RunReader
@@ -30,7 +30,7 @@ Shares = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Weighed:
+class AttentionShares:
     """Attention of N inferences. roles: names of R, the first one `all`.
 
     episodes, groups, categories, sides: (N,), `sides` those of the correct picture. calls: (N,) inference of the
@@ -60,11 +60,11 @@ class Weighed:
         return cls(**{**found, "roles": tuple(map(str, found["roles"]))})
 
     @classmethod
-    def of(cls, stored: Stored) -> Self | None:
+    def of(cls, stored: StoredIntervention) -> Self | None:
         """What one stored intervention noted; None of another kind. Raises RunDamagedError if it was changed."""
         if stored.settings["kind"] != ATTENTION:
             return None
-        return cls.from_bytes(stored.bundle.read(WEIGHED))
+        return cls.from_bytes(stored.bundle.read(ATTENTION_FILE))
 
     def only(self, chosen: NDArray[np.bool_]) -> Self:
         """Some of the inferences. chosen: (N,)."""
@@ -85,7 +85,7 @@ class Weighed:
             found |= {CORRECT: np.where(is_left, left, right), OTHER: np.where(is_left, right, left)}
         return {**found, OWN: 1 - found[ALL]} if ALL in found else found
 
-    def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[Attending]":
+    def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
         """One per category, role and place along the axes `by`; means over the others, every episode alike.
 
         Raises UsageError for an axis that does not exist.
@@ -105,10 +105,10 @@ class Weighed:
         import pandas as pd
 
         unused = [axis for axis in get_args(Axis) if axis not in by]
-        columns = [own.name for own in fields(Attending)]
+        columns = [own.name for own in fields(AttentionRow)]
         return pd.DataFrame([asdict(row) for row in self.rows(by)], columns=columns).drop(columns=unused)
 
-    def toward_correct(self, suite: str) -> "dict[int, tuple[float, tuple[float, float]]]":
+    def correct_minus_other(self, suite: str) -> "dict[int, tuple[float, tuple[float, float]]]":
         """By block, the share on the correct picture's tile minus the other's, with its 95 % interval by groups.
 
         Of one category; a mean over iterations, heads and calls. Empty without tiles.
@@ -129,7 +129,7 @@ class Weighed:
             found[block] = float(values.mean()), limits
         return found
 
-    def _rows(self, category: str, call: int | None, by: Sequence[Axis]) -> "list[Attending]":
+    def _rows(self, category: str, call: int | None, by: Sequence[Axis]) -> "list[AttentionRow]":
         episodes, _ = self._episodes()
         over = tuple(at for axis, at in _AXES.items() if axis not in by)
         found = []
@@ -142,7 +142,7 @@ class Weighed:
                         zip((axis for axis in _AXES if axis in by), map(int, place), strict=True)
                     )
                     named: dict[str, Any] = {"category": category, "role": role, "call": call}
-                    found.append(Attending(**named, **at, share=float(share), n_episodes=len(every)))
+                    found.append(AttentionRow(**named, **at, share=float(share), n_episodes=len(every)))
         return found
 
     def _episodes(self) -> tuple[NDArray[np.int64], NDArray[np.str_]]:
@@ -152,7 +152,7 @@ class Weighed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attending:
+class AttentionRow:
     """How much attention lies on one role's tokens, in one category: a share, of 1 in all.
 
     block, iteration, head, call: of which; None for the mean over all.
@@ -168,25 +168,25 @@ class Attending:
     n_episodes: int
 
 
-def stored_attention(run: RunReader) -> dict[str, Weighed]:
+def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
     """By category, the one of most episodes, and of these of most roles; empty if there is none.
 
     Raises RunDamagedError.
     """
-    return {category: weighed for category, (_, weighed) in foremost_attention(run).items()}
+    return {category: weighed for category, (_, weighed) in preferred_attention(run).items()}
 
 
-def foremost_attention(run: RunReader) -> dict[str, tuple[Told, Weighed]]:
+def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, AttentionShares]]:
     """`stored_attention`, and of which stored intervention each is."""
-    found: dict[str, tuple[Told, Weighed]] = {}
-    read: dict[str, Weighed] = {}
-    for told in told_of(run, ATTENTION):
-        key, before = told.stored.key, found.get(told.category)
+    found: dict[str, tuple[StoredResult, AttentionShares]] = {}
+    read: dict[str, AttentionShares] = {}
+    for result in stored_results(run, ATTENTION):
+        key, before = result.stored.key, found.get(result.category)
         if key not in read:
-            read[key] = Weighed.from_bytes(told.stored.bundle.read(WEIGHED))
-        weighed = read[key].only(read[key].categories == told.category)
-        if before is None or (before[0].rank, len(before[1].roles)) <= (told.rank, len(weighed.roles)):
-            found[told.category] = told, weighed
+            read[key] = AttentionShares.from_bytes(result.stored.bundle.read(ATTENTION_FILE))
+        weighed = read[key].only(read[key].categories == result.category)
+        if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(weighed.roles)):
+            found[result.category] = result, weighed
     return found
 
 

@@ -17,11 +17,18 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.edits.sites import ALL, roles_of
-from probe_kit.intervene.kinds.attention.attention_mass import Weighed
-from probe_kit.intervene.replay.conditions import Condition, Intervention, Plain, Played, Replayed, Turn
-from probe_kit.intervene.replay.image_tokens import TILES, role_mask
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.store.answers import ATTENTION, NOTED, WEIGHED
+from probe_kit.intervene.kinds.attention.attention_mass import AttentionShares
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    Intervention,
+    ReplayBatch,
+)
+from probe_kit.intervene.replay.image_tokens import TILES, role_token_mask
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.store.answers import ATTENTION, ATTENTION_FILE, RECORDED
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -32,7 +39,7 @@ ROLES = ("image", *TILES, "language", "state", "special")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attention(Intervention):
+class AttentionReadout(Intervention):
     """Two inferences per episode, or with the readout `shadow` per call of it: plain, and noted.
 
     roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always noted:
@@ -52,22 +59,22 @@ class Attention(Intervention):
         return ATTENTION
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """A family that tells it; and which tokens see a tile, where that is asked by name."""
         return ("attention", *(("tiles",) if set(self.roles) & set(TILES) else ()))
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Of whose tokens."""
         return {"roles": list(self.roles)}
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """As the run made it, and the same with its attention noted. Raises UsageError for a role it lacks."""
-        return Plain(), Noting(backbone_of(bench.policy), self._roles(bench.policy))
+        return CleanRun(), AttentionRecorded(backbone_of(session.policy), self._roles(session.policy))
 
-    def told(self, conditions: Sequence[Condition], found: Replayed) -> dict[str, Any]:
+    def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
         """What the axes of the stored array are. Raises CaptureChangedActionError if noting changed an action."""
-        (noting,) = (one for one in conditions if isinstance(one, Noting))
-        largest = float(found.changed.max(initial=0.0))
+        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
+        largest = float(found.max_action_change.max(initial=0.0))
         if largest:
             raise CaptureChangedActionError(
                 f"with its attention noted an action differs by {largest:.3g}; expected the same bit for bit. The "
@@ -77,14 +84,14 @@ class Attention(Intervention):
         inferences, blocks, iterations, heads, _ = found.mass.shape
         return {
             ATTENTION: {
-                "stream": noting.stream, "roles": list(noting.roles), "inferences": inferences, "blocks": blocks,
+                "stream": recording.stream, "roles": list(recording.roles), "inferences": inferences, "blocks": blocks,
                 "iterations": iterations, "heads": heads, "largest_change": largest,
             }
         }  # fmt: skip
 
-    def files(self, run: Run, conditions: Sequence[Condition], found: Replayed) -> dict[str, bytes]:
+    def extra_files(self, run: Run, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, bytes]:
         """The attention of every inference."""
-        (noting,) = (one for one in conditions if isinstance(one, Noting))
+        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
         assert found.mass is not None
         assert found.inferences is not None
         rows = run.episodes.iloc[found.inferences[:, 0]]
@@ -95,8 +102,10 @@ class Attention(Intervention):
                 ("sides", "side_correct"),
             )
         }  # fmt: skip
-        noted = Weighed(noting.roles, **columns, calls=found.inferences[:, 1], mass=found.mass)
-        return {WEIGHED: noted.to_bytes()}
+        attention_records = AttentionShares(
+            recording.roles, **columns, calls=found.inferences[:, 1], mass=found.mass
+        )
+        return {ATTENTION_FILE: attention_records.to_bytes()}
 
     def _roles(self, policy: "Policy") -> tuple[str, ...]:
         stream = backbone_of(policy)
@@ -112,32 +121,32 @@ class Attention(Intervention):
 
 
 @dataclass(frozen=True)
-class Noting:
+class AttentionRecorded:
     """The plain inference with somebody who notes what attention is paid. stream: whose tokens are weighed."""
 
     stream: str
     roles: tuple[str, ...]
-    name: str = NOTED
+    name: str = RECORDED
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Nothing is changed."""
         from probe_kit.hooks.capturing.attention import capture_attention
 
-        question, bench = turn.question, turn.bench
-        masks = [self._mask(turn, role) for role in self.roles]
-        with capture_attention(bench.policy) as mass:
-            chunk = bench.act(question.seen, question.seed)
-        return Played(chunk, mass=by_role(mass, masks))
+        replay_input, session = context.replay_input, context.session
+        masks = [self._mask(context, role) for role in self.roles]
+        with capture_attention(session.policy) as mass:
+            chunk = session.act(replay_input.seen, replay_input.seed)
+        return ConditionResult(chunk, mass=shares_by_role(mass, masks))
 
-    def _mask(self, turn: Turn, role: str) -> NDArray[np.bool_] | None:
+    def _mask(self, context: ConditionContext, role: str) -> NDArray[np.bool_] | None:
         """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
         try:
-            return role_mask(turn.bench.policy, turn.question, self.stream, role, turn.memo)
+            return role_token_mask(context.session.policy, context.replay_input, self.stream, role, context.memo)
         except EmptyRoleError:
             return None
 
 
-def by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
+def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
     """(B, I, H, R) shares by block, iteration, head and role.
 
     NaN where a block is not read in an iteration, and of a role that nobody plays. Of one observation. masks: (T,)

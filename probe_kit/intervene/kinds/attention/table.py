@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.edits.sites import TILE_ROLES
-from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Weighed
+from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, AttentionShares
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import ResponsiveTable
@@ -16,15 +16,15 @@ _LEGEND = (
 )
 
 
-def weighed_table(weighed: Weighed, suite: str, of: str) -> "ResponsiveTable":
+def weighed_table(weighed: AttentionShares, suite: str, of: str) -> "ResponsiveTable":
     """One line per category and block of the backbone that is read. of: model, suite."""
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
     names, shares, sides = [], [], []
     rows = weighed.rows(("block",))
     roles = [role for role in dict.fromkeys(row.role for row in rows) if role not in (CORRECT, OTHER)]
     for category, own in weighed.by_category():
-        apart = own.toward_correct(suite)
+        apart = own.correct_minus_other(suite)
         blocks = dict.fromkeys(row.block for row in rows if row.category == category)
         for block in blocks:
             found = {row.role: row.share for row in rows if (row.category, row.block) == (category, block)}

@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.kinds.image_swap.effects import WORTH, net_interval
-from probe_kit.intervene.kinds.site_effects import Named, beyond_controls, controls_of, ledger_sums
-from probe_kit.intervene.store.answers import PLAIN, Answers
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.site_effects import ConditionName, beyond_controls, controls_of, ledger_sums
+from probe_kit.intervene.store.answers import CLEAN, ConditionOutcomes
 from probe_kit.statistics.mcnemar import sign_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 
-BROKEN = 0.5
+MIN_IN_ZONE_RATIO = 0.5
 """Share of the plain in-zone share below which a hand is called broken."""
 CORRECT, WRONG = "correct", "wrong"
 Finding = Literal["dose 0", "control", "hand broken", "confirmed", "not confirmed"]
 
 
 @dataclass(frozen=True)
-class CarriedOut:
+class ClosedLoopEffect:
     """What one change did to whole episodes, in one category.
 
     correct, wrong, in_zone: shares of episodes. wrong_in_zone: share of wrong ones among those in a zone; None if
@@ -61,24 +61,24 @@ class CarriedOut:
     t: float | None
     p: float | None
     p_fwe: float | None
-    hand_broken: bool
-    changed: float
+    disrupted: bool
+    max_action_change: float
     fires: int
-    still: int
-    norm_ratio: float
+    no_op_fires: int
+    relative_change: float
     key: str = ""
 
     @property
     def finding(self) -> Finding:
         """`confirmed` if, beyond its controls and chance, enough episodes turn to the other picture."""
-        if self.place == PLAIN:
+        if self.place == CLEAN:
             return "dose 0"
-        if self.hand_broken:
+        if self.disrupted:
             return "hand broken"
         if self.is_control:
             return "control"
         beyond = self.net - (self.control_net or 0.0)
-        turned = self.p_fwe is not None and self.p_fwe < SIGNIFICANCE and beyond >= WORTH
+        turned = self.p_fwe is not None and self.p_fwe < SIGNIFICANCE and beyond >= SMALLEST_EFFECT_OF_INTEREST
         return "confirmed" if turned else "not confirmed"
 
     @property
@@ -91,44 +91,44 @@ class CarriedOut:
         return {**asdict(self), "finding": self.finding}
 
 
-def carried_out(answers: Answers, suite: str, key: str = "") -> list[CarriedOut]:
+def closed_loop_effects(outcomes: ConditionOutcomes, suite: str, key: str = "") -> list[ClosedLoopEffect]:
     """One per category and condition, dose 0 first. suite: its identity, of which intervals are drawn."""
-    return [row for category, own in answers.by_category() for row in _of_category(own, category, suite, key)]
+    return [row for category, own in outcomes.by_category() for row in _of_category(own, category, suite, key)]
 
 
-def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[CarriedOut]:
-    assert answers.outcomes is not None
-    names = [Named.of(condition) for condition in answers.conditions]
-    wrong = (answers.outcomes == WRONG).astype(float)
-    in_zone = np.isin(answers.outcomes, (CORRECT, WRONG)).mean(axis=1)
-    broken = in_zone < BROKEN * in_zone[0]
+def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: str) -> list[ClosedLoopEffect]:
+    assert outcomes.episode_outcomes is not None
+    names = [ConditionName.of(condition) for condition in outcomes.conditions]
+    wrong = (outcomes.episode_outcomes == WRONG).astype(float)
+    in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
+    broken = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
     net = wrong - wrong[0]
     controls = [[at for at in own if not broken[at]] for own in controls_of(names)]
     tested = [
-        at for at, name in enumerate(names) if name.place != PLAIN and not name.is_control and not broken[at]
+        at for at, name in enumerate(names) if name.place != CLEAN and not name.is_control and not broken[at]
     ]
-    found = _tests(answers, category, suite, net, controls, tested)
+    found = _tests(outcomes, category, suite, net, controls, tested)
     rows = []
     for at, name in enumerate(names):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
         t, p, p_fwe = found.get(at, (None, None, None))
         rows.append(
-            CarriedOut(
+            ClosedLoopEffect(
                 category=category,
                 place=name.place,
                 role=name.role,
                 direction=name.direction,
                 is_control=name.is_control,
                 n_episodes=wrong.shape[1],
-                n_items=np.unique(answers.items).size,
-                correct=float((answers.outcomes[at] == CORRECT).mean()),
+                n_items=np.unique(outcomes.items).size,
+                correct=float((outcomes.episode_outcomes[at] == CORRECT).mean()),
                 wrong=float(wrong[at].mean()),
                 in_zone=float(in_zone[at]),
                 wrong_in_zone=float(wrong[at].mean() / in_zone[at]) if in_zone[at] else None,
                 net=float(net[at].mean()),
-                net_ci=net_interval(net[at], answers, suite),
-                net_left=_mean(net[at][answers.sides == "right"]),
-                net_right=_mean(net[at][answers.sides == "left"]),
+                net_ci=net_interval(net[at], outcomes, suite),
+                net_left=_mean(net[at][outcomes.sides == "right"]),
+                net_right=_mean(net[at][outcomes.sides == "left"]),
                 control_net=float(net[controls[at]].mean()) if controls[at] else None,
                 gained=gained,
                 lost=lost,
@@ -136,17 +136,17 @@ def _of_category(answers: Answers, category: str, suite: str, key: str) -> list[
                 t=t,
                 p=p,
                 p_fwe=p_fwe,
-                hand_broken=bool(broken[at]),
-                changed=float(answers.changed[at].max()),
+                disrupted=bool(broken[at]),
+                max_action_change=float(outcomes.max_action_change[at].max()),
                 key=key,
-                **ledger_sums(answers.ledger[at]),
+                **ledger_sums(outcomes.edit_log[at]),
             )
         )
     return rows
 
 
 def _tests(
-    answers: Answers,
+    outcomes: ConditionOutcomes,
     category: str,
     suite: str,
     net: NDArray[np.float64],
@@ -158,7 +158,7 @@ def _tests(
         return {}
     beyond = beyond_controls(net, controls, tested)
     seed = derive_seed("sign flips", suite, category)
-    values = zip(*max_t(beyond, answers.items, answers.groups, seed), strict=True)
+    values = zip(*max_t(beyond, outcomes.items, outcomes.groups, seed), strict=True)
     return {at: (float(t), float(p), float(p_fwe)) for at, (t, p, p_fwe) in zip(tested, values, strict=True)}
 
 

@@ -14,16 +14,28 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.patching import Kept, Ledger, Tokens, patched
+from probe_kit.intervene.edits.patching import EditLog, Identity, TokenSelection, apply_patch
 from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
-from probe_kit.intervene.edits.sites import ALL, Place, places, token_mask
-from probe_kit.intervene.kinds.interchange.intervention import NONE, TakenOver, along, needed
-from probe_kit.intervene.replay.conditions import Condition, Exchanged, Intervention, Played, Replayed, Turn
+from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, token_mask
+from probe_kit.intervene.kinds.interchange.intervention import (
+    NONE,
+    PatchedFromSource,
+    capabilities_for,
+    patches_within,
+)
+from probe_kit.intervene.replay.conditions import (
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ImagesSwapped,
+    Intervention,
+    ReplayBatch,
+)
 from probe_kit.intervene.replay.image_tokens import TILES
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.replay.token_directions import Bases, bases_of, check_direction
-from probe_kit.intervene.store.answers import PLAIN
-from probe_kit.intervene.store.settings import CHUNK, items_of
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
+from probe_kit.intervene.store.answers import CLEAN
+from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
 
 CELL = "|"
 KIND = "closed-loop"
@@ -31,24 +43,24 @@ KIND = "closed-loop"
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop(Intervention):
-    """Interchange at a few cells, carried out: dose zero, exchanged pictures, every cell, and its controls.
+    """Interchange at a few targets, carried out: dose zero, exchanged pictures, every target, and its controls.
 
-    cells: `PLACE|ROLE`, such as `backbone.02|image`; see `best_cells`. direction: as of an `Interchange`; along it
-    a cell is taken over as well, beside `controls` random ones of the data's own covariance, where a place is one
-    site and the role no tile; `none` for neither. The tokens of every cell are also taken over whole.
+    targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of an `Interchange`; along it
+    a target is taken over as well, beside `controls` random ones of the data's own covariance, where a place is one
+    site and the role no tile; `none` for neither. The tokens of every target are also taken over whole.
     """
 
-    cells: tuple[str, ...]
+    targets: tuple[str, ...]
     direction: str = f"{MEAN_DIFFERENCE}:1"
     controls: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.readout != CHUNK:
+        if self.readout != FIRST_CHUNK:
             raise UsageError("a closed loop is read where the cube ends; leave --readout out")
-        if not self.cells or any(cell.count(CELL) != 1 for cell in self.cells):
-            raise UsageError(f"cells are {self.cells}; expected PLACE|ROLE, such as backbone.02|image")
+        if not self.targets or any(target.count(CELL) != 1 for target in self.targets):
+            raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
         if self.direction != NONE:
             check_direction(self.direction)
         elif self.controls:
@@ -60,87 +72,91 @@ class ClosedLoop(Intervention):
         return KIND
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """Edits; and a memory, where one of its places is."""
-        sites, roles = zip(*map(self._split, self.cells), strict=True)
-        return needed(sites, roles)
+        sites, roles = zip(*map(self._split, self.targets), strict=True)
+        return capabilities_for(sites, roles)
 
     @property
-    def learns(self) -> bool:
+    def fits_first(self) -> bool:
         """Where its direction is of tokens."""
         return ":" in self.direction
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Where and along what; it is read where the cube ends."""
         return {
-            "readout": "episode", "cells": list(self.cells), "direction": self.direction,
+            "readout": "episode", "targets": list(self.targets), "direction": self.direction,
             "controls": self.controls, "seed": self.seed,
         }  # fmt: skip
 
-    def chosen(self, run: Run) -> tuple[str, ...]:
+    def categories_in(self, run: Run) -> tuple[str, ...]:
         """Its categories. Raises UsageError for outcomes by another rule than they were recorded by."""
         if run.rule != DEFAULT_RULE:
             raise UsageError(
                 f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
                 f"recorded: open the run without another rule ({DEFAULT_RULE})"
             )
-        return super().chosen(run)
+        return super().categories_in(run)
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
-        """Dose zero, exchanged pictures, and every cell. Raises UnknownSiteError, NoProbesError."""
-        split = [self._split(cell) for cell in self.cells]
-        tried = [(place, role) for pattern, role in split for place in places(pattern, bench.policy)]
-        donors = tuple(dict.fromkeys(site for place, _ in tried for site in place.sites))
-        bases = self._bases(bench, tried)
-        found: list[Condition] = [DoseZero(donors), Exchanged()]
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
+        """Dose zero, exchanged pictures, and every target. Raises UnknownSiteError, NoProbesError."""
+        split = [self._split(target) for target in self.targets]
+        tried = [(place, role) for pattern, role in split for place in resolve_sites(pattern, session.policy)]
+        source_sites = tuple(dict.fromkeys(site for place, _ in tried for site in place.sites))
+        bases = self._bases(session, tried)
+        found: list[Condition] = [IdentityPatch(source_sites), ImagesSwapped()]
         for place, role in tried:
-            found.append(TakenOver(place, role, donors))
+            found.append(PatchedFromSource(place, role, source_sites))
             if (place, role) in bases:
-                found += along(self.direction, bases[place, role], place, role, donors)
+                found += patches_within(self.direction, bases[place, role], place, role, source_sites)
         return found
 
-    def play(self, bench: Bench, item: str, conditions: Sequence[Condition]) -> Replayed:
+    def play(self, session: ReplaySession, item: str, conditions: Sequence[Condition]) -> ReplayBatch:
         """The item's episodes, each under every condition, from its first step to its last."""
         from probe_kit.intervene.replay.rollout import play
 
-        return play(bench, bench.questions(item), conditions)
+        return play(session, session.replay_inputs(item), conditions)
 
-    def _bases(self, bench: Bench, tried: Sequence[tuple[Place, str]]) -> Mapping[tuple[Place, str], Bases]:
-        """Of the cells that have directions."""
-        wanted: dict[Place, list[str]] = {}
+    def _bases(
+        self, session: ReplaySession, tried: Sequence[tuple[SiteGroup, str]]
+    ) -> Mapping[tuple[SiteGroup, str], DirectionBasis]:
+        """Of the targets that have directions."""
+        wanted: dict[SiteGroup, list[str]] = {}
         for place, role in tried:
             if self.direction != NONE and len(place.sites) == 1 and role not in TILES:
                 wanted.setdefault(place, []).append(role)
-        items = items_of(bench.run, replace(self, items=None))
-        return bases_of(bench, items, wanted, self.direction, self.controls, self.seed)
+        items = items_of(session.run, replace(self, items=None))
+        return fit_token_directions(session, items, wanted, self.direction, self.controls, self.seed)
 
     @staticmethod
-    def _split(cell: str) -> tuple[str, str]:
-        place, _, role = cell.partition(CELL)
+    def _split(target: str) -> tuple[str, str]:
+        place, _, role = target.partition(CELL)
         return place, role
 
 
 @dataclass(frozen=True)
-class DoseZero:
+class IdentityPatch:
     """As the run made it, with every site that any condition changes written back as it was."""
 
     sites: tuple[Site, ...]
-    name: str = PLAIN
+    name: str = CLEAN
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Hooks fire, and nothing moves."""
-        bench, seen = turn.bench, turn.question.seen
+        session, seen = context.session, context.replay_input.seen
         with ExitStack() as stack:
-            ledgers = [
+            edit_logs = [
                 stack.enter_context(
-                    patched(
-                        bench.policy,
+                    apply_patch(
+                        session.policy,
                         [site for site in self.sites if site.stream == stream],
-                        Tokens.of(token_mask(bench.policy, seen, stream, ALL), bench.policy.card.device),
-                        Kept(),
+                        TokenSelection.of(
+                            token_mask(session.policy, seen, stream, ALL), session.policy.card.device
+                        ),
+                        Identity(),
                     )
                 )
                 for stream in dict.fromkeys(site.stream for site in self.sites)
             ]
-            chunk = bench.act(seen, turn.question.seed)
-        return Played(chunk, Ledger.sum(ledgers))
+            chunk = session.act(seen, context.replay_input.seed)
+        return ConditionResult(chunk, EditLog.sum(edit_logs))

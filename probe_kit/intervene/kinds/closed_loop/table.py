@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.closed_loop.effects import BROKEN, CarriedOut
-from probe_kit.intervene.kinds.image_swap.effects import WORTH
-from probe_kit.intervene.store.answers import PLAIN
+from probe_kit.intervene.kinds.closed_loop.effects import MIN_IN_ZONE_RATIO, ClosedLoopEffect
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
+from probe_kit.intervene.store.answers import CLEAN
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
 _LEGEND = (
     "every episode played again, same scene and seeds, with the change at every inference; in a zone: whichever "
     "picture; turned: share of episodes that end on the wrong picture, minus that at dose 0; p: family-wise, of "
-    f"what goes beyond the controls, one-sided; confirmed: p < 0.05 and {WORTH} beyond the controls; hand broken: "
-    f"in a zone less than {BROKEN:g} times as often as at dose 0, and then in no verdict"
+    f"what goes beyond the controls, one-sided; confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; hand broken: "
+    f"in a zone less than {MIN_IN_ZONE_RATIO:g} times as often as at dose 0, and then in no verdict"
 )
 
 
-def carried_out_table(rows: Sequence[CarriedOut], of: str) -> "ResponsiveTable":
+def carried_out_table(rows: Sequence[ClosedLoopEffect], of: str) -> "ResponsiveTable":
     """One line per category and condition, dose 0 first. of: which model, on which suite."""
-    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     return ResponsiveTable(
         title=f"Is it so when carried out? {of}",
         caption=_LEGEND,
         name="category · change",
-        names=tuple(f"{row.category} · {'dose 0' if row.place == PLAIN else row.name}" for row in rows),
+        names=tuple(f"{row.category} · {'dose 0' if row.place == CLEAN else row.name}" for row in rows),
         styles=tuple("bold" if row.finding == "confirmed" else "" for row in rows),
         parts=(
             Part(
@@ -43,17 +43,17 @@ def carried_out_table(rows: Sequence[CarriedOut], of: str) -> "ResponsiveTable":
     )
 
 
-def _ends(row: CarriedOut) -> "tuple[Cell, ...]":
+def _ends(row: ClosedLoopEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
     shares = (row.correct, row.wrong, row.in_zone, row.wrong_in_zone)
     return tuple(Cell("–" if share is None else f"{100 * share:.1f}") for share in shares)
 
 
-def _against(row: CarriedOut) -> "tuple[Cell, ...]":
+def _against(row: ClosedLoopEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
-    if row.place == PLAIN:
+    if row.place == CLEAN:
         return (*(Cell("–") for _ in range(5)), Cell(row.finding))
     low, high = row.net_ci
     texts = (

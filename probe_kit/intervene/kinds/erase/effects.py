@@ -8,9 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.kinds.image_swap.effects import WORTH, net_interval
-from probe_kit.intervene.kinds.site_effects import HALF, Named, beyond_controls, controls_of, ledger_sums
-from probe_kit.intervene.store.answers import PLAIN, Answers
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.site_effects import (
+    LOCALISATION_SHARE,
+    ConditionName,
+    beyond_controls,
+    controls_of,
+    ledger_sums,
+)
+from probe_kit.intervene.store.answers import CLEAN, ConditionOutcomes
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -21,7 +27,7 @@ _NOTHING: Readable = {}
 
 
 @dataclass(frozen=True)
-class Erasing:
+class ErasureEffect:
     """What was left of an answer in the action once it was erased at one place, in one category.
 
     right_before, right: share of episodes whose action goes to the correct picture's side, without and with the
@@ -46,18 +52,18 @@ class Erasing:
     kept: float | None
     net: float
     net_ci: tuple[float, float]
-    shift: float
+    mean_displacement: float
     control_kept: float | None
     control_net: float | None
-    control_shift: float | None
+    control_displacement: float | None
     p: float | None
     p_fwe: float | None
-    readable_before: float | None
-    readable: float | None
-    changed: float
+    probe_accuracy_before: float | None
+    probe_accuracy: float | None
+    max_action_change: float
     fires: int
-    still: int
-    norm_ratio: float
+    no_op_fires: int
+    relative_change: float
     key: str = ""
 
     @property
@@ -70,9 +76,9 @@ class Erasing:
         if self.kept is None:
             return "nothing to lose"
         beside = 1.0 if self.control_kept is None else self.control_kept
-        if beside < HALF:
+        if beside < LOCALISATION_SHARE:
             return "controls break too"
-        gone = self.p is not None and self.p < SIGNIFICANCE and beside - self.kept >= WORTH
+        gone = self.p is not None and self.p < SIGNIFICANCE and beside - self.kept >= SMALLEST_EFFECT_OF_INTEREST
         return "lost" if gone else "kept"
 
     @property
@@ -85,59 +91,65 @@ class Erasing:
         return {**asdict(self), "finding": self.finding}
 
 
-def erased(answers: Answers, suite: str, key: str = "", readable: Readable = _NOTHING) -> list[Erasing]:
+def erasure_effects(
+    outcomes: ConditionOutcomes, suite: str, key: str = "", probe_accuracy: Readable = _NOTHING
+) -> list[ErasureEffect]:
     """One per category and condition. readable: by condition and category, as a certificate has it."""
     return [
-        row for category, own in answers.by_category() for row in _of_category(own, category, suite, key, readable)
+        row
+        for category, own in outcomes.by_category()
+        for row in _of_category(own, category, suite, key, probe_accuracy)
     ]
 
 
-def _of_category(answers: Answers, category: str, suite: str, key: str, readable: Readable) -> list[Erasing]:
-    toward = answers.toward
-    plain = toward * answers.of(PLAIN)
-    conditions = [name for name in answers.conditions if name != PLAIN]
-    names = [Named.of(condition) for condition in conditions]
-    values = np.array([toward * answers.of(condition) for condition in conditions])
+def _of_category(
+    outcomes: ConditionOutcomes, category: str, suite: str, key: str, probe_accuracy: Readable
+) -> list[ErasureEffect]:
+    target_side = outcomes.correct_sign
+    plain = target_side * outcomes.of(CLEAN)
+    conditions = [name for name in outcomes.conditions if name != CLEAN]
+    names = [ConditionName.of(condition) for condition in conditions]
+    values = np.array([target_side * outcomes.of(condition) for condition in conditions])
     controls = controls_of(names)
-    tested = [at for at, name in enumerate(names) if not name.is_control and not name.dose]
+    tested = [at for at, name in enumerate(names) if not name.is_control and not name.coefficient]
     away = plain - values
     beyond = beyond_controls(away, controls, tested)
-    _, _, p_fwe = max_t(beyond, answers.items, answers.groups, derive_seed("sign flips", suite, category))
+    _, _, p_fwe = max_t(beyond, outcomes.items, outcomes.groups, derive_seed("sign flips", suite, category))
     place_of = {at: row for row, at in enumerate(tested)}
-    goes_there = paired_greater_p(plain, answers.items, answers.groups) < SIGNIFICANCE
+    goes_there = paired_greater_p(plain, outcomes.items, outcomes.groups) < SIGNIFICANCE
     kept = values.sum(axis=1) / plain.sum() if goes_there else None
     net = (plain > 0).astype(float) - (values > 0)
     rows = []
     for at, (condition, name) in enumerate(zip(conditions, names, strict=True)):
-        row, beside = answers.conditions.index(condition), controls[at]
+        row, beside = outcomes.conditions.index(condition), controls[at]
         tested_at = place_of.get(at)
         rows.append(
-            Erasing(
+            ErasureEffect(
                 category=category,
                 place=name.place,
                 role=name.role,
                 direction=name.direction,
                 is_control=name.is_control,
                 n_episodes=plain.size,
-                n_items=np.unique(answers.items).size,
+                n_items=np.unique(outcomes.items).size,
                 right_before=float((plain > 0).mean()),
                 right=float((values[at] > 0).mean()),
                 kept=None if kept is None else float(kept[at]),
                 net=float(net[at].mean()),
-                net_ci=net_interval(net[at], answers, suite),
-                shift=float(away[at].mean()),
+                net_ci=net_interval(net[at], outcomes, suite),
+                mean_displacement=float(away[at].mean()),
                 control_kept=_mean(kept, beside),
                 control_net=_mean(net.mean(axis=1), beside),
-                control_shift=_mean(away.mean(axis=1), beside),
+                control_displacement=_mean(away.mean(axis=1), beside),
                 p=None
                 if tested_at is None
-                else paired_greater_p(beyond[tested_at], answers.items, answers.groups),
+                else paired_greater_p(beyond[tested_at], outcomes.items, outcomes.groups),
                 p_fwe=None if tested_at is None else float(p_fwe[tested_at]),
-                readable_before=readable.get(f"{name.place}|{name.role}|none|0", {}).get(category),
-                readable=readable.get(condition, {}).get(category),
-                changed=float(answers.changed[row].max()),
+                probe_accuracy_before=probe_accuracy.get(f"{name.place}|{name.role}|none|0", {}).get(category),
+                probe_accuracy=probe_accuracy.get(condition, {}).get(category),
+                max_action_change=float(outcomes.max_action_change[row].max()),
                 key=key,
-                **ledger_sums(answers.ledger[row]),
+                **ledger_sums(outcomes.edit_log[row]),
             )
         )
     return rows

@@ -15,15 +15,27 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.linear_erasure import Eraser, Method, Tokens
-from probe_kit.intervene.edits.patching import Kept, Where, patched
-from probe_kit.intervene.edits.sites import Place, places, roles_of
-from probe_kit.intervene.replay.conditions import Condition, Intervention, Plain, Played, Replayed, Turn
+from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens
+from probe_kit.intervene.edits.patching import Identity, TokenIndex, apply_patch
+from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    Intervention,
+    ReplayBatch,
+)
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.replay.token_features import Gathered, by_episode, fit_by_fold, gather
-from probe_kit.intervene.store.answers import ERASE, READABLE
-from probe_kit.intervene.store.settings import CHUNK, items_of
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_features import (
+    TokenFeatures,
+    by_episode,
+    collect_token_features,
+    fit_by_fold,
+)
+from probe_kit.intervene.store.answers import ERASE, PROBE_ACCURACY
+from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
 from probe_kit.statistics.folds import Fold
 
 if TYPE_CHECKING:
@@ -33,7 +45,7 @@ LEACE, UNTOUCHED = "leace", "none|0"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Erase(Intervention):
+class ConceptErasure(Intervention):
     """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
 
     sites: patterns of places of one site each. roles: whose tokens. method: see `train.erasure.Method`. controls:
@@ -49,7 +61,7 @@ class Erase(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.readout != CHUNK:
+        if self.readout != FIRST_CHUNK:
             raise UsageError("what erases is fitted on the first inference; leave --readout out")
         if not self.sites or not self.roles:
             raise UsageError("erasing needs at least one site and one role")
@@ -66,92 +78,99 @@ class Erase(Intervention):
         return ERASE
 
     @property
-    def learns(self) -> bool:
+    def fits_first(self) -> bool:
         """Always."""
         return True
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Where, how and beside how many controls."""
         return {
             "sites": list(self.sites), "roles": list(self.roles), "method": self.method,
             "controls": self.controls, "seed": self.seed,
         }  # fmt: skip
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Plain, then every place and role at dose 0, erased, and with its controls. Raises UnknownSiteError."""
-        found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
-        wanted = {place: roles_of(bench.policy, place.stream, self.roles) for place in found.values()}
+        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
         if not any(wanted.values()):
             raise UsageError(f"no token of {', '.join(found)} plays {', '.join(self.roles)}")
-        cells: dict[tuple[Place, str], _Cell] = {}
-        for place, role, category, own in gather(bench, items_of(bench.run, self), wanted):
-            self._fit(cells.setdefault((place, role), _Cell()), place, role, category, own)
-        return [Plain(), *(erased for (place, role), cell in cells.items() for erased in cell.at(place, role))]
+        cells: dict[tuple[SiteGroup, str], _FittedErasers] = {}
+        for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
+            self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
+        return [CleanRun(), *(erased for (place, role), cell in cells.items() for erased in cell.at(place, role))]
 
-    def told(self, conditions: Sequence[Condition], found: Replayed) -> dict[str, Any]:
+    def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
         """How well a fresh probe reads the answer behind each condition, by category."""
         del found
-        return {READABLE: {one.name: dict(one.readable) for one in conditions if isinstance(one, Erased)}}
+        return {
+            PROBE_ACCURACY: {
+                one.name: dict(one.probe_accuracy) for one in conditions if isinstance(one, ErasedCondition)
+            }
+        }
 
-    def _fit(self, cell: "_Cell", place: Place, role: str, category: str, own: Gathered) -> None:
+    def _fit(self, cell: "_FittedErasers", place: SiteGroup, role: str, category: str, own: TokenFeatures) -> None:
         """Add one category's erasers, and what is readable with each and without."""
         fits = fit_by_fold(own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category)
         folds = [fold for fold, _ in fits]
-        cell.readable.setdefault(UNTOUCHED, {})[category] = _readable(own, folds, None)
+        cell.probe_accuracy.setdefault(UNTOUCHED, {})[category] = _probe_accuracy(own, folds, None)
         for name, of_episode in by_episode(own, fits).items():
             cell.erasers.setdefault(name, {}).update(of_episode)
             fitted = [by_name[name] for _, by_name in fits]
-            cell.readable.setdefault(name, {})[category] = _readable(own, folds, fitted)
+            cell.probe_accuracy.setdefault(name, {})[category] = _probe_accuracy(own, folds, fitted)
 
 
 @dataclass(frozen=True)
-class Erased:
+class ErasedCondition:
     """The tokens of one role at one place, without what an eraser takes away.
 
     erasers: by episode, fitted without it; empty to write back what is there. readable: by category, the held-out
     accuracy of a probe fitted on what is left, of the mean over tokens.
     """
 
-    place: Place
+    place: SiteGroup
     role: str
     what: str
     erasers: Mapping[str, Eraser] = field(repr=False)
-    readable: Mapping[str, float]
+    probe_accuracy: Mapping[str, float]
 
     @property
     def name(self) -> str:
         """Place, role and what is taken away, apart by `|`."""
         return f"{self.place.name}|{self.role}|{self.what}"
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """The plain inference without it."""
-        question, bench = turn.question, turn.bench
-        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
-        change = Without(self.erasers[question.episode_id]) if self.erasers else Kept()
-        with patched(bench.policy, self.place.sites, tokens, change) as ledger:
-            chunk = bench.act(question.seen, question.seed)
-        return Played(chunk, ledger)
+        replay_input, session = context.replay_input, context.session
+        tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
+        change = ApplyEraser(self.erasers[replay_input.episode_id]) if self.erasers else Identity()
+        with apply_patch(session.policy, self.place.sites, tokens, change) as edit_log:
+            chunk = session.act(replay_input.seen, replay_input.seed)
+        return ConditionResult(chunk, edit_log)
 
 
 @dataclass
-class _Cell:
+class _FittedErasers:
     """One place and role. erasers: by name and episode. readable: by name and category."""
 
     erasers: dict[str, dict[str, Eraser]] = field(default_factory=dict)
-    readable: dict[str, dict[str, float]] = field(default_factory=dict)
+    probe_accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
 
-    def at(self, place: Place, role: str) -> list[Erased]:
+    def at(self, place: SiteGroup, role: str) -> list[ErasedCondition]:
         """Untouched first, then every eraser."""
-        return [Erased(place, role, name, self.erasers.get(name, {}), own) for name, own in self.readable.items()]
+        return [
+            ErasedCondition(place, role, name, self.erasers.get(name, {}), own)
+            for name, own in self.probe_accuracy.items()
+        ]
 
 
 @dataclass(frozen=True)
-class Without:
+class ApplyEraser:
     """What an eraser leaves; tokens beyond those it was fitted on stay as they are."""
 
     eraser: Eraser
 
-    def __call__(self, site: Site, own: "Tensor", where: Where) -> "Tensor":
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
         """Computed in float64, as it was fitted."""
         import torch
 
@@ -163,7 +182,7 @@ class Without:
         return after
 
 
-def _readable(own: Gathered, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
+def _probe_accuracy(own: TokenFeatures, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
     """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
@@ -178,7 +197,7 @@ def _readable(own: Gathered, folds: Sequence[Fold], erasers: Sequence[Eraser] | 
     return right / own.left.size
 
 
-def _pooled(tokens: Tokens, eraser: Eraser | None) -> NDArray[np.float64]:
+def _pooled(tokens: PaddedTokens, eraser: Eraser | None) -> NDArray[np.float64]:
     """(N, D) mean over the tokens that are there."""
     values = tokens.values if eraser is None else eraser(tokens.values)
     here = tokens.present[..., None]

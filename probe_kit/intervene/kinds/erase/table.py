@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.erase.effects import Erasing
+from probe_kit.intervene.kinds.erase.effects import ErasureEffect
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -17,9 +17,9 @@ _LEGEND = (
 )
 
 
-def erased_table(rows: Sequence[Erasing], of: str) -> "ResponsiveTable":
+def erased_table(rows: Sequence[ErasureEffect], of: str) -> "ResponsiveTable":
     """One line per category and place; controls stand beside what they are held against. of: model, suite."""
-    from probe_kit._terminal.responsive_table import ResponsiveTable, Part
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     shown = [row for row in rows if row.finding not in ("control", "dose 0")]
     return ResponsiveTable(
@@ -43,7 +43,7 @@ def erased_table(rows: Sequence[Erasing], of: str) -> "ResponsiveTable":
     )
 
 
-def _action_cells(row: Erasing) -> "tuple[Cell, ...]":
+def _action_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
     beside = None if row.control_net is None else row.right_before - row.control_net
@@ -51,14 +51,16 @@ def _action_cells(row: Erasing) -> "tuple[Cell, ...]":
         f"{100 * row.right_before:.1f} → {100 * row.right:.1f}", "–" if beside is None else f"{100 * beside:.1f}",
         "n/a" if row.kept is None else f"{row.kept:.2f}",
         "–" if row.control_kept is None else f"{row.control_kept:.2f}",
-        f"{-100 * row.shift:+.2f}", "–" if row.p is None else f"{row.p:.2g}", f"{row.norm_ratio:.2f}",
+        f"{-100 * row.mean_displacement:+.2f}", "–" if row.p is None else f"{row.p:.2g}", f"{row.relative_change:.2f}",
     )  # fmt: skip
     return tuple(map(Cell, texts))
 
 
-def _probe_cells(row: Erasing) -> "tuple[Cell, ...]":
+def _probe_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
-    unknown = row.readable_before is None or row.readable is None
-    read = "–" if unknown else f"{100 * (row.readable_before or 0):.1f} → {100 * (row.readable or 0):.1f}"
+    unknown = row.probe_accuracy_before is None or row.probe_accuracy is None
+    read = (
+        "–" if unknown else f"{100 * (row.probe_accuracy_before or 0):.1f} → {100 * (row.probe_accuracy or 0):.1f}"
+    )
     return Cell(read), Cell(row.finding)

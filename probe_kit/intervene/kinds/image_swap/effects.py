@@ -6,25 +6,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.intervene.store.answers import EXCHANGED, PLAIN, Answers
-from probe_kit.intervene.store.selection import foremost
+from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, ConditionOutcomes
+from probe_kit.intervene.store.selection import preferred_by_category
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 
-WORTH = 0.25
+SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Share of episodes by which following must outweigh going against, to be called following."""
 
 
 @dataclass(frozen=True)
-class Following:
+class ImageSwapEffect:
     """Whether the action follows the pictures, in one category.
 
     follows: share of episodes in which the action goes to the correct picture, and to the other side once the two
     are exchanged; against: in which it does the reverse. net: follows − against, with its 95 % interval by groups.
     p_follows, p_against: exact, one-sided: an item's action moves toward (away from) the correct picture more
-    often than a coin would have it; the larger of by items and by groups. shift: median metres between the two
+    often than a coin would have it; the larger of by items and by groups. median_displacement: median metres between the two
     actions. key: of the stored intervention.
     """
 
@@ -32,69 +32,69 @@ class Following:
     n_episodes: int
     n_items: int
     n_groups: int
-    follows: float
-    against: float
-    net: float
-    net_ci: tuple[float, float]
-    p_follows: float
-    p_against: float
-    shift: float
+    follow_rate: float
+    reversal_rate: float
+    net_follow_rate: float
+    net_follow_rate_ci: tuple[float, float]
+    follow_p: float
+    reversal_p: float
+    median_displacement: float
     key: str = ""
 
     @property
-    def is_following(self) -> bool:
+    def follows_images(self) -> bool:
         """Beyond chance, and in enough episodes to matter."""
-        return self.p_follows < SIGNIFICANCE and self.net >= WORTH
+        return self.follow_p < SIGNIFICANCE and self.net_follow_rate >= SMALLEST_EFFECT_OF_INTEREST
 
     @property
     def is_against(self) -> bool:
         """The mirror of it."""
-        return self.p_against < SIGNIFICANCE and self.net <= -WORTH
+        return self.reversal_p < SIGNIFICANCE and self.net_follow_rate <= -SMALLEST_EFFECT_OF_INTEREST
 
     @property
     def is_bounded(self) -> bool:
         """Whether the interval leaves no room for following that matters."""
-        return self.net_ci[1] < WORTH
+        return self.net_follow_rate_ci[1] < SMALLEST_EFFECT_OF_INTEREST
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
         return asdict(self)
 
 
-def following(answers: Answers, suite: str, key: str = "") -> list[Following]:
+def image_swap_effects(outcomes: ConditionOutcomes, suite: str, key: str = "") -> list[ImageSwapEffect]:
     """One per category, in the order of the episodes. suite: its identity, of which intervals are drawn."""
-    return [_of_category(own, category, suite, key) for category, own in answers.by_category()]
+    return [_of_category(own, category, suite, key) for category, own in outcomes.by_category()]
 
 
-def _of_category(answers: Answers, category: str, suite: str, key: str) -> Following:
-    plain, exchanged = (answers.toward * answers.of(name) for name in (PLAIN, EXCHANGED))
+def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: str) -> ImageSwapEffect:
+    plain, exchanged = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, IMAGE_SWAP))
     follows, against = (plain > 0) & (exchanged < 0), (plain < 0) & (exchanged > 0)
     net = follows.astype(float) - against
-    shift = plain - exchanged
-    return Following(
+    median_displacement = plain - exchanged
+    return ImageSwapEffect(
         category=category,
         n_episodes=net.size,
-        n_items=np.unique(answers.items).size,
-        n_groups=np.unique(answers.groups).size,
-        follows=float(follows.mean()),
-        against=float(against.mean()),
-        net=float(net.mean()),
-        net_ci=net_interval(net, answers, suite),
-        p_follows=paired_greater_p(shift, answers.items, answers.groups),
-        p_against=paired_greater_p(-shift, answers.items, answers.groups),
-        shift=float(np.median(np.abs(shift))),
+        n_items=np.unique(outcomes.items).size,
+        n_groups=np.unique(outcomes.groups).size,
+        follow_rate=float(follows.mean()),
+        reversal_rate=float(against.mean()),
+        net_follow_rate=float(net.mean()),
+        net_follow_rate_ci=net_interval(net, outcomes, suite),
+        follow_p=paired_greater_p(median_displacement, outcomes.items, outcomes.groups),
+        reversal_p=paired_greater_p(-median_displacement, outcomes.items, outcomes.groups),
+        median_displacement=float(np.median(np.abs(median_displacement))),
         key=key,
     )
 
 
-def net_interval(net: NDArray[np.float64], answers: Answers, suite: str) -> tuple[float, float]:
+def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: str) -> tuple[float, float]:
     """95 % interval by groups of the mean over episodes of (E,) gains."""
-    drawn = units_seed(answers.groups, suite)
-    low, high = group_bootstrap(net[:, None], answers.groups, drawn, bounds=GAINS)
+    drawn = units_seed(outcomes.groups, suite)
+    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
     return float(low[0]), float(high[0])
 
 
-def stored_following(run: RunReader) -> dict[str, Following]:
+def stored_image_swaps(run: RunReader) -> dict[str, ImageSwapEffect]:
     """By category, what the exchange of pictures did, of those that are stored for the episodes the run has now.
 
     Of several the one that says most, see `standing`; empty if there is none. Raises RunDamagedError if any stored
@@ -102,6 +102,6 @@ def stored_following(run: RunReader) -> dict[str, Following]:
     """
     return {
         category: row
-        for category, told in foremost(run, "follow").items()
-        for row in following(told.answers, run.suite, told.stored.key)
+        for category, result in preferred_by_category(run, "follow").items()
+        for row in image_swap_effects(result.outcomes, run.suite, result.stored.key)
     }

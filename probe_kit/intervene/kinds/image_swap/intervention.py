@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit.hooks.contract.interventions import InterventionKind
-from probe_kit.intervene.replay.conditions import Condition, Exchanged, Intervention, Plain
-from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.conditions import CleanRun, Condition, ImagesSwapped, Intervention
+from probe_kit.intervene.replay.session import ReplaySession
 
 
 @dataclass(frozen=True, kw_only=True)
-class Follow(Intervention):
+class ImageSwap(Intervention):
     """Two inferences per episode, same state and noise: with its pictures, and with the two exchanged."""
 
     @property
@@ -18,11 +18,11 @@ class Follow(Intervention):
         return "follow"
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """Two inferences that can be compared."""
-        return ("follow",)
+        return ("swap",)
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """As the run made it, and exchanged."""
-        del bench
-        return Plain(), Exchanged()
+        del session
+        return CleanRun(), ImagesSwapped()

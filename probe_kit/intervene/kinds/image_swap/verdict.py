@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from probe_kit.hooks.contract.sites import MEMORY_STREAM
-from probe_kit.intervene.kinds.image_swap.effects import WORTH, Following
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
 
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
@@ -26,20 +26,20 @@ Verdict = Literal[
 
 
 @dataclass(frozen=True)
-class Judgement:
+class UseVerdict:
     """A verdict, and in a few words what it rests on or why there is none."""
 
     verdict: Verdict
     reason: str = ""
 
 
-def judge(
+def classify_use(
     encoded: bool | None,
-    found: Following,
+    found: ImageSwapEffect,
     control: str | None,
     located: Sequence[str] | None = None,
     carried: Sequence[str] = (),
-) -> Judgement:
+) -> UseVerdict:
     """What probes and the exchange of pictures say together.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
@@ -48,32 +48,35 @@ def judge(
     the effect, if an interchange searched for them; where it did and found none, nothing is called used. carried:
     places and the directions along which half of it passes there.
     """
-    if found.is_following:
+    if found.follows_images:
         if encoded and located is not None:
             if not located:
-                return Judgement("inconclusive", "it follows, and no place that was tried carries half of that")
-            return Judgement("used", where(located, carried))
-        return Judgement(_by(encoded, "used", "acted on, not found", "follows"))
+                return UseVerdict("inconclusive", "it follows, and no place that was tried carries half of that")
+            return UseVerdict("used", describe_sites(located, carried))
+        return UseVerdict(_by(encoded, "used", "acted on, not found", "follows"))
     if found.is_against:
-        return Judgement(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
+        return UseVerdict(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
     if not found.is_bounded:
-        low, high = found.net_ci
-        return Judgement(
-            "inconclusive", f"follows − against may be anything from {low:.2f} to {high:.2f}; {WORTH} would count"
+        low, high = found.net_follow_rate_ci
+        return UseVerdict(
+            "inconclusive",
+            f"follows − against may be anything from {low:.2f} to {high:.2f}; {SMALLEST_EFFECT_OF_INTEREST} would count",
         )
     if encoded and control is None:
-        return Judgement("inconclusive", "no other category of the run follows, so following is not known to show")
+        return UseVerdict(
+            "inconclusive", "no other category of the run follows, so following is not known to show"
+        )
     reason = f"positive control: {control}" if encoded and control else ""
-    return Judgement(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
+    return UseVerdict(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
 
 
-def where(located: Sequence[str], carried: Sequence[str] = ()) -> str:
+def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
     """Where the answer passes, of keys and values that what acts reads where it is read, and along what.
 
     An exchange in the backbone says that something behind it depends on that place; one in the memory, which only
     what acts looks at, that it is read there.
     """
-    read = [place for place in located if place.partition(".")[0] == MEMORY_STREAM]
+    read = [place for place in located if place.partition(".")[0] == KV_STREAM]
     passes = [place for place in located if place not in read]
     parts = [f"passes at {', '.join(passes)}"] * bool(passes) + [f"read at {', '.join(read)}"] * bool(read)
     parts += [f"carried by {', '.join(carried)}"] * bool(carried)
@@ -84,24 +87,26 @@ def _by(encoded: bool | None, yes: Verdict, no: Verdict, unknown: Verdict) -> Ve
     return unknown if encoded is None else yes if encoded else no
 
 
-def control_for(category: str, found: Mapping[str, Following]) -> str | None:
+def control_for(category: str, found: Mapping[str, ImageSwapEffect]) -> str | None:
     """Another category of the run that follows, the one that does so most; None if there is none."""
-    others = [one for one in found.values() if one.category != category and one.is_following]
-    return max(others, key=lambda one: one.net).category if others else None
+    others = [one for one in found.values() if one.category != category and one.follows_images]
+    return max(others, key=lambda one: one.net_follow_rate).category if others else None
 
 
-def judgements(
-    found: Mapping[str, Following],
+def classify_all(
+    found: Mapping[str, ImageSwapEffect],
     encoded: Mapping[str, bool | None],
     located: Mapping[str, Sequence[str]] = MappingProxyType({}),
     carried: Mapping[str, Sequence[str]] = MappingProxyType({}),
-) -> dict[str, Judgement]:
+) -> dict[str, UseVerdict]:
     """Of every category that was intervened on.
 
     encoded, located, carried: by category; one that is not there was not probed, or not looked for inside.
     """
     return {
-        name: judge(encoded.get(name), one, control_for(name, found), located.get(name), carried.get(name, ()))
+        name: classify_use(
+            encoded.get(name), one, control_for(name, found), located.get(name), carried.get(name, ())
+        )
         for name, one in found.items()
     }
 

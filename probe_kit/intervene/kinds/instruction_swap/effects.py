@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.intervene.store.answers import EXCHANGED, NOISE, PICTURES, PLAIN, Answers
+from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, NOISE, PICTURES, ConditionOutcomes
 
-_CONDITIONS = {"words": EXCHANGED, "pictures": PICTURES, "noise": NOISE}
+_CONDITIONS = {"words": IMAGE_SWAP, "pictures": PICTURES, "noise": NOISE}
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class InputSensitivity:
     """Of the first inferences of one category; one is exchanged, the others stay.
 
     words, pictures, noise: median metres between where the two actions would bring the hand, across.
@@ -32,18 +32,20 @@ class Sensitivity:
         return asdict(self)
 
 
-def sensitivity(answers: Answers) -> list[Sensitivity]:
+def input_sensitivity(outcomes: ConditionOutcomes) -> list[InputSensitivity]:
     """One per category, in the order of the episodes; empty where words were not exchanged."""
-    if not {PICTURES, NOISE} <= set(answers.conditions):
+    if not {PICTURES, NOISE} <= set(outcomes.conditions):
         return []
-    return [_of_category(own, category) for category, own in answers.by_category()]
+    return [_of_category(own, category) for category, own in outcomes.by_category()]
 
 
-def _of_category(answers: Answers, category: str) -> Sensitivity:
-    plain = answers.of(PLAIN)
-    apart = {name: float(np.median(np.abs(answers.of(own) - plain))) for name, own in _CONDITIONS.items()}
+def _of_category(outcomes: ConditionOutcomes, category: str) -> InputSensitivity:
+    plain = outcomes.of(CLEAN)
+    apart = {name: float(np.median(np.abs(outcomes.of(own) - plain))) for name, own in _CONDITIONS.items()}
     changed = {
-        f"{name}_changed": float((answers.changed[answers.conditions.index(_CONDITIONS[name])] > 0).mean())
+        f"{name}_changed": float(
+            (outcomes.max_action_change[outcomes.conditions.index(_CONDITIONS[name])] > 0).mean()
+        )
         for name in ("words", "pictures")
     }
-    return Sensitivity(category, plain.size, **apart, **changed)
+    return InputSensitivity(category, plain.size, **apart, **changed)

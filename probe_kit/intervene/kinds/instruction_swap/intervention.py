@@ -10,9 +10,16 @@ from dataclasses import dataclass, replace
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
-from probe_kit.intervene.replay.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.store.answers import EXCHANGED, NOISE, PICTURES
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ImagesSwapped,
+    Intervention,
+)
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.store.answers import IMAGE_SWAP, NOISE, PICTURES
 from probe_kit.suite.items import Episode, Layout
 from probe_kit.suite.ladder import check_wordings, in_words
 
@@ -20,7 +27,7 @@ _TURNED: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Words(Intervention):
+class InstructionSwap(Intervention):
     """Four inferences per episode: as it was, with its twin's words, with exchanged pictures, with other noise.
 
     A twin shows the same two pictures and asks for the other one; items without one are passed over and counted.
@@ -33,61 +40,63 @@ class Words(Intervention):
         return "words"
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """Two inferences that can be compared."""
-        return ("follow",)
+        return ("swap",)
 
-    def playable(self, bench: Bench, items: Sequence[str]) -> list[str]:
+    def eligible_items(self, session: ReplaySession, items: Sequence[str]) -> list[str]:
         """Those of `items` that have a twin with words for the run's wording. Raises UsageError if none has."""
-        found = [item for item in items if words_of_twin(bench, item, "original") is not None]
+        found = [item for item in items if counterpart_instruction(session, item, "original") is not None]
         if not found:
             raise UsageError(
                 f"none of the {len(items)} items has a twin in its suite: the same two pictures, asked for the "
-                "other one. Suites of `probe-kit suite build` have them; else exchange pictures (--kind follow)"
+                "other one. Suites of `probe-kit suite build` have them; else exchange pictures (--kind image-swap)"
             )
         return found
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """As the run made it; asked for the other picture; the pictures exchanged; the noise drawn anew."""
-        del bench
-        return Plain(), Reworded(), Exchanged(PICTURES), OtherNoise()
+        del session
+        return CleanRun(), InstructionSwapped(), ImagesSwapped(PICTURES), NoiseResampled()
 
 
 @dataclass(frozen=True)
-class Reworded:
+class InstructionSwapped:
     """The same state, noise and pictures, asked for the other one of the two."""
 
-    name: str = EXCHANGED
+    name: str = IMAGE_SWAP
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Only what is asked is another."""
-        question = turn.question
-        words = words_of_twin(turn.bench, question.item_id, question.layout)
+        replay_input = context.replay_input
+        words = counterpart_instruction(context.session, replay_input.item_id, replay_input.layout)
         assert words is not None, "items without a twin are passed over"
-        return Played(turn.bench.act(replace(question.seen, instruction=words), question.seed))
+        return ConditionResult(
+            context.session.act(replace(replay_input.seen, instruction=words), replay_input.seed)
+        )
 
 
 @dataclass(frozen=True)
-class OtherNoise:
+class NoiseResampled:
     """The same question with its noise drawn anew; the same action again where a policy draws none."""
 
     name: str = NOISE
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """Only the seed is another."""
-        question = turn.question
-        return Played(turn.bench.act(question.seen, derive_seed(question.seed, NOISE, 0)))
+        replay_input = context.replay_input
+        return ConditionResult(context.session.act(replay_input.seen, derive_seed(replay_input.seed, NOISE, 0)))
 
 
-def words_of_twin(bench: Bench, item_id: str, layout: Layout) -> str | None:
+def counterpart_instruction(session: ReplaySession, item_id: str, layout: Layout) -> str | None:
     """What the item's twin is asked in the run's wording, its pictures lying as the item's do in `layout`."""
-    twin = bench.twins.get(item_id)
+    twin = session.counterparts.get(item_id)
     if twin is None:
         return None
-    if bench.run.wording is None:
+    if session.run.wording is None:
         return twin.instruction
-    own = bench.items[item_id]
+    own = session.items[item_id]
     alike = own.left_pixels_sha256 == twin.left_pixels_sha256
-    (wording,) = check_wordings([bench.run.wording])
-    asked = in_words(Episode(twin, layout if alike else _TURNED[layout]), wording)
-    return None if asked is None else asked.item.instruction
+    (wording,) = check_wordings([session.run.wording])
+    intervention = in_words(Episode(twin, layout if alike else _TURNED[layout]), wording)
+    return None if intervention is None else intervention.item.instruction

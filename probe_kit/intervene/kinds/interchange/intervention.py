@@ -10,13 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.interventions import InterventionKind
-from probe_kit.hooks.contract.sites import MEMORY_STREAM, Site
-from probe_kit.intervene.edits.patching import Change, Replaced, ReplacedAlong, patched
-from probe_kit.intervene.edits.sites import ALL, Place, places, roles_of
-from probe_kit.intervene.replay.conditions import Condition, Exchanged, Intervention, Plain, Played, Turn
+from probe_kit.hooks.contract.sites import KV_STREAM, Site
+from probe_kit.intervene.edits.patching import ReplaceInSubspace, ReplaceWith, TokenEdit, apply_patch
+from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ImagesSwapped,
+    Intervention,
+)
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
-from probe_kit.intervene.replay.session import Bench
-from probe_kit.intervene.replay.token_directions import Bases, bases_of, check_direction
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.settings import items_of
 
 if TYPE_CHECKING:
@@ -27,10 +34,10 @@ ROLES = (ALL, "image", "language")
 NONE = "none"
 
 
-def needed(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
+def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
     """What a family must support for changes at such places and roles."""
-    memory = any(pattern.partition(".")[0] == MEMORY_STREAM for pattern in sites)
-    further: dict[InterventionKind, bool] = {"memory": memory, "tiles": bool(set(roles) & set(TILES))}
+    memory = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
+    further: dict[InterventionKind, bool] = {"kv": memory, "tiles": bool(set(roles) & set(TILES))}
     return ("edit", *(kind for kind, is_needed in further.items() if is_needed))
 
 
@@ -38,7 +45,7 @@ def needed(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind
 class Interchange(Intervention):
     """Every place is tried at every role, alone.
 
-    sites: patterns of places, see `places`. roles: of the tokens that are taken over; a stream is tried at those
+    sites: patterns of places, see `resolve_sites`. roles: of the tokens that are taken over; a stream is tried at those
     that it has. direction: `none` takes tokens over whole; `mean-difference` or `probe` only along that direction
     of each place (rank 1), found in means over tokens without the episode it is used on; `mean-difference:K` along
     K directions found in the tokens themselves, see `token_directions`. controls: so many times as many random
@@ -71,84 +78,94 @@ class Interchange(Intervention):
         return "interchange"
 
     @property
-    def needs(self) -> tuple[InterventionKind, ...]:
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """Edits; and a memory, where one of its places is."""
-        return needed(self.sites, self.roles)
+        return capabilities_for(self.sites, self.roles)
 
     @property
-    def learns(self) -> bool:
+    def fits_first(self) -> bool:
         """Where its direction is of tokens."""
         return ":" in self.direction
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Where, which tokens and along what."""
         return {
             "sites": list(self.sites), "roles": list(self.roles), "direction": self.direction,
             "controls": self.controls, "seed": self.seed,
         }  # fmt: skip
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Plain, exchanged, and every place at every role. Raises UnknownSiteError, NoProbesError."""
-        found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
-        donors = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
-        wanted = {place: roles_of(bench.policy, place.stream, self.roles) for place in found.values()}
-        conditions: list[Condition] = [Plain(), Exchanged()]
+        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        source_sites = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
+        wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
+        conditions: list[Condition] = [CleanRun(), ImagesSwapped()]
         if self.direction == NONE:
-            return conditions + [TakenOver(place, role, donors) for place in wanted for role in wanted[place]]
-        items = items_of(bench.run, replace(self, items=None))
-        found_along = bases_of(bench, items, wanted, self.direction, self.controls, self.seed)
+            return conditions + [
+                PatchedFromSource(place, role, source_sites) for place in wanted for role in wanted[place]
+            ]
+        items = items_of(session.run, replace(self, items=None))
+        found_along = fit_token_directions(session, items, wanted, self.direction, self.controls, self.seed)
         for (place, role), bases in found_along.items():
-            conditions += along(self.direction, bases, place, role, donors)
+            conditions += patches_within(self.direction, bases, place, role, source_sites)
         return conditions
 
 
 @dataclass(frozen=True)
-class TakenOver:
+class PatchedFromSource:
     """The tokens of one role at one place, from the inference before exchanged pictures.
 
     donors: all sites of which that inference is asked, once for all conditions. direction: the name of one of
     `bases`, empty to take tokens over whole.
     """
 
-    place: Place
+    place: SiteGroup
     role: str
-    donors: tuple[Site, ...]
+    source_sites: tuple[Site, ...]
     direction: str = ""
-    bases: Bases | None = None
+    bases: DirectionBasis | None = None
 
     @property
     def name(self) -> str:
         """Place, role and direction, apart by `|`."""
         return "|".join(filter(None, (self.place.name, self.role, self.direction)))
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """The plain inference with these tokens in it."""
-        question, bench = turn.question, turn.bench
-        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
-        with patched(bench.policy, self.place.sites, tokens, self._change(turn, tokens.count)) as ledger:
-            chunk = bench.act(question.seen, question.seed)
-        return Played(chunk, ledger)
+        replay_input, session = context.replay_input, context.session
+        tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
+        with apply_patch(
+            session.policy, self.place.sites, tokens, self._change(context, tokens.count)
+        ) as edit_log:
+            chunk = session.act(replay_input.seen, replay_input.seed)
+        return ConditionResult(chunk, edit_log)
 
-    def _change(self, turn: Turn, tokens: int) -> Change:
-        donor = donor_of(turn, self.donors)
+    def _change(self, context: ConditionContext, tokens: int) -> TokenEdit:
+        source = source_of(context, self.source_sites)
         if self.bases is None:
-            return Replaced(donor, tokens)
-        basis = self.bases.basis(self.direction, turn.question.episode_id, turn.question.category)
-        return ReplacedAlong(donor, tokens, basis)
+            return ReplaceWith(source, tokens)
+        basis = self.bases.basis(self.direction, context.replay_input.episode_id, context.replay_input.category)
+        return ReplaceInSubspace(source, tokens, basis)
 
 
-def along(direction: str, bases: Bases, place: Place, role: str, donors: tuple[Site, ...]) -> list[TakenOver]:
+def patches_within(
+    direction: str, bases: DirectionBasis, place: SiteGroup, role: str, source_sites: tuple[Site, ...]
+) -> list[PatchedFromSource]:
     """What is taken over along a direction, and along each of its controls."""
-    return [TakenOver(place, role, donors, name, bases) for name in (direction, *bases.control_names)]
+    return [
+        PatchedFromSource(place, role, source_sites, name, bases) for name in (direction, *bases.control_names)
+    ]
 
 
-def donor_of(turn: Turn, sites: Sequence[Site]) -> "ActivationCache":
+def source_of(context: ConditionContext, sites: Sequence[Site]) -> "ActivationCache":
     """What all these sites hold before exchanged pictures, with the question's state and noise; made once."""
     from probe_kit.hooks import capture
 
-    if "donor" not in turn.memo:
-        with capture(turn.bench.policy, sites) as tape:
-            turn.memo["chunk"] = turn.bench.act(turn.question.exchanged, turn.question.seed)
-        turn.memo["donor"] = tape
-    donor: ActivationCache = turn.memo["donor"]
-    return donor
+    if "donor" not in context.memo:
+        with capture(context.session.policy, sites) as tape:
+            context.memo["first-chunk"] = context.session.act(
+                context.replay_input.exchanged, context.replay_input.seed
+            )
+        context.memo["donor"] = tape
+    source: ActivationCache = context.memo["donor"]
+    return source

@@ -13,19 +13,30 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.edits.patching import Moved, patched
-from probe_kit.intervene.edits.pooled_directions import DIRECTIONS, MEAN_DIFFERENCE, Axes, axes_of
-from probe_kit.intervene.edits.sites import Place, places
-from probe_kit.intervene.replay.conditions import Condition, Intervention, Plain, Played, Turn
+from probe_kit.intervene.edits.patching import AddVector, apply_patch
+from probe_kit.intervene.edits.pooled_directions import (
+    DIRECTIONS,
+    MEAN_DIFFERENCE,
+    PooledDirections,
+    fit_directions,
+)
+from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    Intervention,
+)
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
-from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.session import ReplaySession
 
-Toward = Literal["wrong", "correct", "left", "right"]
-DOSES = (1.0, 2.0, 4.0)
+TargetSide = Literal["wrong", "correct", "left", "right"]
+COEFFICIENTS = (1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steer(Intervention):
+class Steering(Intervention):
     """Every place and dose, toward one side, and the same for the controls; dose 0 is always played as well.
 
     sites: patterns of places. role: whose tokens are moved, along the direction found in their own mean. doses: in
@@ -36,8 +47,8 @@ class Steer(Intervention):
     sites: tuple[str, ...]
     role: str
     direction: str = MEAN_DIFFERENCE
-    doses: tuple[float, ...] = DOSES
-    toward: Toward = "wrong"
+    coefficients: tuple[float, ...] = COEFFICIENTS
+    target_side: TargetSide = "wrong"
     controls: int = 5
     seed: int = 0
 
@@ -53,64 +64,74 @@ class Steer(Intervention):
                 f"{self.direction!r} is no direction for a dose: steering adds one vector to every token. Use "
                 f"{' or '.join(DIRECTIONS)}"
             )
-        if self.toward not in get_args(Toward):
-            raise UsageError(f"toward is {self.toward!r}; expected one of {', '.join(get_args(Toward))}")
-        if not self.doses or not all(0 < dose <= 1000 for dose in self.doses):
-            raise UsageError(f"doses are {self.doses}; expected positive numbers of half gaps, such as 1, 2, 4")
-        if len(set(self.doses)) != len(self.doses):
-            raise UsageError(f"doses are {self.doses}; give each once")
+        if self.target_side not in get_args(TargetSide):
+            raise UsageError(f"toward is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}")
+        if not self.coefficients or not all(0 < coefficient <= 1000 for coefficient in self.coefficients):
+            raise UsageError(
+                f"doses are {self.coefficients}; expected positive numbers of half gaps, such as 1, 2, 4"
+            )
+        if len(set(self.coefficients)) != len(self.coefficients):
+            raise UsageError(f"doses are {self.coefficients}; give each once")
 
     @property
     def kind(self) -> str:
         """`steer`."""
         return "steer"
 
-    def own_settings(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Where, along what, how far and to which side."""
         return {
-            "sites": list(self.sites), "role": self.role, "direction": self.direction, "doses": list(self.doses),
-            "toward": self.toward, "controls": self.controls, "seed": self.seed,
+            "sites": list(self.sites), "role": self.role, "direction": self.direction, "doses": list(self.coefficients),
+            "toward": self.target_side, "controls": self.controls, "seed": self.seed,
         }  # fmt: skip
 
-    def conditions(self, bench: Bench) -> Sequence[Condition]:
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Plain, then every place at dose 0 and every other, each with its controls. Raises UnknownSiteError."""
-        found = {place.name: place for pattern in self.sites for place in places(pattern, bench.policy)}
-        conditions: list[Condition] = [Plain()]
+        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        conditions: list[Condition] = [CleanRun()]
         for place in found.values():
-            axes = axes_of(bench.run, place.only_site, self.role, self.direction, self.controls, self.seed)
-            conditions.append(Pushed(place, self.role, self.direction, 0.0, self.toward, axes))
+            axes = fit_directions(
+                session.run, place.only_site, self.role, self.direction, self.controls, self.seed
+            )
+            conditions.append(Steered(place, self.role, self.direction, 0.0, self.target_side, axes))
             conditions += [
-                Pushed(place, self.role, name, dose, self.toward, axes)
-                for dose in self.doses
+                Steered(place, self.role, name, coefficient, self.target_side, axes)
+                for coefficient in self.coefficients
                 for name in (self.direction, *axes.control_names)
             ]
         return conditions
 
 
 @dataclass(frozen=True)
-class Pushed:
+class Steered:
     """The tokens of one role at one place, moved along a direction."""
 
-    place: Place
+    place: SiteGroup
     role: str
     direction: str
-    dose: float
-    toward: Toward
-    axes: Axes
+    coefficient: float
+    target_side: TargetSide
+    axes: PooledDirections
 
     @property
     def name(self) -> str:
         """Place, role, direction and dose, apart by `|`."""
-        return f"{self.place.name}|{self.role}|{self.direction}|{self.dose:g}"
+        return f"{self.place.name}|{self.role}|{self.direction}|{self.coefficient:g}"
 
-    def play(self, turn: Turn) -> Played:
+    def play(self, context: ConditionContext) -> ConditionResult:
         """The plain inference with these tokens moved."""
-        question, bench = turn.question, turn.bench
-        left = question.side_correct == "left"
+        replay_input, session = context.replay_input, context.session
+        left = replay_input.side_correct == "left"
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
-        length = self.dose * self.axes.half_gap(question.episode_id, question.category) * side[self.toward]
-        unit = self.axes.of(self.direction, question.episode_id, question.category)
-        tokens = role_tokens(bench.policy, question, self.place.stream, self.role, turn.memo)
-        with patched(bench.policy, self.place.sites, tokens, Moved(np.float32(length) * unit)) as ledger:
-            chunk = bench.act(question.seen, question.seed)
-        return Played(chunk, ledger)
+        length = (
+            self.coefficient
+            * self.axes.half_difference(replay_input.episode_id, replay_input.category)
+            * side[self.target_side]
+        )
+        unit = self.axes.of(self.direction, replay_input.episode_id, replay_input.category)
+        tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
+        with apply_patch(
+            session.policy, self.place.sites, tokens, AddVector(np.float32(length) * unit)
+        ) as edit_log:
+            chunk = session.act(replay_input.seen, replay_input.seed)
+        return ConditionResult(chunk, edit_log)

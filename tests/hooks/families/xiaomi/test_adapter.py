@@ -53,12 +53,12 @@ class TestXiaomiAsTheGoogleRobotInThreeSteps(AdapterContract):
 
 def test_only_the_last_blocks_memory_is_read(loaded: Xiaomi, observation: Observation) -> None:
     """As many as the flow transformer has layers; those before are a control."""
-    assert loaded.memory is not None
+    assert loaded.prompt_kv is not None
     plain, read = loaded.act([observation], [0]), len(loaded.network.dit.layers)
-    for site in loaded.memory.sites("values"):
+    for site in loaded.prompt_kv.sites("values"):
         with edit(loaded, {site: torch.zeros_like}):
             moved = np.abs(loaded.act([observation], [0]) - plain).max()
-        assert (moved > 0) == (site.layer >= loaded.memory.layers - 1 - read), str(site)
+        assert (moved > 0) == (site.layer >= loaded.prompt_kv.layers - 1 - read), str(site)
 
 
 # -- the reference ---------------------------------------------------------------------------------------------

@@ -17,19 +17,19 @@ from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import (
-    Attention,
-    Effects,
-    Source,
-    Weighed,
-    intervene_on,
+    AttentionReadout,
+    AttentionShares,
+    InterventionResult,
+    ReplaySource,
     load_effects,
+    run_intervention,
     stored_attention,
 )
-from probe_kit.intervene.kinds.attention.intervention import Noting, by_role
+from probe_kit.intervene.kinds.attention.intervention import AttentionRecorded, shares_by_role
 from probe_kit.intervene.kinds.attention.table import weighed_table
-from probe_kit.intervene.replay.conditions import Replayed
+from probe_kit.intervene.replay.conditions import ReplayBatch
 from probe_kit.intervene.replay.image_tokens import TILES
-from probe_kit.intervene.replay.session import Bench
+from probe_kit.intervene.replay.session import ReplaySession
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -40,23 +40,25 @@ STEPS = 4
 
 
 @pytest.fixture(scope="module")
-def noted(copy: Run, source: Source, twin: "Policy") -> Effects:
-    return intervene_on(copy, Attention(categories=("color",), items=2), source, load=lambda *_: twin)
+def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+    return run_intervention(copy, AttentionReadout(categories=("color",), items=2), source, load=lambda *_: twin)
 
 
 @pytest.fixture
-def weighed(noted: Effects) -> Weighed:
-    assert noted.attention is not None
-    return noted.attention
+def weighed(attention_records: InterventionResult) -> AttentionShares:
+    assert attention_records.attention is not None
+    return attention_records.attention
 
 
-def test_it_is_what_the_policy_tells_by_block_iteration_and_head(bench: Bench, weighed: Weighed) -> None:
+def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
+    session: ReplaySession, weighed: AttentionShares
+) -> None:
     """By hand, on the words of one question."""
-    (question, _) = bench.questions(str(weighed.episodes[0]).partition(":")[0])
-    row, role = list(weighed.episodes).index(question.episode_id), weighed.roles.index("language")
-    words = bench.policy.roles([question.seen])["backbone"][0].mask("language")
-    with capture_attention(bench.policy) as mass:
-        bench.act(question.seen, question.seed)
+    (replay_input, _) = session.replay_inputs(str(weighed.episodes[0]).partition(":")[0])
+    row, role = list(weighed.episodes).index(replay_input.episode_id), weighed.roles.index("language")
+    words = session.policy.roles([replay_input.seen])["backbone"][0].mask("language")
+    with capture_attention(session.policy) as mass:
+        session.act(replay_input.seen, replay_input.seed)
     assert weighed.mass.shape == (4, BLOCKS, ITERATIONS, HEADS, len(weighed.roles))
     for (block, step), weights in mass.by_head.items():
         expected = weights[0][:, words].sum(axis=-1)
@@ -66,8 +68,8 @@ def test_it_is_what_the_policy_tells_by_block_iteration_and_head(bench: Bench, w
         np.testing.assert_allclose(share.mean(axis=1), by_role_alone[read])
 
 
-def test_noting_changes_no_action_bit_for_bit(noted: Effects) -> None:
-    said = noted.certificate["attention"]
+def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionResult) -> None:
+    said = attention_records.certificate["attention"]
     assert (said["inferences"], said["blocks"], said["iterations"], said["heads"]) == (
         4,
         BLOCKS,
@@ -75,16 +77,16 @@ def test_noting_changes_no_action_bit_for_bit(noted: Effects) -> None:
         HEADS,
     )
     assert said["largest_change"] == 0.0
-    assert noted.certificate["replay"]["equal"] == 4
-    found = Replayed(
+    assert attention_records.certificate["replay"]["equal"] == 4
+    found = ReplayBatch(
         np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)), np.zeros(1),
         mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
     )  # fmt: skip
     with pytest.raises(CaptureChangedActionError, match="1e-06"):
-        Attention().told([Noting("backbone", ("all",))], found)
+        AttentionReadout().told([AttentionRecorded("backbone", ("all",))], found)
 
 
-def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: Weighed) -> None:
+def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: AttentionShares) -> None:
     shares = weighed.shares()
     assert set(TILES) <= set(weighed.roles)
     np.testing.assert_allclose(shares["all"] + shares["own"], 1)
@@ -96,7 +98,7 @@ def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: Weig
     left = weighed.sides == "left"
     np.testing.assert_array_equal(shares["image.correct"][left], shares["image.left"][left])
     np.testing.assert_array_equal(shares["image.correct"][~left], shares["image.right"][~left])
-    apart = weighed.toward_correct("suite")
+    apart = weighed.correct_minus_other("suite")
     assert set(apart) == set(range(BLOCKS))
     for block, (value, (low, high)) in apart.items():
         own = shares["image.correct"][:, block] - shares["image.other"][:, block]
@@ -109,7 +111,7 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
     mass = np.arange(3 * 2 * 2 * 2, dtype=np.float32).reshape(3, 2, 2, 2, 1) / 100
     mass[:, 1] = np.nan
     mass[:, 0, 1, :] += np.float32(0.5)
-    weighed = Weighed(
+    weighed = AttentionShares(
         ("all",), np.array(["a", "a", "b"]), np.array(["g", "g", "h"]), np.array(["color"] * 3),
         np.array(["left", "left", "right"]), np.array([0, 1, 0]), mass,
     )  # fmt: skip
@@ -121,15 +123,15 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
     assert by_call["call"].tolist() == [0, 1]
     assert by_call["share"].iloc[1] == pytest.approx(cells[1].mean())
     assert list(weighed.frame(("head",)).columns) == ["category", "role", "head", "share", "n_episodes"]
-    assert weighed.toward_correct("suite") == {}
-    again = Weighed.from_bytes(weighed.to_bytes())
+    assert weighed.correct_minus_other("suite") == {}
+    again = AttentionShares.from_bytes(weighed.to_bytes())
     np.testing.assert_array_equal(again.mass, mass)
     assert again.to_bytes() == weighed.to_bytes()
     with pytest.raises(UsageError, match="no axis 'layer'"):
         weighed.rows(("layer",))  # type: ignore[arg-type]
 
 
-def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: Weighed) -> None:
+def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
     mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
     mass[..., at["special"]] = np.nan
     mass[0, ..., at["image.left"]] = np.nan
@@ -138,27 +140,27 @@ def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen
     assert "special" not in found
     assert found["image.left"] == pytest.approx(float(mass[1:, ..., at["image.left"]].mean()), rel=1e-5)
     values = (hidden.shares()["image.correct"] - hidden.shares()["image.other"])[1:, 1]
-    assert hidden.toward_correct("suite")[1][0] == pytest.approx(values.mean())
+    assert hidden.correct_minus_other("suite")[1][0] == pytest.approx(values.mean())
     every = replace(weighed, mass=np.where(np.arange(mass.shape[-1]) == at["special"], np.nan, weighed.mass))
     assert weighed_table(every, "suite", "of").parts[0].headings == tuple(
         role for role in weighed_table(weighed, "suite", "of").parts[0].headings if role != "special"
     )
 
 
-def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, noted: Effects) -> None:
-    assert any("no cause" in note for note in noted.notes)
-    assert noted.verdicts == {}
-    assert noted.changes == noted.rows == []
-    assert load_effects(copy, kind="attention").to_csv() == noted.to_csv()
+def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, attention_records: InterventionResult) -> None:
+    assert any("no cause" in note for note in attention_records.notes)
+    assert attention_records.verdicts == {}
+    assert attention_records.changes == attention_records.rows == []
+    assert load_effects(copy, kind="attention").to_csv() == attention_records.to_csv()
     assert set(stored_attention(copy)) == {"color"}
 
 
-def test_the_command_shows_a_table_json_and_csv(copy: Run, noted: Effects) -> None:
+def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: InterventionResult) -> None:
     def ask(style: str) -> str:
         options = ["--kind", "attention", "--categories", "color", "--items", "2", "--format", style]
         told = CliRunner().invoke(app, ["intervene", str(copy.path), *options])
         assert told.exit_code == 0
-        assert f"stored as {noted.key}" in told.stderr
+        assert f"stored as {attention_records.key}" in told.stderr
         assert "no cause" in " ".join(told.stderr.split())
         return told.stdout
 
@@ -173,9 +175,9 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, noted: Effects) -> No
     assert len(found["effects"]) == BLOCKS * ITERATIONS * HEADS * len({row["role"] for row in found["effects"]})
 
 
-def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: Source, twin: "Policy") -> None:
-    asked = Attention(categories=("shape",), items=1, roles=("language",), readout="shadow")
-    effects = intervene_on(copy, asked, source, load=lambda *_: twin)
+def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
+    intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
+    effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert effects.attention is not None
     assert effects.attention.roles == ("all", "language")
     calls = effects.attention.calls
@@ -185,43 +187,45 @@ def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: Source, 
 
 
 def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
-    copy: Run, noted: Effects, source: Source, twin: "Policy", tmp_path: Path
+    copy: Run, attention_records: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
 ) -> None:
     mine = open_run(shutil.copytree(copy.path, tmp_path / "run"))
-    folder = mine.path / "interventions" / noted.key
+    folder = mine.path / "interventions" / attention_records.key
     shutil.rmtree(folder)
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    asked = Attention(categories=("color",), items=2)
+    intervention = AttentionReadout(categories=("color",), items=2)
     with pytest.raises(KeyboardInterrupt):
-        intervene_on(mine, asked, source, load=lambda *_: twin, progress=stop)
-    intervene_on(mine, asked, source, load=lambda *_: twin)
+        run_intervention(mine, intervention, source, load=lambda *_: twin, progress=stop)
+    run_intervention(mine, intervention, source, load=lambda *_: twin)
     file = folder / "attention.npz"
     for name in ("attention.npz", "episodes.npz", "effects.csv", "certificate.json"):
-        assert (folder / name).read_bytes() == (copy.path / "interventions" / noted.key / name).read_bytes()
+        assert (folder / name).read_bytes() == (
+            copy.path / "interventions" / attention_records.key / name
+        ).read_bytes()
     file.write_bytes(file.read_bytes()[:-1] + b"?")
     assert any("attention.npz" in problem for problem in verify_run(mine.path, deep=True).problems)
 
 
-def test_what_cannot_be_told_is_refused_by_name(bench: Bench) -> None:
-    for asked, family, missing in (
-        (Attention(), "internvla-m1", "attention"),
-        (Attention(roles=("image.left",)), "magma", "tiles"),
+def test_what_cannot_be_told_is_refused_by_name(session: ReplaySession) -> None:
+    for intervention, family, missing in (
+        (AttentionReadout(), "internvla-m1", "attention"),
+        (AttentionReadout(roles=("image.left",)), "magma", "tiles"),
     ):
         with pytest.raises(UnsupportedInterventionError, match=f"{family} does not support.*{missing}"):
-            list(map(find_family(family).check_intervention, asked.needs))
+            list(map(find_family(family).check_intervention, intervention.required_capabilities))
     with pytest.raises(UsageError, match=r"no token of backbone plays 'smell'; there are image"):
-        Attention(roles=("smell",)).conditions(bench)
+        AttentionReadout(roles=("smell",)).conditions(session)
     with pytest.raises(UsageError, match="give each once"):
-        Attention(roles=("image", "image"))
+        AttentionReadout(roles=("image", "image"))
 
 
 def test_blocks_with_other_numbers_of_heads_are_no_table() -> None:
     weights = np.ones((1, 2, 3), np.float32) / 3
     mass = AttentionMass({(0, 0): weights, (2, 1): weights})
-    found = by_role(mass, [np.array([True, False, True]), None])
+    found = shares_by_role(mass, [np.array([True, False, True]), None])
     assert found.shape == (3, 2, 2, 2)
     assert np.isnan(found[..., 1]).all()
     found = found[..., :1]
@@ -230,4 +234,4 @@ def test_blocks_with_other_numbers_of_heads_are_no_table() -> None:
     assert np.isnan(found[0, 1]).all()
     for other in (weights[:, :1], np.concatenate([weights, weights])):
         with pytest.raises(CaptureError, match="as many heads"):
-            by_role(replace(mass, by_head={**mass.by_head, (1, 0): other}), [np.array([True] * 3)])
+            shares_by_role(replace(mass, by_head={**mass.by_head, (1, 0): other}), [np.array([True] * 3)])

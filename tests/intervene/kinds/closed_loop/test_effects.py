@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from probe_kit.intervene import Answers, CarriedOut
-from probe_kit.intervene.kinds.closed_loop.effects import carried_out
-from probe_kit.intervene.kinds.site_effects import Passing
+from probe_kit.intervene import ClosedLoopEffect, ConditionOutcomes
+from probe_kit.intervene.kinds.closed_loop.effects import closed_loop_effects
+from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.best_targets import _best
 
 NAMES = (
-    "plain",
-    "exchanged",
+    "clean",
+    "image_swap",
     "backbone.02|image",
     "backbone.02|image|mean-difference",
     "backbone.02|image|control-1",
@@ -20,28 +20,28 @@ NAMES = (
 RIGHT, WRONG, OUT = "correct", "wrong", "oob"
 
 
-def made(outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> Answers:
+def made(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> ConditionOutcomes:
     """outcomes: (K, E), two layouts an item, each item a group of its own."""
-    episodes = len(outcomes[0])
+    episodes = len(episode_outcomes[0])
     items = np.array([f"color-{number // 2}" for number in range(episodes)])
     shape = len(names), episodes
-    return Answers(
+    return ConditionOutcomes(
         conditions=tuple(names),
         episodes=np.array([f"{item}:{'os'[number % 2]}" for number, item in enumerate(items)]),
         items=items,
         groups=items,
         categories=np.full(episodes, "color"),
         sides=np.array([("left", "right")[number % 2] for number in range(episodes)]),
-        lateral=np.zeros(shape),
-        changed=np.zeros(shape),
-        ledger=np.zeros((*shape, 5)),
-        apart=np.zeros(episodes),
-        outcomes=np.array(outcomes),
+        displacement=np.zeros(shape),
+        max_action_change=np.zeros(shape),
+        edit_log=np.zeros((*shape, 5)),
+        replay_error=np.zeros(episodes),
+        episode_outcomes=np.array(episode_outcomes),
     )
 
 
-def found(outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> dict[str, CarriedOut]:
-    return {row.name: row for row in carried_out(made(outcomes, names), "suite")}
+def found(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> dict[str, ClosedLoopEffect]:
+    return {row.name: row for row in closed_loop_effects(made(episode_outcomes, names), "suite")}
 
 
 def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
@@ -52,7 +52,7 @@ def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
     assert (along.gained, along.lost) == (14, 0)
     assert along.p_mcnemar == pytest.approx(2 * 0.5**14)
     assert rows["backbone.02 image"].p_fwe == pytest.approx(1 / 2**8)
-    assert rows["plain"].p is None
+    assert rows["clean"].p is None
 
 
 def test_what_its_control_does_as_well_is_not_confirmed() -> None:
@@ -72,32 +72,32 @@ def test_a_broken_hand_enters_no_verdict_and_no_family() -> None:
     assert rows["backbone.02 image mean-difference"].control_net is None
     assert rows["backbone.02 image mean-difference"].finding == "confirmed"
     half = [WRONG] * 8 + [OUT] * 8
-    assert not found([[RIGHT] * 16, half], NAMES[:2])["exchanged"].hand_broken
+    assert not found([[RIGHT] * 16, half], NAMES[:2])["image_swap"].disrupted
 
 
 def test_falling_out_of_the_zones_is_no_turn() -> None:
     rows = found([[RIGHT] * 16, [OUT] * 6 + [RIGHT] * 10], NAMES[:2])
-    assert rows["exchanged"].net == 0
-    assert rows["exchanged"].correct == 0.625
-    assert rows["exchanged"].finding == "not confirmed"
+    assert rows["image_swap"].net == 0
+    assert rows["image_swap"].correct == 0.625
+    assert rows["image_swap"].finding == "not confirmed"
 
 
 def test_sides_are_of_the_picture_that_is_turned_to() -> None:
     rows = found([[RIGHT] * 16, [WRONG, RIGHT] * 8], NAMES[:2])
-    assert (rows["exchanged"].net_left, rows["exchanged"].net_right) == (0.0, 1.0)
+    assert (rows["image_swap"].net_left, rows["image_swap"].net_right) == (0.0, 1.0)
 
 
 def test_nothing_in_a_zone_is_no_ratio() -> None:
     rows = found([[OUT] * 16, [OUT] * 16], NAMES[:2])
-    assert rows["exchanged"].wrong_in_zone is None
-    assert not rows["exchanged"].hand_broken
+    assert rows["image_swap"].wrong_in_zone is None
+    assert not rows["image_swap"].disrupted
 
 
 def test_shuffled_conditions_are_seldom_confirmed() -> None:
     """Plain and changed outcomes of the same coin: not above one in twenty."""
     draw = np.random.default_rng(0)
     confirmed = [
-        found(draw.choice([RIGHT, WRONG, OUT], size=(2, 16)).tolist(), NAMES[:2])["exchanged"].finding
+        found(draw.choice([RIGHT, WRONG, OUT], size=(2, 16)).tolist(), NAMES[:2])["image_swap"].finding
         == "confirmed"
         for _ in range(100)
     ]
@@ -105,17 +105,17 @@ def test_shuffled_conditions_are_seldom_confirmed() -> None:
 
 
 def test_stored_answers_come_back_with_outcomes_and_without() -> None:
-    answers = made([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
-    again = Answers.from_bytes(answers.to_bytes())
-    assert again.outcomes is not None
-    np.testing.assert_array_equal(again.outcomes, [[RIGHT, WRONG], [OUT, WRONG]])
+    outcomes = made([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
+    again = ConditionOutcomes.from_bytes(outcomes.to_bytes())
+    assert again.episode_outcomes is not None
+    np.testing.assert_array_equal(again.episode_outcomes, [[RIGHT, WRONG], [OUT, WRONG]])
 
 
-def place(name: str, role: str, effect: float, p: float = 0.001) -> Passing:
-    return Passing(
-        category="color", place=name, role=role, direction="", dose="", is_control=False, n_episodes=8, n_items=4,
-        effect=effect, net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0, shift=0.0, control_shift=None,
-        t=0.0, p=p, p_fwe=p, changed=0.0, fires=0, still=0, norm_ratio=0.0,
+def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
+    return PatchEffect(
+        category="color", place=name, role=role, direction="", coefficient="", is_control=False, n_episodes=8, n_items=4,
+        effect=effect, net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0, mean_displacement=0.0, control_displacement=None,
+        t=0.0, p=p, p_fwe=p, max_action_change=0.0, fires=0, no_op_fires=0, relative_change=0.0,
     )  # fmt: skip
 
 

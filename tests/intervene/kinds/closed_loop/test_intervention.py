@@ -12,16 +12,16 @@ from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verif
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene import (
     ClosedLoop,
-    Effects,
-    Source,
-    best_cells,
-    intervene_on,
+    InterventionResult,
+    ReplaySource,
+    best_patch_targets,
     load_effects,
-    stored_following,
+    run_intervention,
+    stored_image_swaps,
 )
-from probe_kit.intervene.replay.conditions import Plain
-from probe_kit.intervene.replay.rollout import carry_out
-from probe_kit.intervene.replay.session import Bench, open_bench
+from probe_kit.intervene.replay.conditions import CleanRun
+from probe_kit.intervene.replay.rollout import roll_out
+from probe_kit.intervene.replay.session import ReplaySession, open_session
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 ASKED = ClosedLoop(
     categories=("color",),
     items=1,
-    cells=("backbone.00|all", "backbone.03|all", "expert.01@0-1|all"),
+    targets=("backbone.00|all", "backbone.03|all", "expert.01@0-1|all"),
     direction="none",
     controls=0,
 )
@@ -56,98 +56,100 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def effects(run: Run, source: Source, twin: "Policy") -> Effects:
-    return intervene_on(run, ASKED, source, load=lambda *_: twin)
+def effects(run: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+    return run_intervention(run, ASKED, source, load=lambda *_: twin)
 
 
-def row_of(effects: Effects, place: str, direction: str = "") -> dict[str, object]:
+def row_of(effects: InterventionResult, place: str, direction: str = "") -> dict[str, object]:
     (row,) = (row for row in effects.carried_out if (row.place, row.direction) == (place, direction))
     return row.to_json()
 
 
-def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effects: Effects) -> None:
+def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effects: InterventionResult) -> None:
     check = effects.certificate["replay"]
     assert check == {
         "episodes": 2, "compared": 2, "equal": 2, "largest_difference": 0.0, "outcomes_equal": 2,
     }  # fmt: skip
-    said = effects.certificate["edits"]["plain"]
+    said = effects.certificate["edits"]["clean"]
     assert said["fires"] == said["still"] == 2 * CALLS * (2 + 2)
     assert [note for note in effects.notes if "of items no p" not in note] == []
 
 
-def test_edits_are_in_force_at_every_inference(effects: Effects) -> None:
+def test_edits_are_in_force_at_every_inference(effects: InterventionResult) -> None:
     edits = effects.certificate["edits"]
     assert edits["backbone.00|all"]["fires"] == 2 * CALLS
     assert edits["expert.01@0-1|all"]["fires"] == 2 * 2 * CALLS
     assert edits["backbone.00|all"]["still"] == 0
 
 
-def test_what_nothing_reads_changes_no_episode_and_what_all_reads_is_the_whole_exchange(effects: Effects) -> None:
+def test_what_nothing_reads_changes_no_episode_and_what_all_reads_is_the_whole_exchange(
+    effects: InterventionResult,
+) -> None:
     assert row_of(effects, "backbone.03")["changed"] == 0.0
     assert row_of(effects, "backbone.03")["fires"] == 2 * CALLS
-    assert row_of(effects, "exchanged")["changed"] > 0  # type: ignore[operator]
-    answers = effects.answers
-    np.testing.assert_allclose(answers.of("backbone.00|all"), answers.of("exchanged"), atol=1e-6)
-    np.testing.assert_array_equal(answers.outcomes[2], answers.outcomes[1])  # type: ignore[index]
+    assert row_of(effects, "image_swap")["changed"] > 0  # type: ignore[operator]
+    outcomes = effects.outcomes
+    np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
+    np.testing.assert_array_equal(outcomes.episode_outcomes[2], outcomes.episode_outcomes[1])  # type: ignore[index]
 
 
-def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: Effects) -> None:
+def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: InterventionResult) -> None:
     assert load_effects(run, kind="closed-loop").to_json() == effects.to_json()
     assert load_effects(run).to_csv() == effects.to_csv()
     assert effects.settings["readout"] == "episode"
-    assert stored_following(run) == {}
+    assert stored_image_swaps(run) == {}
     assert verify_run(run.path, deep=True).ok
     assert set(effects.table["finding"]) <= {"dose 0", "control", "not confirmed", "hand broken"}
 
 
 def test_another_outcome_stops_before_anything_is_stored(
-    run: Run, effects: Effects, source: Source, twin: "Policy", tmp_path: Path
+    run: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
 ) -> None:
     assert effects
     other = open_run(shutil.copytree(run.path, tmp_path / "run"))
     shutil.rmtree(other.path / "interventions")
     other.episodes["outcome"] = "correct"
     with pytest.raises(CaptureChangedActionError, match="ended oob; the run has correct"):
-        intervene_on(other, ASKED, source, load=lambda *_: twin)
+        run_intervention(other, ASKED, source, load=lambda *_: twin)
     assert not (other.path / "interventions" / effects.key).exists()
 
 
 @pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_bytes(
-    recorded_run: Run, source: Source, twin: "Policy", tmp_path: Path
+    recorded_run: Run, source: ReplaySource, twin: "Policy", tmp_path: Path
 ) -> None:
-    asked = ClosedLoop(categories=("color",), items=2, cells=("backbone.02|image",))
+    intervention = ClosedLoop(categories=("color",), items=2, targets=("backbone.02|image",))
     copies = [open_run(shutil.copytree(recorded_run.path, tmp_path / name)) for name in ("whole", "killed")]
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        intervene_on(copies[1], asked, source, load=lambda *_: twin, progress=stop)
-    keys = {intervene_on(copy, asked, source, load=lambda *_: twin).key for copy in copies}
+        run_intervention(copies[1], intervention, source, load=lambda *_: twin, progress=stop)
+    keys = {run_intervention(copy, intervention, source, load=lambda *_: twin).key for copy in copies}
     (key,) = keys
     for name in ("episodes.npz", "effects.csv", "certificate.json"):
         whole, killed = ((copy.path / "interventions" / key / name).read_bytes() for copy in copies)
         assert whole == killed
     edits = load_effects(copies[0], key).certificate["edits"]
-    assert {name.rpartition("|")[2] for name in edits} == {"plain", "image", "mean-difference:1", "control-1"}
+    assert {name.rpartition("|")[2] for name in edits} == {"clean", "image", "mean-difference:1", "control-1"}
     assert all(said["fires"] == 2 * 2 for said in edits.values())
 
 
 def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
-    run: Run, source: Source, twin: "Policy"
+    run: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
     seen: list[tuple[Observation, Observation]] = []
 
-    class Watching(Plain):
-        def play(self, turn):  # type: ignore[no-untyped-def]
-            seen.append((turn.question.seen, turn.question.exchanged))
-            return super().play(turn)
+    class Watching(CleanRun):
+        def play(self, context):  # type: ignore[no-untyped-def]
+            seen.append((context.replay_input.seen, context.replay_input.exchanged))
+            return super().play(context)
 
-    bench: Bench
-    with open_bench(run, source, lambda *_: twin) as bench, bench.ready():
-        (question, _) = bench.questions(str(run.episodes["item_id"][0]))
-        carry_out(bench, question, Watching())
+    session: ReplaySession
+    with open_session(run, source, lambda *_: twin) as session, session.ready():
+        (replay_input, _) = session.replay_inputs(str(run.episodes["item_id"][0]))
+        roll_out(session, replay_input, Watching())
     assert len(seen) == CALLS
     assert (seen[0][0].state != seen[1][0].state).any()
     for own, other in seen:
@@ -158,18 +160,18 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
 @pytest.mark.parametrize(
     "asked",
     [
-        lambda: ClosedLoop(cells=()),
-        lambda: ClosedLoop(cells=("backbone.02",)),
-        lambda: ClosedLoop(cells=("backbone.02|all",), direction="none"),
+        lambda: ClosedLoop(targets=()),
+        lambda: ClosedLoop(targets=("backbone.02",)),
+        lambda: ClosedLoop(targets=("backbone.02|all",), direction="none"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(asked: object) -> None:
+def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
     with pytest.raises(UsageError):
-        asked()  # type: ignore[operator]
+        intervention()  # type: ignore[operator]
 
 
 def test_another_rule_and_no_located_place_are_refused(run: Run) -> None:
     with pytest.raises(UsageError, match="by the rule 'box'"):
-        ASKED.chosen(run.under("box"))
+        ASKED.categories_in(run.under("box"))
     with pytest.raises(UsageError, match="--kind interchange"):
-        best_cells(run, ("color",))
+        best_patch_targets(run, ("color",))

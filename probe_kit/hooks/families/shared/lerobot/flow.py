@@ -24,7 +24,7 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, memory_stream
+from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.capabilities import FLOW
@@ -38,7 +38,7 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import (
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
-from probe_kit.hooks.families.shared.prompt_kv import memory_tap, attach_prompt_kv
+from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv, kv_tap
 from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
@@ -68,7 +68,7 @@ class LerobotFlow(Policy):
         self.stacks = self._stacks()
         self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "expert")}
         self._kept = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
-        self.memory = memory_stream(len(self._kept.keys), self._memory_width)
+        self.prompt_kv = kv_stream(len(self._kept.keys), self._memory_width)
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
         self._show(self.cameras[:1])
@@ -428,8 +428,8 @@ class LerobotFlow(Policy):
         The memory passes once the prompt is read; every iteration then begins with a copy of it.
         """
         stream = self.stream_of(site)
-        if stream is self.memory:
-            return memory_tap(self._kept, site)
+        if stream is self.prompt_kv:
+            return kv_tap(self._kept, site)
         return self.stacks[site.stream].tap(site)
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:

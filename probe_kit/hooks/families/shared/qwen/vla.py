@@ -54,7 +54,7 @@ class QwenVLA(Policy):
         """The decoder's stream."""
         return Stream("backbone", len(self.language.layers) + 1, int(self.vlm.config.text_config.hidden_size))
 
-    def backbone_memory(self) -> Stream:
+    def backbone_kv(self) -> Stream:
         """The decoder's keys and values."""
         return kept_prompt(self.vlm.config.text_config)
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.model import Prompt, AnswerModel, Reading, Tap
+from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
