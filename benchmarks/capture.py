@@ -55,7 +55,7 @@ class Benchmark:
         self._hosts: dict[bool, tuple[Capturer, list[dict[int, EpisodeBuffers]]]] = {}
 
     def ways(self, host: bool) -> dict[str, Callable[[], Output]]:
-        """By name, as far as the family has them; the plain one first."""
+        """By name, as far as the family has them; the clean one first."""
         found: dict[str, Callable[[], Output]] = {
             "plain": self.plain, "pooled": self.pooled, "tokens": self.tokens,
         }  # fmt: skip

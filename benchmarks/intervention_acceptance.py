@@ -78,16 +78,18 @@ def maps(trial: Trial, last: int) -> Iterator[Property]:
     effects = trial.done(Interchange(categories=categories))
     check = effects.certificate["replay"]
     yield Property(
-        "plain inferences are the run's bit for bit", check["equal"] == check["compared"] > 0,
+        "clean inferences are the run's bit for bit", check["equal"] == check["compared"] > 0,
         f"{check['equal']} of {check['compared']}",
     )  # fmt: skip
     end = f"backbone.{last:02d}"
     for category in categories:
-        rows = {(row.place, row.role): row for row in effects.changes if row.category == category}
+        rows = {(row.place, row.role): row for row in effects.effects if row.category == category}
         unread = rows[end, "all"]
         yield Property(
-            f"{category}: {end} is read by nothing", unread.max_action_change == 0 and unread.fires > unread.no_op_fires == 0,
-            f"largest change {unread.max_action_change:g}; {unread.fires} fires moved tokens {unread.relative_change:.2f} norms",
+            f"{category}: {end} is read by nothing",
+            unread.max_action_change == 0 and unread.fires > unread.no_op_fires == 0,
+            f"largest change {unread.max_action_change:g}; {unread.fires} fires moved tokens "
+            f"{unread.relative_change:.2f} norms",
         )  # fmt: skip
         located = [row.name for row in rows.values() if row.is_localised]
         yield Property(
@@ -106,7 +108,7 @@ def last_located(trial: Trial) -> tuple[str, str] | None:
     """The last place, and there the role with the largest effect, of what is located in every used category."""
     effects = trial.done(Interchange(categories=(*trial.used, *trial.unused)))
     everywhere: dict[tuple[str, str], list[float]] = {}
-    for row in effects.changes:
+    for row in effects.effects:
         if row.category in trial.used and row.is_localised and row.role != "all":
             everywhere.setdefault((row.place, row.role), []).append(row.effect or 0.0)
     found = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
@@ -117,7 +119,7 @@ def memories(trial: Trial) -> Iterator[Property]:
     """One block is read, and the others are not."""
     effects = trial.done(Interchange(categories=trial.used, sites=("kv.*",), roles=("all",)))
     for category in trial.used:
-        found = {row.place: row.effect for row in effects.changes if row.category == category}
+        found = {row.place: row.effect for row in effects.effects if row.category == category}
         read = [place for place, effect in found.items() if effect is not None and effect >= 0.95]
         rest = [effect for place, effect in found.items() if place not in read]
         holds = len(read) == 1 and all(effect is not None and abs(effect) <= 0.05 for effect in rest)
@@ -139,7 +141,7 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
         Steering(categories=trial.used, sites=(place,), role=role, coefficients=(4.0,), controls=1)
     )
     for category in categories:
-        own, control = pair(effects.changes, category)
+        own, control = pair(effects.effects, category)
         if category in trial.unused:
             yield Property(
                 f"{category}: rank 1 at {place} {role} turns ≤ .1", abs(own.net) <= 0.1, f"turned {own.net:+.2f}"
@@ -153,7 +155,7 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
             f"{category}: its random control ≤ .05",
             control.effect is not None and abs(control.effect) <= 0.05, shown(control.effect),
         )  # fmt: skip
-        _, orthogonal = pair([row for row in steered.changes if row.dose != "0"], category)
+        _, orthogonal = pair([row for row in steered.effects if row.coefficient != "0"], category)
         yield Property(
             f"{category}: an orthogonal direction at dose 4 turns ≤ .05", abs(orthogonal.net) <= 0.05,
             f"turned {orthogonal.net:+.2f}",
@@ -161,18 +163,18 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
 
 
 def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
-    """Dose zero gives the run's own episodes again."""
+    """The identity patch gives the run's own episodes again."""
     asked = ClosedLoop(
         categories=(*trial.used, *trial.unused), items=items, targets=(cell,), direction="none", controls=0
     )
     try:
         effects = trial.done(asked)
     except CaptureChangedActionError as error:
-        yield Property("closed loop, dose 0: the run's own outcomes", False, str(error))
+        yield Property("closed loop, coefficient 0: the run's own outcomes", False, str(error))
         return
     check = effects.certificate["replay"]
     yield Property(
-        "closed loop, dose 0: the run's own outcomes, and trajectories bit for bit",
+        "closed loop, coefficient 0: the run's own outcomes, and trajectories bit for bit",
         check["outcomes_equal"] == check["episodes"] and check["equal"] == check["compared"],
         f"{check['outcomes_equal']} of {check['episodes']}; {check['equal']} of {check['compared']}",
     )

@@ -3,7 +3,7 @@
     python benchmarks/intervention_cost.py [--family pi0-tiny] [--pairs 200] [--device cpu]
 
 The embedded policy, or another family at the size of `capture_subjects`; one observation, one process. Every pair
-is a plain inference and a changed one, in drawn order, one directly behind the other, so that neighbours on the
+is a clean inference and a changed one, in drawn order, one directly behind the other, so that neighbours on the
 machine disturb both alike. Prints, per way, the median of the pairs' ratios of processor time with its 95 %
 bootstrap interval, and of the times themselves the ratio of medians and of lower fifths. The second plain way says
 what the measurement itself adds. Changes take tokens over from an inference before another picture, with a ledger.
@@ -21,7 +21,8 @@ import numpy as np
 from capture_subjects import LARGER, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
-from probe_kit.intervene.edits.patching import ReplaceWith, TokenSelection, apply_patch
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
@@ -50,15 +51,15 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     seen, other = observations()
     backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
     acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
-    with capture(policy, [*backbone, *acting]) as donor:
+    with capture(policy, [*backbone, *acting]) as source:
         policy.infer_without_acting([other], [0])
     roles = policy.roles([seen])
 
-    def max_action_change(sites: list[Site]) -> Callable[[], object]:
+    def changed(sites: list[Site]) -> Callable[[], object]:
         tokens = TokenSelection.of(roles[sites[0].stream][0].valid, policy.card.device)
 
         def run() -> object:
-            with apply_patch(policy, sites, tokens, ReplaceWith(donor, tokens.count)) as edit_log:
+            with apply_patch(policy, sites, tokens, ReplaceWith(source, tokens.count)) as edit_log:
                 policy.infer_without_acting([seen], [0])
             assert edit_log.fires == len(sites)
             return edit_log

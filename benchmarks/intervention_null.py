@@ -31,7 +31,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
 
 NAMES = (
-    "follow: p < 0.05", "follow: called following", "interchange: single p < 0.05", "interchange: located",
+    "image swap: p < 0.05", "image swap: called following", "interchange: single p < 0.05", "interchange: located",
     "interchange: any p_fwe < 0.05 in a category",
 )  # fmt: skip
 
@@ -67,8 +67,8 @@ def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> Condition
 def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
     """Note every category of a `follow`."""
     for row in image_swap_effects(answers, suite):
-        counts["follow: p < 0.05"].note(row.follow_p < SIGNIFICANCE)
-        counts["follow: called following"].note(row.follows_images)
+        counts["image swap: p < 0.05"].note(row.follow_p < SIGNIFICANCE)
+        counts["image swap: called following"].note(row.follows_images)
 
 
 def count_inside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
@@ -156,7 +156,7 @@ def main() -> None:
     run = run_of(arguments.folder, suite, arguments.model)
     with open_session(run, ReplaySource(suite.folder)) as bench, bench.ready():
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
-        questions = [replace(one, stored=None) for item in items for one in bench.questions(item)]
+        questions = [replace(one, stored=None) for item in items for one in bench.replay_inputs(item)]
         frames = Frames(run, bench, questions)
         measure(
             frames, arguments.model, arguments.folder, range(arguments.twins), arguments.inside, arguments.shuffles

@@ -9,7 +9,7 @@ and no more.
 
 * parity: every family, an extraction, probes and copies to the host, on the device against the CPU.
 * golden: every recorded reference that lies here, through the ordinary adapter, on the CPU, where it was recorded.
-* listening: plain inference against capture in every family; with `--checkpoint FAMILY=DIR` in that family at full
+* listening: clean inference against capture in every family; with `--checkpoint FAMILY=DIR` in that family at full
   size in bfloat16, with a trace of what waited for the device.
 * probes: a site at N = 300 and 3,440, numpy against torch on the device.
 * waiting: the real loop with `--batch auto`.

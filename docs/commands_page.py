@@ -1,6 +1,7 @@
 """An mkdocs hook: puts the options of every command, as Typer knows them, into the page `commands.md`.
 
-A line `<!-- options of: extract -->` becomes the command's help and a table of its arguments and options.
+A line `<!-- options of: extract -->` becomes the command's help and a table of its arguments and options,
+`<!-- kinds of intervention -->` a table of the registered kinds.
 """
 
 import re
@@ -11,11 +12,14 @@ import typer
 PAGE = "commands.md"
 _PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z -]+) -->$", re.MULTILINE)
 
+_KINDS = "<!-- kinds of intervention -->"
+
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for every page. Raises KeyError for a command that does not exist."""
     if page.file.src_uri != PAGE:
         return markdown
+    markdown = markdown.replace(_KINDS, kinds_markdown())
     return _PLACE.sub(lambda place: command_markdown(place["path"]), markdown)
 
 
@@ -32,6 +36,19 @@ def command_markdown(path: str) -> str:
     rows = [row for parameter in command.params if (row := _row(parameter))]
     table = ["| argument or option | default | meaning |", "|---|---|---|", *rows] if rows else []
     return "\n".join([_text(command.help), "", *table])
+
+
+def kinds_markdown() -> str:
+    """What every kind of intervention does, and what the options mean to it."""
+    from probe_kit.intervene.kinds.registry import KINDS
+
+    rows = []
+    for kind in KINDS.values():
+        rows.append(f"| `{kind.name}` | | {_text(kind.summary)} |")
+        rows += [
+            f"| | `--{name.replace('_', '-')}` | {_text(meaning)} |" for name, meaning in kind.options.items()
+        ]
+    return "\n".join(["| kind | option | meaning |", "|---|---|---|", *rows])
 
 
 def _root() -> Any:

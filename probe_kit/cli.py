@@ -24,7 +24,7 @@ from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
 from probe_kit.hooks.commands import new_adapter, verify
-from probe_kit.intervene.commands import intervene
+from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
 from probe_kit.retention.known_used_command import join
@@ -144,12 +144,12 @@ for command in (
     new_adapter,
     train,
     power,
-    intervene,
     retention,
     join,
     doctor,
 ):
     app.command()(command)
+app.command(cls=KindHelp)(intervene)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

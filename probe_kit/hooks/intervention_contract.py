@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
 from probe_kit.hooks.capturing.activation_cache import ActivationCache
-from probe_kit.hooks.capturing.apply_edits import apply_edits
 from probe_kit.hooks.capturing.attention import capture_attention
 from probe_kit.hooks.capturing.capture_context import capture, edit
+from probe_kit.hooks.capturing.edit_engine import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, Vectors, vector_hash
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.model import Policy
@@ -204,7 +204,7 @@ class InterventionContract:
 
     def _memory(self, policy: Policy) -> Stream:
         if policy.prompt_kv is None:
-            pytest.skip(f"{policy.card.family} declares no memory")
+            pytest.skip(f"{policy.card.family} declares no kv stream")
         return policy.prompt_kv
 
     @staticmethod

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
     from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
     from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, Verdict, classify_all, classify_use
-    from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity
+    from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity, InstructionSwapEffect
     from probe_kit.intervene.kinds.instruction_swap.intervention import InstructionSwap
     from probe_kit.intervene.kinds.interchange.intervention import Interchange
     from probe_kit.intervene.kinds.site_effects import PatchEffect
@@ -42,6 +42,7 @@ __all__ = [
     "ImageSwapEffect",
     "InputSensitivity",
     "InstructionSwap",
+    "InstructionSwapEffect",
     "Interchange",
     "InterventionResult",
     "PatchEffect",
@@ -66,6 +67,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "InputSensitivity": "kinds.instruction_swap.effects",
+        "InstructionSwapEffect": "kinds.instruction_swap.effects",
         "InstructionSwap": "kinds.instruction_swap.intervention",
         "stored_site_effects": "results.site_maps",
         "PatchEffect": "kinds.site_effects",

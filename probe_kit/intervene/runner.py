@@ -1,4 +1,4 @@
-"""Carrying out an intervention: replay what is missing, store it, say what it means."""
+"""Running an intervention: replay what is missing, store it, and read the result."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -11,19 +11,18 @@ from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import tidy_bundle
 from probe_kit.extract.store.format.resume_pieces import Pieces
 from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.registry import known_families
-from probe_kit.intervene.edits.patching import LOG_FIELDS
-from probe_kit.intervene.edits.sites import check_unplayed, resolve_sites
-from probe_kit.intervene.kinds.closed_loop.intervention import CELL
+from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
+from probe_kit.intervene.kinds.base import ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
 from probe_kit.intervene.kinds.interchange.intervention import ROLES
-from probe_kit.intervene.kinds.site_effects import ConditionName
 from probe_kit.intervene.replay.conditions import Condition, Intervention, ReplayBatch
 from probe_kit.intervene.replay.per_step import evaluate_per_step
 from probe_kit.intervene.replay.session import Progress, ReplaySession, ReplaySource, open_session
 from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
-from probe_kit.intervene.store.answers import IMAGE_SWAP, ConditionOutcomes, is_stored, save
-from probe_kit.intervene.store.settings import PER_STEP, check_unfit, items_of, key_of, settings_of
+from probe_kit.intervene.store.answers import ConditionOutcomes, is_stored, save
+from probe_kit.intervene.store.settings import PER_STEP, check_run_fits, items_of, key_of, settings_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -42,15 +41,15 @@ def run_intervention(
 ) -> InterventionResult:
     """Intervene on a run's policy, and store what came of it with the run; what is stored is read back.
 
-    asked: what to do; `ImageSwap()` by default. source: where policy and pictures are, by default the embedded suite
-    and the model's own checkpoint. load: how the policy is found, if not by its name. progress: told of items
-    replayed; learning: of items inferred before that, where directions or erasers of tokens are found. What was
-    interrupted is continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError, and what
-    `open_session` raises.
+    intervention: `ImageSwap()` by default. source: where policy and pictures are, by default the embedded suite
+    and the model's own checkpoint. load: how the policy is found, if not by its name. progress: called after every
+    item replayed; on_fit_progress: after every item inferred before that, where directions or erasers are fitted.
+    What was interrupted is continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError,
+    and what `open_session` raises.
     """
     intervention = intervention or ImageSwap()
-    check_unfit(run)
-    check_unsupported(run, intervention)
+    check_run_fits(run)
+    check_supported(run, intervention)
     settings = settings_of(intervention, run)
     key = key_of(settings)
     if is_stored(run.location, key):
@@ -74,7 +73,7 @@ def _execute(
     wanted = items_of(run, intervention)
     with open_session(run, source, load) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
-        _check_unplayed_roles(session, settings)
+        _check_roles(session, settings)
         items = intervention.eligible_items(session, wanted)
         conditions = intervention.conditions(session)
         parts = _replay_items(
@@ -91,24 +90,23 @@ def _execute(
         }
     outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
     further = intervention.extra_files(run, conditions, parts)
-    effects = effects_csv(outcomes, run.suite, str(settings.get("toward", IMAGE_SWAP)), intervention.kind, further)
+    measurement = Measurement(outcomes, run.suite, settings, certificate, further.__getitem__)
+    effects = effects_csv(measurement)
     save(run.location, settings, key, outcomes, effects, certificate, further)
     pieces.discard()
 
 
-def _check_unplayed_roles(session: ReplaySession, settings: Mapping[str, Any]) -> None:
+def _check_roles(session: ReplaySession, settings: Mapping[str, Any]) -> None:
     """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it."""
     roles, sites = settings.get("roles"), settings.get("sites")
     intervention = [(sites, roles)] if roles and sites else []
-    intervention += [
-        ([pattern], [role]) for pattern, role in (cell.split(CELL) for cell in settings.get("cells", ()))
-    ]
+    intervention += [([name.place], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))]
     for patterns, wanted in intervention:
         found = [place.stream for pattern in patterns for place in resolve_sites(pattern, session.policy)]
-        check_unplayed(session.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
+        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
 
 
-def check_unsupported(run: Run, intervention: Intervention) -> None:
+def check_supported(run: Run, intervention: Intervention) -> None:
     """Raise UnsupportedInterventionError, before anything is loaded, for what the run's family does not do."""
     if (family := known_families().get(run.model)) is not None:
         for kind in intervention.required_capabilities:
@@ -148,7 +146,7 @@ def _replay_item(
 
 
 def outcomes_of(run: Run, conditions: Sequence[str], found: ReplayBatch) -> ConditionOutcomes:
-    """What K conditions gave, and for which episodes. conditions: names of the K, the plain one first."""
+    """What K conditions gave, and for which episodes. conditions: names of the K, the clean one first."""
     rows = run.episodes.iloc[found.rows]
     columns = {
         own: rows[name].to_numpy(dtype=str)
@@ -169,7 +167,7 @@ def outcomes_of(run: Run, conditions: Sequence[str], found: ReplayBatch) -> Cond
 
 
 def _replay_check(found: ReplayBatch) -> dict[str, Any]:
-    """Whether the plain inferences are the run's, bit for bit."""
+    """Whether the clean inferences are the run's, bit for bit."""
     known = found.replay_error[~np.isnan(found.replay_error)]
     return {
         "episodes": int(found.replay_error.size),
@@ -192,14 +190,16 @@ def _ledgers(conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, d
         fires = float(rows["fires"].sum())
         if not fires:
             continue
-        means = {name: float((rows[name] * rows["fires"]).sum() / fires) for name in ("norm", "moved")}
+        means = {name: float((rows[name] * rows["fires"]).sum() / fires) for name in ("norm", "change")}
         said[condition.name] = {
-            "fires": fires, "still": float(rows["still"].sum()), **means, "largest": float(rows["largest"].max()),
-            "largest_change": float(found.max_action_change[number].max()),
+            "fires": fires, "no_op_fires": float(rows["no_op_fires"].sum()), **means,
+            "largest_change": float(rows["largest_change"].max()),
+            "max_action_change": float(found.max_action_change[number].max()),
         }  # fmt: skip
-        if ConditionName.of(condition.name).coefficient == "0" and found.max_action_change[number].any():
+        if ConditionName.parse(condition.name).coefficient == "0" and found.max_action_change[number].any():
             raise CaptureChangedActionError(
-                f"{condition.name} adds nothing and changed an action by {found.max_action_change[number].max():.3g}; "
+                f"{condition.name} adds nothing and changed an action by "
+                f"{found.max_action_change[number].max():.3g}; "
                 "expected the same bit for bit. The adapter's tap does not write what it reads, or the model is "
                 "not deterministic"
             )

@@ -10,10 +10,8 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.extract import Run
 from probe_kit.intervene import ImageSwap
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import save
-from probe_kit.intervene.store.settings import key_of, settings_of
-from tests.intervene.answers import follower, habit, outcomes_of
+from probe_kit.intervene.store.settings import settings_of
+from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
 
 @pytest.fixture
@@ -25,14 +23,7 @@ def run(recorded_run: Run, tmp_path: Path) -> Run:
     outcomes = outcomes_of({"color": follower(24), "shape": habit(24)})
     settings = settings_of(ImageSwap(), copy)
     certificate = {"replay": {"episodes": 48, "compared": 48, "equal": 47, "largest_difference": 1e-7}}
-    save(
-        copy.location,
-        settings,
-        key_of(settings),
-        outcomes,
-        effects_csv(outcomes, copy.suite),
-        certificate,
-    )
+    store_outcomes(copy.location, copy.suite, settings, outcomes, certificate)
     return copy
 
 
@@ -44,16 +35,16 @@ def ask(run: Run | str, *options: str) -> tuple[int, str, str]:
 def test_the_table_says_what_follows(run: Run) -> None:
     code, shown, said = ask(run)
     assert code == 0
-    assert "follows" in shown
+    assert "follow %" in shown
     assert "100.0" in shown
     assert "random weights" in shown
-    assert "47 of 48 plain inferences" in said
+    assert "47 of 48 clean inferences" in said
 
 
 def test_what_was_stored_is_said_to_be_read_back_whatever_policy_was_named(run: Run) -> None:
     code, _, said = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
     assert code == 0
-    assert "read back: it was stored, so that no policy, suite or device was looked for" in " ".join(said.split())
+    assert "loaded the stored result; no model was run" in " ".join(said.split())
 
 
 def test_json_holds_settings_and_effects(run: Run) -> None:
@@ -61,7 +52,7 @@ def test_json_holds_settings_and_effects(run: Run) -> None:
     found = json.loads(shown)
     assert code == 0
     assert [row["category"] for row in found["effects"]] == ["color", "shape"]
-    assert found["effects"][0]["p_follows"] == 2.0**-12
+    assert found["effects"][0]["follow_p"] == 2.0**-12
     assert found["settings"]["kind"] == "image-swap"
 
 
@@ -73,10 +64,10 @@ def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "instruction-swap"),
+    ("options", "code", "words"),
     [
-        (("--kind", "wish"), 2, "unknown kind"),
-        (("--format", "xml"), 2, "unknown format"),
+        (("--kind", "wish"), 2, "is not one of"),
+        (("--format", "xml"), 2, "is not one of"),
         (("--categories", "colour"), 2, "color, shape"),
         (("--items", "0"), 2, "at least 1"),
         (("--wording", "named"), 2, "no wording"),
@@ -96,22 +87,22 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "instruction-swap"),
+    ("options", "words"),
     [
-        (("--coefficients", "1"), "--coefficients means nothing to --kind image-swap"),
-        (("--kind", "interchange", "--target-side", "left"), "--target-side means nothing"),
+        (("--coefficients", "1"), "--coefficients does not apply to --kind image-swap"),
+        (("--kind", "interchange", "--target-side", "left"), "--target-side does not apply"),
         (("--kind", "steer"), "needs --sites"),
         (("--kind", "steer", "--sites", "backbone.02", "--roles", "image,language"), "one of --roles"),
         (
             ("--kind", "steer", "--sites", "backbone.02", "--roles", "image", "--coefficients", "much"),
-            "is no dose",
+            "expected numbers",
         ),
         (("--kind", "interchange", "--controls", "2"), "choose --direction"),
         (("--kind", "erase"), "needs --sites"),
         (("--kind", "erase", "--sites", "backbone.02", "--direction", "zap"), "expected leace"),
         (
             ("--kind", "erase", "--sites", "backbone.02", "--coefficients", "1"),
-            "--coefficients means nothing to --kind erase",
+            "--coefficients does not apply to --kind erase",
         ),
     ],
 )
@@ -125,7 +116,7 @@ def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
     for options, words in (
         ((), "--kind interchange"),
         (("--roles", "image"), "go with --sites"),
-        (("--coefficients", "1"), "--coefficients means nothing to --kind closed-loop"),
+        (("--coefficients", "1"), "--coefficients does not apply to --kind closed-loop"),
         (("--sites", "backbone.02", "--direction", "none", "--controls", "1"), "--controls 0"),
         (("--sites", "backbone.02", "--suite", "nowhere"), "is not a suite"),
     ):

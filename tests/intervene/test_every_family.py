@@ -168,7 +168,7 @@ def _check_ledger(run: Run, effects: InterventionResult) -> None:
     for name, said in effects.certificate["edits"].items():
         assert said["fires"] > 0, name
         if name == "clean" or name.endswith("|0"):
-            assert said["largest_change"] == 0.0
-            assert said["still"] == said["fires"]
+            assert said["max_action_change"] == 0.0
+            assert said["no_op_fires"] == said["fires"]
         if name.startswith(last) and "backbone" in supported.unread:
-            assert said["largest_change"] == 0.0, name
+            assert said["max_action_change"] == 0.0, name

@@ -61,10 +61,10 @@ def test_plain_inferences_are_the_runs_bit_for_bit(effects: InterventionResult) 
 def test_too_few_groups_are_said_to_show_nothing(effects: InterventionResult) -> None:
     assert len(effects.notes) == 2
     assert "with 1 group of items no p can be below 0.5, so that nothing is beyond chance" in effects.notes[0]
-    assert all(min(row.follow_p, row.reversal_p) >= 0.5 for row in effects.rows)
+    assert all(min(row.follow_p, row.reversal_p) >= 0.5 for row in effects.effects)
     enough = replace(effects.outcomes, groups=np.array([f"g{number}" for number in range(8)]))
     many = replace(enough, categories=np.full(8, "color"))
-    assert replace(effects, outcomes=many).notes == ()
+    assert replace(effects, measurement=replace(effects.measurement, outcomes=many)).notes == ()
 
 
 def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, session: ReplaySession) -> None:
@@ -124,8 +124,9 @@ def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> N
     assert [one.key for one in stored_interventions(copy)] == [effects.key]
 
 
-def test_killed_and_resumed_gives_the_same_bytes(copy: Run, effects: InterventionResult, mine: Run, source: ReplaySource,
-                                                 twin: "Policy") -> None:  # fmt: skip
+def test_killed_and_resumed_gives_the_same_bytes(
+    copy: Run, effects: InterventionResult, mine: Run, source: ReplaySource, twin: "Policy"
+) -> None:
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
     seen = []
@@ -198,11 +199,11 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
 def test_tables_show_it_beside_the_success_rate(copy: Run, effects: InterventionResult) -> None:
     table = retention([copy])
     assert {row.category: row.follow_rate for row in table.rows} == {
-        row.category: row.follow_rate for row in effects.rows
+        row.category: row.follow_rate for row in effects.effects
     }
     assert all(row.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
-        assert "ollows / against" in text
+        assert "ollow / reversal" in text
     assert json.loads(table.to_json())[0]["used"] == table.rows[0].used
 
 
@@ -251,9 +252,7 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"capture_only": True}, "capture_only"),
      ({"edits": [{}]}, "edited"), ({"ask": {}, "weights_sha256": None}, "asked")],
 )  # fmt: skip
-def test_a_policy_that_did_not_act_is_not_intervened_on(
-    copy: Run, max_action_change: dict[str, object], why: str
-) -> None:
+def test_a_policy_that_did_not_act_is_not_intervened_on(copy: Run, changed: dict[str, object], why: str) -> None:
     run = open_run(copy.path)
     run.settings = {**run.settings, **changed}
     with pytest.raises(UsageError, match=why):

@@ -8,13 +8,12 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import ATTENTION_FILE, save
-from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.intervene.store.answers import ATTENTION_FILE
+from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import retention
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, gallery
 from probe_kit.train import ArrayRun
-from tests.intervene.answers import answers_of, follower
+from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 mpl.use("agg")
 ROLES = ("all", "image", "image.left", "image.right", "language")
@@ -34,15 +33,12 @@ def noted(run: ArrayRun) -> AttentionShares:
     names = np.array(["a", "b", "c", "d"])
     sides = np.array(["left", "right"] * 2)
     weighed = AttentionShares(ROLES, names, names, np.array(["color"] * 4), sides, np.zeros(4, int), mass)
-    answers = answers_of({"color": follower(4)})
+    answers = outcomes_of({"color": follower(4)})
     settings = {
         "format": FORMAT, "kind": "attention", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
         "categories": ["color"],
     }  # fmt: skip
-    check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
-    further = {ATTENTION_FILE: weighed.to_bytes()}
-    written = effects_csv(answers, run.suite, kind="attention", further=further)
-    save(run.location, settings, key_of(settings), answers, written, check, further)
+    store_outcomes(run.location, run.suite, settings, answers, further={ATTENTION_FILE: weighed.to_bytes()})
     return weighed
 
 
@@ -50,7 +46,7 @@ def test_it_shows_means_by_block_and_how_heads_and_iterations_differ(run: ArrayR
     weighed = noted(run)
     display = AttentionDisplay.from_run(run, "color").plot()
     assert display.blocks.tolist() == [0, 2]
-    assert display.roles == ("image", "language", "image.correct", "image.other", "own")
+    assert display.roles == ("image", "language", "image.correct", "image.other", "action")
     assert (display.iterations.shape, display.heads.shape) == ((5, 2, 2), (5, 2, 2))
     shares = weighed.shares()
     for row, role in enumerate(display.roles):

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import ConditionOutcomes, save
-from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.intervene.store.answers import ConditionOutcomes
+from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import retention
 from probe_kit.retention.displays import CausalCurveDisplay, causal_curve, gallery
 from probe_kit.train import ArrayRun, load_results
-from tests.intervene.answers import answers_of, follower, habit
+from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
 mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
@@ -26,15 +25,14 @@ def store(run: ArrayRun, kind: str, answers: ConditionOutcomes, **asked: str) ->
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
         "categories": categories, **asked,
     }  # fmt: skip
-    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
-    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
+    store_outcomes(run.location, run.suite, settings, answers)
 
 
 def inside(answers: ConditionOutcomes, condition: str = "|all", **shares: float) -> ConditionOutcomes:
     """shares: by place (`__` for `.`), how many of the episodes go where the exchange brings them."""
     count = answers.episodes.size
     rows = [
-        np.where(np.arange(count) < share * count, answers.of("exchanged"), answers.of("plain"))
+        np.where(np.arange(count) < share * count, answers.of("image_swap"), answers.of("clean"))
         for share in shares.values()
     ]
     lateral = np.vstack([answers.displacement, *rows])
@@ -52,13 +50,13 @@ def inside(answers: ConditionOutcomes, condition: str = "|all", **shares: float)
 def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
     """Color follows, shape does not; both can be read at layer 1."""
     made = probed_run({"color": SIGNAL, "shape": SIGNAL})
-    answers = answers_of({"color": follower(48), "shape": habit(48)})
-    store(made, "follow", answers)
+    answers = outcomes_of({"color": follower(48), "shape": habit(48)})
+    store(made, "image-swap", answers)
     return made
 
 
 def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
-    answers = answers_of({"color": follower(48)})
+    answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0))
     display = CausalCurveDisplay.from_run(run, load_results(run), "color").plot()
     np.testing.assert_allclose(display.readable.percent, [50.0, 90.0])
@@ -89,7 +87,7 @@ def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
 
 
 def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
-    answers = answers_of({"color": follower(48)})
+    answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
     rows = {row.category: row for row in retention([run]).rows}
     assert rows["color"].used == "inconclusive"
@@ -99,7 +97,7 @@ def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -
 @pytest.mark.parametrize("is_memory_last", [False, True])
 def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_last: bool) -> None:
     """Whichever was stored last took the other's place in verdict and figure."""
-    answers = answers_of({"color": follower(48)})
+    answers = outcomes_of({"color": follower(48)})
     both = {
         "backbone.*": inside(answers, backbone__00=1.0, backbone__01=0.0),
         "kv.*": inside(answers, kv__00=1.0, kv__01=0.0),
@@ -115,7 +113,7 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
 
 def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     """It turned *used* into *inconclusive*, and stopped the report for want of a map to draw."""
-    answers = answers_of({"color": follower(48)})
+    answers = outcomes_of({"color": follower(48)})
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
     (row,) = (row for row in retention([run]).rows if row.category == "color")

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import save
-from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import retention
 from probe_kit.retention.displays import DoseResponseDisplay, dose_response, gallery
 from probe_kit.train import ArrayRun
-from tests.intervene.answers import answers_of, follower
+from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
@@ -28,8 +26,8 @@ def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
 
 def steered(run: ArrayRun) -> None:
     """Toward the wrong side: half of the pushed turn at dose 2, all at dose 4; the control turns one in eight."""
-    answers = answers_of({"color": follower(EPISODES)})
-    plain, item = answers.of("plain"), np.arange(EPISODES)
+    answers = outcomes_of({"color": follower(EPISODES)})
+    plain, item = answers.of("clean"), np.arange(EPISODES)
     turned = {
         "mean-difference|0": item < 0, "mean-difference|2": item < EPISODES / 2, "mean-difference|4": item >= 0,
         "control-1|2": item < 0, "control-1|4": item % 8 == 0,
@@ -37,7 +35,7 @@ def steered(run: ArrayRun) -> None:
     lateral = np.vstack([plain, *(np.where(which, -plain, plain) for which in turned.values())])
     answers = replace(
         answers,
-        conditions=("plain", *(f"backbone.01|image|{name}" for name in turned)),
+        conditions=("clean", *(f"backbone.01|image|{name}" for name in turned)),
         displacement=lateral,
         max_action_change=np.abs(lateral - lateral[0]),
         edit_log=np.ones((*lateral.shape, 5)),
@@ -46,9 +44,7 @@ def steered(run: ArrayRun) -> None:
         "format": FORMAT, "kind": "steer", "run_settings": run.settings_sha256, "stamp": "", "wording": None,
         "categories": ["color"], "target_side": "wrong",
     }  # fmt: skip
-    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
-    written = effects_csv(answers, run.suite, "wrong")
-    save(run.location, settings, key_of(settings), answers, written, {"replay": check})
+    store_outcomes(run.location, run.suite, settings, answers)
 
 
 def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: ArrayRun) -> None:

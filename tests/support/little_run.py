@@ -17,11 +17,10 @@ from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene import ConditionOutcomes, ImageSwap
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import save
-from probe_kit.intervene.store.settings import key_of, settings_of
+from probe_kit.intervene.store.settings import settings_of
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
+from tests.intervene.answers import store_outcomes
 
 STREAMS = (
     StoredStream("backbone", 2, 6, None, 130, ("mean", "last"), quantities=("residual",)),
@@ -114,7 +113,7 @@ def intervene_on_little_run(run: Run) -> None:
     names = {"episodes": "episode_id", "items": "item_id", "groups": "group_id", "categories": "category"}
     lateral = draw.normal(size=(2, len(episodes)))
     answers = ConditionOutcomes(
-        conditions=("plain", "exchanged"),
+        conditions=("clean", "image_swap"),
         **{own: episodes[name].to_numpy(dtype=str) for own, name in names.items()},
         sides=episodes["side_correct"].to_numpy(dtype=str),
         displacement=lateral,
@@ -128,7 +127,7 @@ def intervene_on_little_run(run: Run) -> None:
         "equal": len(episodes),
         "largest_difference": 0.0,
     }
-    save(run.location, settings, key_of(settings), answers, effects_csv(answers, run.suite), {"replay": check})
+    store_outcomes(run.location, run.suite, settings, answers, {"replay": check})
 
 
 def probe_little_run(run: Run) -> None:

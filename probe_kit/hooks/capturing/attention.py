@@ -1,4 +1,4 @@
-"""How much attention what acts pays to every token of the backbone. It weighs; only an edit says what is read.
+"""The acting stream's attention on every token of the backbone. Descriptive; only an edit shows what is read.
 
 with attention(policy) as mass:
     policy.act([seen], [seed])
@@ -18,12 +18,12 @@ from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.roles import Roles
 
 Read = tuple[int, int]
-"""A block of the backbone whose memory is read, and the iteration in which it is."""
+"""A block of the backbone whose keys and values are read, and the iteration in which it is."""
 
 
 @dataclass
 class AttentionMass:
-    """Shares of attention, by (block of the backbone whose memory is read, iteration).
+    """Shares of attention, by (block of the backbone whose keys are read, iteration).
 
     by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's own
     tokens. Not a cause: a token can be weighed and not be used, and an optional display is all that it serves.
@@ -63,7 +63,7 @@ class AttentionMass:
 
 @contextmanager
 def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
-    """Note the attention of what acts while `policy` acts once; its actions stay the same, bit for bit.
+    """Note the attention of the acting stream while `policy` acts once; its actions stay the same, bit for bit.
 
     Raises UnsupportedInterventionError for a family that does not tell it, CaptureError if nothing was weighed.
     """

@@ -1,9 +1,9 @@
 """Edits as data: what is changed in a stream while a model runs, said so that a run can be named by it.
 
 move = Edit("add", (Site("backbone", 2),), roles=("language",), vector=vector_hash(direction), strength=2.0)
-with applied(model, [move], seen, {move.vector: direction}) as ledger:
+with apply_edits(model, [move], seen, {move.vector: direction}) as edit_log:
     model.act(seen, seeds)
-ledger.entries  # what fired where, and how far it moved
+edit_log.entries  # what fired where, and how far it moved
 """
 
 import hashlib

@@ -10,8 +10,8 @@ from probe_kit.errors import UnsupportedInterventionError, UsageError
 InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles"]
 Readout = Literal["first-chunk", "per-step"]
 _UNDECLARED = {
-    "kv": "its adapter declares no memory. Interchange residual sites instead, or declare `Model.prompt_kv`",
-    "attention": "its adapter gives no attention. Exchange the memory or single roles instead: what an exchange "
+    "kv": "its adapter declares no `kv` stream. Interchange residual sites instead, or declare `Model.prompt_kv`",
+    "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
     "moves is read, whatever attention weighs",
     "tiles": "its adapter does not say which picture token comes of which patch. Exchange all of `image`, or "
     "declare `Model.patch_order`",
@@ -22,17 +22,16 @@ _UNDECLARED = {
 class Interventions:
     """What can be asked of a family when the question is whether a stream is used.
 
-    Following, the comparison of actions on exchanged pictures or words, every policy supports: it is two
+    Following, the comparison of actions on swapped images or words, every policy supports: it is two
     inferences.
 
     edits: per stored stream the quantities that can be rewritten; None for all that its streams have.
     unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
     the actions bit for bit, which makes it a control.
-    prompt_kv: whether it keeps keys and values of the prompt that what acts reads, see `Model.prompt_kv`.
-    first_affected_token: the first output that an edit of backbone or memory reaches through the memory: 0, or 1
-    where the
+    prompt_kv: whether it keeps keys and values of the prompt that the acting stream reads, see `Model.prompt_kv`.
+    first_affected_token: the first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where the
     prompt's own pass already chooses the first token.
-    attention: whether it tells how much attention what acts pays to every token of the prompt.
+    attention: whether it tells how much attention the acting stream pays to every token of the prompt.
     tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
     readout: `chunk` where the first chunk says where the hand will go; `shadow` where an inference gives one
     action in greedy bins, so that conditions are evaluated at every call of an unedited episode, never executed.

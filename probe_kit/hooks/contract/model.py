@@ -103,8 +103,8 @@ class Model(ABC):
     """A network that can be captured: what capture, edits, verification and the store need.
 
     streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
-    prompt_kv: the keys and values that the part which acts reads of the backbone, block by block, as a stream of the
-    quantities `MEMORY`; captured and edited by naming their sites, such as `memory.02.values`; None where a family
+    prompt_kv: the keys and values of the prompt that the acting part reads, block by block, as a stream of the
+    quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
     has none. Its tokens are the backbone's.
     role_names: per stream, every role its tokens can play.
     """
@@ -142,12 +142,12 @@ class Model(ABC):
         return [site for stream in having for site in stream.sites(quantity)]
 
     def every_stream(self) -> dict[str, Stream]:
-        """What is stored, what is captured by name only, and the memory."""
-        memory = {} if self.prompt_kv is None else {self.prompt_kv.name: self.prompt_kv}
-        return {**self.streams, **self.further_streams, **memory}
+        """What is stored, what is captured by name only, and `kv`."""
+        kv = {} if self.prompt_kv is None else {self.prompt_kv.name: self.prompt_kv}
+        return {**self.streams, **self.further_streams, **kv}
 
     def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """As `roles`, and those of the memory's tokens."""
+        """As `roles`, and those of the tokens of `kv`."""
         roles = self.roles(seen)
         if self.prompt_kv is not None:
             roles[self.prompt_kv.name] = roles[self.tokens_of(self.prompt_kv.name)]
@@ -164,7 +164,7 @@ class Model(ABC):
         )
 
     def tokens_of(self, stream: str) -> str:
-        """The stored stream whose tokens a stream has: the backbone for the memory, else itself."""
+        """The stored stream whose tokens a stream has: the backbone for `kv`, else itself."""
         if self.prompt_kv is None or stream != self.prompt_kv.name:
             return stream
         return first_of("backbone", self.streams.values()) or stream
@@ -233,7 +233,7 @@ class Policy(Model):
         return self.act(seen, seeds)
 
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
-        """A context in which `note` is given what attention what acts pays; see `hooks.attention`.
+        """A context in which `note` is given what attention the acting stream pays; see `hooks.attention`.
 
         note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
         the backbone's T tokens. No number of the inference may change. Raises UnsupportedInterventionError.

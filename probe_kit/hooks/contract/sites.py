@@ -12,7 +12,10 @@ PARTS: tuple[Part, ...] = get_args(Part)
 QUANTITIES = ("residual", "attention", "mlp", "final_norm")
 """What the streams of today's families have; a family may declare others."""
 KV = ("keys", "values")
-"""What a memory has, per block and token: all heads side by side, as attention reads them, keys after rotation."""
+"""Quantities of the stream `kv`, per block and token: all heads side by side, as attention reads them.
+
+Keys are those after rotation.
+"""
 KV_STREAM = "kv"
 
 _PATTERN = re.compile(
@@ -133,8 +136,10 @@ class Stream:
 
 
 def kv_stream(blocks: int, width: int) -> Stream:
-    """The memory of a backbone of so many blocks; width: heads times size of a head."""
-    return Stream(KV_STREAM, blocks + 1, width, part="bridge", label="memory of the prompt", quantities=KV)
+    """The stream `kv` of a backbone of so many blocks; width: heads times size of a head."""
+    return Stream(
+        KV_STREAM, blocks + 1, width, part="bridge", label="keys and values of the prompt", quantities=KV
+    )
 
 
 def part_of(stream: str) -> Part:

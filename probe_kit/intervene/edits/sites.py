@@ -25,7 +25,7 @@ _PATTERN = re.compile(r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(@(?P<firs
 
 @dataclass(frozen=True)
 class SiteGroup:
-    """One layer of a stream, over some of its iterations; of a memory its keys and values together."""
+    """One layer of a stream, over some of its iterations; of `kv` its keys and values together."""
 
     name: str
     sites: tuple[Site, ...]
@@ -55,8 +55,8 @@ def resolve_sites(pattern: str, policy: "Policy") -> list[SiteGroup]:
     """The places that a pattern names.
 
     `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
-    changed at each of them; `expert.03` over all; `memory.02` what block 2 hands over to what acts, keys and
-    values together. Raises UnknownSiteError, and UnsupportedInterventionError for the memory of a family that has
+    changed at each of them; `expert.03` over all; `kv.02` what block 2 hands over to the acting stream, keys and
+    values together. Raises UnknownSiteError, and UnsupportedInterventionError for `kv` of a family that has
     none.
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
@@ -99,7 +99,7 @@ def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> N
     mask = roles.valid if role == ALL else roles.mask(role)
     if not mask.any():
         there = ", ".join(dict.fromkeys(span.role for span in roles.spans))
-        raise EmptyRoleError(f"no token of {stream} plays {role!r}; there are {there}")
+        raise EmptyRoleError(f"no token of {stream} has the role {role!r}; there are {there}")
     return np.asarray(mask, bool)
 
 
@@ -110,7 +110,9 @@ def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
     return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]
 
 
-def check_unplayed(policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]) -> None:
+def check_roles_have_tokens(
+    policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]
+) -> None:
     """Raise UsageError for a wanted role that no token of these streams plays.
 
     usual: the roles that are tried if nothing is said, of which one that is there will do.
@@ -121,6 +123,6 @@ def check_unplayed(policy: "Policy", streams: Sequence[str], wanted: Sequence[st
         return
     named = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
     raise UsageError(
-        f"no token of {', '.join(streams)} plays {missing[0]!r}; expected one of "
+        f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
         f"{', '.join(dict.fromkeys((ALL, *named)))}"
     )

@@ -3,14 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.interventions import InterventionKind
-from probe_kit.intervene.edits.patching import LOG_FIELDS, EditLog
 from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP
 from probe_kit.intervene.store.settings import InterventionSettings
@@ -32,7 +32,7 @@ class ConditionContext:
 class ConditionResult:
     """The actions (chunk, 7) of one inference, and what was changed in it, if anything.
 
-    mass: (B, I, H, R) what attention was paid in it, if it was asked for; see `weighed.Weighed`.
+    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`.
     """
 
     chunk: Chunk
@@ -83,6 +83,12 @@ class Intervention(InterventionSettings, ABC):
         del run, conditions, found
         return {}
 
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """As the command builds it. options: of the command, those that are given. Raises UsageError."""
+        del run
+        return cls(**options)
+
     @abstractmethod
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """All of them, in the order in which they are stored; the first is `CleanRun`."""
@@ -118,12 +124,13 @@ AttentionRecord = tuple[int, int, NDArray[np.float32]]
 class ReplayBatch:
     """What K conditions gave for E episodes.
 
-    rows: (E,) in the run's episodes. lateral: (K, E) metres, see `ReplaySession.lateral`. changed: (K, E) the largest
-    difference of any action from the plain one's. ledger: (K, E, 5) what was changed, see `patching.LEDGER`.
-    replay_error: (E,) of the plain one from the stored one; NaN where the run does not say. outcomes: (K, E) where the
-    cube ended, correct, wrong or oob, for episodes that were played to their end; then `displacement` is the cube's,
-    and `changed` and `apart` are of the trajectory. None where nothing was carried out. mass: (N, B, I, H, R) the
-    attention of N inferences, inferences: (N, 2) of which row and call they are; None where nobody asked for it.
+    rows: (E,) in the run's episodes. displacement: (K, E) metres, see `ReplaySession.lateral_displacement`.
+    max_action_change: (K, E) the largest difference of any action from the clean one's. edit_log: (K, E, 5) see
+    `LOG_FIELDS`. replay_error: (E,) of the clean inference from the stored one; NaN where the
+    run does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were
+    played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the
+    trajectory; None where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences, inferences:
+    (N, 2) their rows and calls; None where attention was not recorded.
     """
 
     rows: NDArray[np.int64]
@@ -136,7 +143,7 @@ class ReplayBatch:
     inferences: NDArray[np.int64] | None = None
 
     def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
-        """With the attention of its inferences, if any was noted."""
+        """With the attention of its inferences, if any was recorded."""
         if not attention_records:
             return self
         rows, calls, masses = zip(*attention_records, strict=True)
@@ -174,7 +181,7 @@ class ReplayBatch:
 def replay(
     session: ReplaySession, replay_inputs: Sequence[ReplayInput], conditions: Sequence[Condition]
 ) -> ReplayBatch:
-    """Play every condition on every question; the first one is the plain one."""
+    """Play every condition on every question; the first one is the clean one."""
     found = ReplayBatch.none_yet(replay_inputs, conditions)
     attention_records: list[AttentionRecord] = []
     for column, replay_input in enumerate(replay_inputs):

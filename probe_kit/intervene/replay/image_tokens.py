@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError
+from probe_kit.hooks.capturing.token_edits import TokenSelection
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.edits.patching import TokenSelection
 from probe_kit.intervene.edits.sites import TILE_ROLES, token_mask
 from probe_kit.suite.items import Side
 
@@ -26,7 +26,7 @@ TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True)
 """Roles by tile, and the tile."""
 IMAGE = "image"
 PATCHES = "patches"
-"""Under which a question remembers its own, which all tiles are held against."""
+"""Under which an input keeps its own, which all tiles are compared with."""
 ENOUGH = 0.1
 """Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
 
@@ -75,7 +75,7 @@ def tokens_overlapping(
 ) -> NDArray[np.bool_]:
     """(tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
 
-    before: what `patch_embeddings` gives of `seen`, where somebody has it.
+    before: what `patch_embeddings` gives of `seen`, if it is known.
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)

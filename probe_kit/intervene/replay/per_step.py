@@ -1,7 +1,7 @@
-"""Shadow: the episode goes on as it was, and at every call each condition is evaluated and not carried out.
+"""Per-step readout, teacher-forced: every condition is evaluated at every call of the unedited episode.
 
 Where one inference is one action in greedy bins, the first one says little of where the hand will go. Here every
-condition meets every state of the unedited episode, and what its actions would add across is summed up.
+condition gets every state of the unedited episode, and the lateral displacements of its actions are summed.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from probe_kit.extract.rollout.stage import Answer, Ending
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.capturing.edit_engine import EditLog
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.edits.patching import EditLog
 from probe_kit.intervene.replay.conditions import AttentionRecord, Condition, ConditionContext, ReplayBatch
 from probe_kit.intervene.replay.rollout import RolloutResult, apart_from_stored, executed, planned_of
 from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
@@ -22,9 +22,9 @@ from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 
 @dataclass(frozen=True)
 class _Evaluated:
-    """K conditions along one episode. lateral, changed: (K,). ledger: (K, 5). plain: how the episode went.
+    """K conditions along one episode. displacement, max_action_change: (K,). edit_log: (K, 5).
 
-    noted: what attention was asked for, a call each.
+    plain: how the episode went. attention_records: one per call, if attention was recorded.
     """
 
     displacement: NDArray[np.float64]
@@ -37,10 +37,10 @@ class _Evaluated:
 def evaluate_per_step(
     session: ReplaySession, replay_inputs: Sequence[ReplayInput], conditions: Sequence[Condition]
 ) -> ReplayBatch:
-    """Every condition along every episode; the first one, which changes nothing, is carried out.
+    """Every condition along every episode; the first one, which edits nothing, is executed.
 
-    `displacement` is where the hand began plus what all calls' actions would add across, in metres from the middle,
-    left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
+    `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
+    the middle, left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
     """
     found = ReplayBatch.none_yet(replay_inputs, conditions)
     attention_records: list[AttentionRecord] = []

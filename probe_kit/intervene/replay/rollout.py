@@ -1,4 +1,4 @@
-"""Playing episodes again under conditions, step by step, beside the same state with its pictures exchanged."""
+"""Playing episodes again under conditions, step by step, with the same state and swapped images as source."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.action_ensemble import ensemble
 from probe_kit.extract.rollout.stage import Answer, Ending
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.capturing.edit_engine import EditLog
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.edits.patching import EditLog
 from probe_kit.intervene.replay.conditions import Condition, ConditionContext, ReplayBatch
 from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 from probe_kit.suite.items import Episode
@@ -58,7 +58,7 @@ def roll_out(
 ) -> RolloutResult:
     """One episode under a condition that is in force at every inference.
 
-    exchanging: whether the condition looks at exchanged pictures; they are then drawn at every inference.
+    exchanging: whether the condition looks at swapped images; they are then drawn at every inference.
     """
     stage, planned = session.stage, planned_of(session, replay_input)
     seen: Answer = stage.begin(planned, False)
@@ -105,7 +105,7 @@ def apart_from_stored(session: ReplaySession, replay_input: ReplayInput, plain: 
     if stored != plain.outcome:
         raise CaptureChangedActionError(
             f"{replay_input.episode_id}, played again with nothing changed, ended {plain.outcome}; the run has "
-            f"{stored}. A closed loop is held against the run's own outcomes, so that all must repeat: extract "
+            f"{stored}. A closed loop is compared with the run's own outcomes, so that all must repeat: extract "
             "with --batch 1 on this machine (larger batches and other devices round otherwise), then intervene on "
             "that run"
         )

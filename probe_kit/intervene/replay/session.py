@@ -1,4 +1,4 @@
-"""The bench: a run's policy and scene, set up again so that its first inferences can be repeated and changed."""
+"""A replay session: a run's policy and scene, set up again to repeat and edit its inferences."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -63,10 +63,10 @@ class ReplaySource:
 
 @dataclass(frozen=True)
 class ReplayInput:
-    """The first inference of one episode, and what is seen when the two pictures are exchanged.
+    """The first inference of one episode, and the observation with the two images swapped.
 
     row: in the run's episodes. seed: of the inference. tiles: (H, W) where in its picture each tile's own is seen.
-    stored: (n, 7) actions that the run carried out of it, None where it does not say.
+    stored: (n, 7) actions that the run executed of it, None where it does not say.
     """
 
     row: int
@@ -86,8 +86,8 @@ class ReplayInput:
 class ReplaySession:
     """A policy and a scene; a context manager, because it holds a simulator.
 
-    items: of the run's suite, by id. twins: of those that have one, see `counterparts_of`. learning: is told of items
-    that are inferred beforehand, for directions and erasers.
+    items: of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`. on_fit_progress:
+    called after every item that is inferred beforehand, for directions and erasers.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
@@ -175,7 +175,7 @@ class ReplaySession:
             return np.asarray(self.policy.act(copied([seen]), [seed])[0], np.float32)
 
     def replay_error(self, replay_input: ReplayInput, chunk: Chunk) -> float:
-        """By how much a plain inference differs from what the run carried out; NaN where it does not say.
+        """By how much a clean inference differs from what the run executed; NaN where it does not say.
 
         Raises CaptureChangedActionError if it is another action altogether.
         """

@@ -50,7 +50,7 @@ class TokenDirections:
 
 
 def check_direction(direction: str) -> None:
-    """Raises UsageError for what is no direction to take tokens over along."""
+    """Raises UsageError for what is no direction to patch tokens within."""
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)
     elif direction not in DIRECTIONS:
@@ -71,7 +71,7 @@ def fit_token_directions(
     """By place and role what `direction` means there: of the run's columns, or of the tokens of these items (ids).
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
-    same for every token; from one plain inference per episode and place. wanted: roles by place. Raises
+    same for every token; from one clean inference per episode and place. wanted: roles by place. Raises
     UnknownSiteError for a place of several sites or one that is not stored, UsageError where there are too few
     episodes to learn from.
     """

@@ -37,7 +37,7 @@ class TokenFeatures:
 def collect_token_features(
     session: ReplaySession, items: Sequence[str], wanted: Mapping[SiteGroup, Sequence[str]]
 ) -> Iterator[tuple[SiteGroup, str, str, TokenFeatures]]:
-    """Place, role, category and what was gathered there, from one plain inference per episode and place.
+    """Place, role, category and what was gathered there, from one clean inference per episode and place.
 
     items: by id, all of their episodes. wanted: roles by place. What is held at a time is of one place and
     category: 8 bytes per number, episodes × tokens × width. Raises UnknownSiteError for a place of several sites.

@@ -7,30 +7,25 @@ from typing import Any
 from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import PARTIAL, Bundle, read_bundles
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.intervene.kinds.attention.attention_mass import preferred_attention
-from probe_kit.intervene.results.site_maps import keys_in_use
-from probe_kit.intervene.store.answers import ATTENTION, stored_interventions
-from probe_kit.intervene.store.selection import preferred_by_category
+from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.intervene.store.answers import stored_interventions
+from probe_kit.intervene.store.former_words import current_settings
 from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
     {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout"}
 )
-"""What every intervention is parameters; the rest of its settings is its kind's own."""
-
-
-TABLED = frozenset({"follow", "interchange", "steer", ATTENTION})
-"""Kinds that verdicts, tables or figures read."""
+"""Settings of every intervention; the rest of its settings is its kind's own."""
 
 
 @dataclass(frozen=True)
-class StoredIntervention:
+class ListedIntervention:
     """One stored intervention, or what is known of one written by another version.
 
     state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
     that it says, of more episodes or newly; `other episodes` if the run has others by now; `other version` if this
-    version cannot read it. parameters: what its kind was parameters besides, as stored.
+    version cannot read it. parameters: the settings of its kind alone, as stored.
     """
 
     key: str
@@ -64,7 +59,7 @@ class StoredIntervention:
         return f"made {self.created[:16].replace('T', ' ')} UTC"
 
 
-def listed_interventions(run: Any) -> list[StoredIntervention]:
+def listed_interventions(run: Any) -> list[ListedIntervention]:
     """All of a run, oldest first. Raises RunDamagedError if one was changed."""
     wordings = getattr(run, "wordings", ())
     readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
@@ -83,17 +78,22 @@ def unfinished_interventions(location: Location) -> dict[str, int]:
 
 def _used(run: RunReader) -> set[str]:
     """Keys of what is read, and of the kinds of which nothing takes another's place."""
-    found = {result.stored.key for result in preferred_by_category(run, "follow").values()} | keys_in_use(run)
-    found |= {result.stored.key for result, _ in preferred_attention(run).values()}
-    return found | {one.key for one in stored_interventions(run) if one.settings["kind"] not in TABLED}
+    by_kind: dict[str, list[str]] = {}
+    for one in stored_interventions(run):
+        by_kind.setdefault(str(one.settings["kind"]), []).append(one.key)
+    found: set[str] = set()
+    for name, keys in by_kind.items():
+        kind = KINDS.get(name)
+        found |= kind.function("keys_in_use")(run) if kind is not None and kind.keys_in_use else set(keys)
+    return found
 
 
-def _listed(bundle: Bundle, current: set[str], used: set[str]) -> StoredIntervention:
-    settings, created = bundle.head["settings"], bundle.times.get("created", "")
+def _listed(bundle: Bundle, current: set[str], used: set[str]) -> ListedIntervention:
+    settings, created = current_settings(bundle.head["settings"], FORMAT), bundle.times.get("created", "")
     if settings.get("format") != FORMAT:
-        return StoredIntervention(bundle.key, "other version", created)
+        return ListedIntervention(bundle.key, "other version", created)
     state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
-    return StoredIntervention(
+    return ListedIntervention(
         key=bundle.key,
         state=state,
         created=created,

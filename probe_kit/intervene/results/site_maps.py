@@ -10,7 +10,8 @@ from typing import Any
 
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL
-from probe_kit.intervene.kinds.site_effects import ConditionName, PatchEffect, patch_effects
+from probe_kit.intervene.kinds.base import ConditionName
+from probe_kit.intervene.kinds.site_effects import PatchEffect, patch_effects
 from probe_kit.intervene.store.answers import IMAGE_SWAP
 from probe_kit.intervene.store.selection import PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.train.data.run_reader import RunReader
@@ -21,9 +22,9 @@ WHOLE, USUAL, WRONG = "none", "mean-difference", "wrong"
 
 
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """By category, the maps: what happens where tokens are taken over whole, a row for every place and role.
+    """By category, the maps: what happens where tokens are patched in full, a row for every place and role.
 
-    The backbone first and the memory last, shallow before deep. Raises RunDamagedError.
+    The backbone first and `kv` last, shallow before deep. Raises RunDamagedError.
     """
     return _by_category(run, _maps(run))
 
@@ -52,15 +53,15 @@ def keys_in_use(run: RunReader) -> set[str]:
 
 
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
-    """The places, each once, that carry half of the effect or more when their tokens are taken over whole."""
+    """The places, each once, that carry half of the effect or more when their tokens are patched in full."""
     return tuple(dict.fromkeys(row.place for row in rows if row.is_localised and not row.direction))
 
 
 def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """By category, `localised_sites` of its maps; without categories that nobody searched.
+    """By category, `localised_sites` of its maps; without categories that were not searched.
 
-    Searched is one of which all tokens of some layer of the backbone were exchanged, or of which a place was
-    found. That a single role, iteration or block carries nothing says nothing of the others.
+    Searched is one of which all tokens of some layer of the backbone were patched, or of which a place was found:
+    a null result for one role, iteration or block does not rule out the others.
     """
     maps = stored_site_effects(run)
     searched = {
@@ -107,7 +108,8 @@ def _along(run: RunReader) -> list[_Selection]:
 
 def _steering(run: RunReader) -> list[_Selection]:
     return _chosen(
-        pool_conditions(stored_results(run, "steer"), ("direction", "seed", "toward")), ("direction", "toward")
+        pool_conditions(stored_results(run, "steer"), ("direction", "seed", "target_side")),
+        ("direction", "target_side"),
     )
 
 
@@ -130,7 +132,7 @@ def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]
     """The conditions of every place and role, controls and doses among them."""
     found: dict[tuple[str, str], list[str]] = {}
     for condition in sorted(group.sources):
-        named = ConditionName.of(condition)
+        named = ConditionName.parse(condition)
         found.setdefault((named.place, named.role), []).append(condition)
     return {cell: tuple(names) for cell, names in found.items()}
 
@@ -148,7 +150,7 @@ def _rows_of(chosen: Sequence[_Selection], suite: str) -> Iterator[tuple[_Select
 
 def _test_together(group: PooledConditions, stream: str, suite: str) -> dict[str, PatchEffect]:
     conditions = sorted(name for name in group.sources if _stream(name) == stream)
-    target_side = str(group.like.stored.settings.get("toward", IMAGE_SWAP))
+    target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
     rows = patch_effects(group.outcomes(conditions), suite, target_side)
     return {
         name: replace(row, key=group.sources[name].stored.key) for name, row in zip(conditions, rows, strict=True)
@@ -167,18 +169,18 @@ def _direction(settings: Mapping[str, Any]) -> str:
 
 
 def _in_words(steered: _Selection) -> str:
-    named, settings = ConditionName.of(steered.conditions[0]), steered.group.like.stored.settings
-    direction, target_side = str(settings.get("direction", USUAL)), str(settings.get("toward", WRONG))
+    named, settings = ConditionName.parse(steered.conditions[0]), steered.group.like.stored.settings
+    direction, target_side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
     further = [direction] * (direction != USUAL) + [f"toward {target_side}"] * (target_side != WRONG)
     return ", ".join([f"{named.place} {named.role}", *further])
 
 
 def _stream(condition: str) -> str:
-    return ConditionName.of(condition).place.partition(".")[0]
+    return ConditionName.parse(condition).place.partition(".")[0]
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
-    """The backbone, then what acts, then the memory; shallow before deep, all tokens before single roles."""
+    """The backbone, then the acting stream, then `kv`; shallow before deep, all tokens before single roles."""
     place, role, *values = subject
     stream, _, rest = place.partition(".")
     layer, _, iterations = rest.partition("@")

@@ -22,19 +22,23 @@ from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
 from probe_kit.extract.store.format.hashes import as_json
 from probe_kit.extract.store.locations.location import Location
+from probe_kit.intervene.store.former_words import (
+    FORMER_FORMAT,
+    current_arrays,
+    current_certificate,
+    current_settings,
+)
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import stamp_of_run
 
-CLEAN, IMAGE_SWAP = "plain", "exchanged"
-"""Conditions: as the run made it, and before the same two pictures in each other's place."""
-PICTURES, NOISE = "pictures", "noise"
-"""Of `words`, where the words are what is exchanged: the pictures instead, and only the noise drawn anew."""
-ERASE, PROBE_ACCURACY = "erase", "readable"
+CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
+"""Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
+ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
 """A kind, and what its certificate calls what probes read behind its conditions."""
-ATTENTION, RECORDED, ATTENTION_FILE = "attention", "noted", "attention.npz"
-"""A kind, its condition in which somebody notes the weights, and the file in which they are."""
-UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, PICTURES, NOISE, RECORDED})
+ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
+"""A kind, its condition with recorded weights, and the file in which they are."""
+UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED})
 """Conditions in which nothing inside the network is changed."""
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
 
@@ -43,11 +47,11 @@ EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.jso
 class ConditionOutcomes:
     """What K conditions gave for E episodes of a run; see `conditions.Replayed`.
 
-    conditions: names of the K, the plain one first. episodes, items, groups, categories, sides: (E,), `sides`
-    those of the correct picture. lateral: (K, E) metres from the middle, left positive. changed: (K, E) largest
-    difference of any action from the plain one's. ledger: (K, E, 5), see `patching.LEDGER`. apart: (E,) of the
-    plain one from the stored one. outcomes: (K, E) correct, wrong or oob, where episodes were played to their end;
-    else None.
+    conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
+    those of the correct picture. displacement: (K, E) metres from the middle, left positive. max_action_change:
+    (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see `LOG_FIELDS`.
+    replay_error: (E,) of the clean one from the stored one. episode_outcomes: (K, E) correct, wrong or oob, where
+    episodes were played to their end; else None.
     """
 
     conditions: tuple[str, ...]
@@ -95,12 +99,11 @@ class ConditionOutcomes:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
-        """Read back."""
+    def from_bytes(cls, content: bytes, former_kind: str | None = None) -> "ConditionOutcomes":
+        """Read back. former_kind: the kind's name in format 1, if it was stored in that."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
-            found: dict[str, Any] = {
-                name: arrays[name] for name in cls.__annotations__ if name in arrays or name != "outcomes"
-            }
+            found: dict[str, Any] = dict(arrays)
+        found = found if former_kind is None else current_arrays(found, former_kind)
         return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
 
 
@@ -118,8 +121,13 @@ class StoredIntervention:
     @property
     def settings(self) -> Mapping[str, Any]:
         """What decided its numbers."""
-        settings: Mapping[str, Any] = self.bundle.head["settings"]
-        return settings
+        return current_settings(self.bundle.head["settings"], FORMAT)
+
+    @property
+    def _former_kind(self) -> str | None:
+        """The kind's name in format 1; None of today's format."""
+        settings = self.bundle.head["settings"]
+        return str(settings["kind"]) if settings.get("format") == FORMER_FORMAT else None
 
     @property
     def created(self) -> str:
@@ -128,11 +136,12 @@ class StoredIntervention:
 
     def outcomes(self) -> ConditionOutcomes:
         """What was measured. Raises RunDamagedError if it was changed."""
-        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES))
+        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES), self._former_kind)
 
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked. Raises RunDamagedError if it was changed."""
-        return self.bundle.read_json(CERTIFICATE)
+        found = self.bundle.read_json(CERTIFICATE)
+        return found if self._former_kind is None else current_certificate(found, self._former_kind)
 
 
 def save(
@@ -168,8 +177,9 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
     """
     found = [StoredIntervention(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
     for one in found:
-        if key_of(one.settings) != one.key:
-            raise one.bundle.head_damaged(f"has the settings of {key_of(one.settings)}")
+        key = key_of(one.bundle.head["settings"])
+        if key != one.key:
+            raise one.bundle.head_damaged(f"has the settings of {key}")
     wanted = {
         "format": FORMAT, "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
         "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),

@@ -1,8 +1,7 @@
-"""Which of a run's stored interventions stands for what: by what each is about, never by when it was made.
+"""Which of a run's stored interventions is preferred: by what each is about, never by when it was made.
 
-Another map, role, direction, dose, or a try on fewer episodes takes nothing's place. Conditions that were played
-on the same episodes stand side by side, whichever intervention they came with. Reads what is stored; needs no
-model.
+Another map, role, direction, coefficient, or a try on fewer episodes replaces nothing. Conditions that were played
+on the same episodes are pooled, whichever intervention they came with. Reads what is stored; needs no model.
 """
 
 from collections.abc import Iterable, Sequence

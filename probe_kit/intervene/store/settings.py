@@ -8,11 +8,11 @@ from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import sha256_json
 
-FORMAT = 1  # raise when stored numbers would be others
+FORMAT = 2  # raise when stored numbers would be others
 Readout = Literal["first-chunk", "per-step"]
 READOUTS: Mapping[str, str] = {
-    "first-chunk": "where the first inference's actions would bring the hand, with nothing carried out",
-    "per-step": "what every inference of the unedited episode would add across, with only the plain one carried out",
+    "first-chunk": "where the first inference's actions would bring the hand, with nothing executed",
+    "per-step": "what every inference of the unedited episode would add laterally; only the clean one is executed",
 }
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
@@ -88,7 +88,7 @@ def key_of(settings: Mapping[str, Any]) -> str:
     return sha256_json(settings)[:12]
 
 
-def check_unfit(run: Run) -> None:
+def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
     why = None

@@ -27,8 +27,8 @@ GLOSSARY = MappingProxyType(
             "decision itself, as a noisy action or as the tokens before."
         ),
         "follow / reversal": (
-            "With the two pictures exchanged, and nothing else: share of episodes whose action then turns from "
-            "the correct picture's side to the other one, and share in which it does the reverse."
+            "With the two images swapped, and nothing else: share of episodes whose action then turns from the "
+            "correct picture's side to the other one, and share in which it does the reverse."
         ),
         "used": (
             "Whether the action follows what can be read in the backbone. Encoded, unused: it can be read, and "

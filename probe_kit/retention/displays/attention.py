@@ -1,4 +1,4 @@
-"""What is weighed: by block, how much attention what acts pays to the pictures, the words and itself."""
+"""What is weighed: by block, how much attention the acting stream pays to the pictures, the words and itself."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
 from probe_kit.intervene.kinds.attention.attention_mass import (
+    ACTION,
     CORRECT,
     OTHER,
     AttentionShares,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Percent = NDArray[np.float64]
-_LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", "own": "its own tokens"}
+_LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACTION: "its own tokens"}
 
 
 @dataclass

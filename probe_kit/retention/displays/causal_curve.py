@@ -40,7 +40,7 @@ class CausalCurveDisplay(Panelled):
     """By backbone layer: held-out accuracy of probes, and how many episodes turn when its tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
-    the exchanged pictures, minus those that turn from it. read: the same for the keys and values that the acting
+    the swapped images, minus those that turn from it. read: the same for the keys and values that the acting
     part reads of each block; None where nobody looked. Filled: significant, family-wise.
     """
 
@@ -68,7 +68,7 @@ class CausalCurveDisplay(Panelled):
         if not rows:
             raise NoInterventionsError(
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
-                f"memory. Run `probe-kit intervene {run.location} --kind interchange`"
+                f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
             )
         scores = scores_of(results, category, view)
         scores = scores[scores["stream"] == BACKBONE].sort_values("layer")
@@ -95,7 +95,7 @@ class CausalCurveDisplay(Panelled):
         return spell(self.category)
 
     def draw(self, axes: "Axes") -> None:
-        """A line for probes, one for every role, one for the memory."""
+        """A line for probes, one for every role, one for `kv`."""
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
         lines = {
             "readable (probe)": self.readable,
@@ -111,7 +111,7 @@ class CausalCurveDisplay(Panelled):
 
 
 def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """By category, what a figure by layers shows of the maps: the backbone at every role, the memory as a whole.
+    """By category, what a figure by layers shows of the maps: the backbone at every role, `kv` as a whole.
 
     Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
     """

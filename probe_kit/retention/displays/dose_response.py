@@ -26,12 +26,13 @@ Percent = NDArray[np.float64]
 
 @dataclass
 class DoseResponseDisplay(Panelled):
-    """By coefficient, the share of episodes that turn to the side they are pushed to, minus those that turn from it.
+    """By coefficient, the share of episodes that turn to the target side, minus those that turn from it.
 
-    coefficients: (K,) in half gaps between the class means, ascending, 0 among them. net, left, right: (K,) percent, of
+    coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, left, right: (K,) percent, of
     all episodes and of those that are pushed to either side, one of which may be saturated. controls: (C, K)
-    percent of random directions of the same norm, NaN at a coefficient at which none was played. norm_ratio: (K,) how far
-    tokens were moved, in their own norms; what a coefficient of more than about two norms does is little evidence.
+    percent of random directions of the same norm, NaN at a coefficient at which none was played. relative_change:
+    (K,) how far tokens were moved, in their own norms; beyond about two norms an effect is little
+    evidence.
     significant: (K,) beyond the controls, family-wise.
     """
 
@@ -107,7 +108,7 @@ class DoseResponseDisplay(Panelled):
         axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{ratio:.1f}×" for coefficient, ratio in zip(
             self.coefficients, self.relative_change, strict=True)])  # fmt: skip
         axes.set_ylim(-108, 108)
-        axes.set_xlabel("half gaps between the class means; below: in norms of the tokens", fontsize=7.5)
+        axes.set_xlabel("half class-mean differences; below: in norms of the tokens", fontsize=7.5)
 
 
 def dose_response(run: RunReader) -> "Figure":

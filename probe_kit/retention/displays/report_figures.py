@@ -258,7 +258,7 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
     exhibits = [
         Exhibit(
             f"{name}-paired-layouts", "The same question, pictures swapped", "behaviour",
-            "Every question is asked twice, with the two pictures exchanged. Knowing the answer means right both "
+            "Every question is asked twice, with the two images swapped. Knowing the answer means right both "
             "times; always choosing one side means right once. Bold p: more items are right twice than wrong "
             "twice, beyond luck.",
             position, lambda: _figure(PairedLayoutsDisplay.from_run(run)),
@@ -325,7 +325,7 @@ def _of_causes(name: str, position: int, run: RunReader, results: ProbeResults) 
         Exhibit(
             f"{name}-causes", "Readable and used", "interventions",
             "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
-            "layer are taken from the same inference before exchanged pictures. A layer that is readable and "
+            "layer are taken from the same inference with swapped images. A layer that is readable and "
             "turns nothing is read by nothing behind it.",
             position, partial(causal_curve, run, results, view),
         )
@@ -354,9 +354,9 @@ def _of_attention(name: str, position: int, run: RunReader) -> list[Exhibit]:
     return [
         Exhibit(
             f"{name}-attention", "What is weighed", "interventions",
-            "How much of the attention that what acts pays lies on the pictures, the words and its own tokens, by "
-            "the block whose keys are read. Dots: single heads; bars: from the least to the most of any "
-            "iteration. It describes and is no cause: what is weighed need not be used, and it enters no verdict.",
+            "How much of the attention that the acting stream pays lies on the pictures, the words and its own "
+            "tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the most of "
+            "any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
             position, partial(attention_curve, run),
         )
     ]  # fmt: skip

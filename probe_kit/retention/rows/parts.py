@@ -92,9 +92,10 @@ class Asked:
 
 @dataclass(frozen=True, kw_only=True)
 class Followed:
-    """What the exchange of the two pictures did, if `probe-kit intervene` was run; see `intervene.Following`.
+    """What the image swap did, if `probe-kit intervene` was run.
 
-    follows, against: shares of episodes; follows_net: their difference, follows_p: exact, one-sided. used: the
+    follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference, follow_p: exact, one-sided;
+    see `intervene.ImageSwapEffect`. used: the
     verdict of that and the row's own probes; used_note: what it rests on, or why there is none.
     """
 

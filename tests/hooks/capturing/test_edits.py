@@ -1,11 +1,12 @@
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Site, capture
-from probe_kit.hooks.capturing.apply_edits import apply_edits
+from probe_kit.hooks.capturing.edit_engine import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, vector_hash
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
@@ -109,3 +110,33 @@ def test_a_vector_of_another_hash_or_shape_is_refused(pi0_tiny: Pi0, observation
         )
     with pytest.raises(UnknownSiteError):
         _tape(pi0_tiny, [observation], [Edit("zero", (Site("backbone", 99),))], {})
+
+
+def test_rows_of_a_batch_are_edited_each_by_its_own_roles(pi0_tiny: Pi0, observation: Observation) -> None:
+    """Zero and source, one after the other at the same site; instructions differ in their length."""
+    seen = [observation, replace(observation, instruction="Put the cube on the shape")]
+    masks = [roles.mask("language") for roles in pi0_tiny.roles(seen)["backbone"]]
+    assert masks[0].sum() != masks[1].sum()
+    with capture(pi0_tiny, [SITE]) as tape:
+        pi0_tiny.act(seen, [0, 1])
+    plain = tape[SITE].numpy()
+    source = np.random.default_rng(1).normal(size=plain.shape[1:]).astype(np.float32)
+    image = Edit("replace", (SITE,), roles=("image",), vector=vector_hash(source), strength=0.5)
+    edits = [Edit("zero", (SITE,), roles=("language",)), image]
+    with apply_edits(pi0_tiny, edits, seen, {image.vector: source}) as edit_log, capture(pi0_tiny, [SITE]) as tape:
+        pi0_tiny.act(seen, [0, 1])
+    changed = tape[SITE].numpy()
+    for row, roles in enumerate(pi0_tiny.roles(seen)["backbone"]):
+        language, pictures = roles.mask("language"), roles.mask("image")
+        assert (changed[row][language] == 0).all()
+        half = (plain[row] + source)[pictures] / 2
+        np.testing.assert_allclose(changed[row][pictures], half, atol=1e-5)
+        rest = ~language & ~pictures
+        np.testing.assert_array_equal(changed[row][rest], plain[row][rest])
+    assert [entry.tokens for entry in edit_log.entries] == [sum(mask.sum() for mask in masks), 2 * pictures.sum()]
+    first = edit_log.entries[0]
+    lengths = np.concatenate([np.linalg.norm(plain[row][mask], axis=1) for row, mask in enumerate(masks)])
+    np.testing.assert_allclose(
+        (first.norm, first.moved, first.largest), (lengths.mean(), lengths.mean(), lengths.max()), rtol=1e-5
+    )
+    assert edit_log.row()[:2].tolist() == [2, 0]

@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, edit, known_families
-from probe_kit.hooks.capturing.apply_edits import apply_edits
+from probe_kit.hooks.capturing.edit_engine import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, vector_hash
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
@@ -22,7 +22,7 @@ def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it
     assert {"backbone"} < supported.edits.keys()
     assert supported.prompt_kv or "kv" in supported.instead
     assert (supported.readout == "per-step") == ("action" in supported.edits)
-    assert json.loads(json.dumps(supported.to_json()))["kinds"][:2] == ["follow", "edit"]
+    assert json.loads(json.dumps(supported.to_json()))["kinds"][:2] == ["swap", "edit"]
 
 
 @pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if not family.acts])
@@ -49,6 +49,7 @@ def test_another_adapter_over_the_same_network_keeps_its_memory(pi0_tiny: Pi0, o
     """The prompt passes once, however often an adapter is put around it."""
     again = type(pi0_tiny)(pi0_tiny.network, pi0_tiny.folder)
     again.card = pi0_tiny.card
+    assert again._kept is pi0_tiny._kept
     site = Site("kv", 0, "keys")
     with capture(again, [site]) as tape:
         again.act([observation], [0])

@@ -1,4 +1,4 @@
-"""Erasing an answer: what LEACE promises, held against scikit-learn; what the others and the controls do."""
+"""Erasing an answer: what LEACE promises, compared with scikit-learn; what the others and the controls do."""
 
 import numpy as np
 import pytest

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from probe_kit.intervene import ConditionOutcomes, PatchEffect, UseVerdict, classify_use
+from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.site_effects import ConditionName, patch_effects
+from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.results.site_maps import localised_sites
 from tests.intervene.answers import follower, habit, outcomes_of
 
@@ -15,10 +16,10 @@ SUITE = "suite@1#0123456789ab"
 
 
 def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) -> ConditionOutcomes:
-    """changes: by condition (`__` for `|`, `_` for `-`), metres toward the plain pictures' correct side."""
+    """changes: by condition (`__` for `|`, `_` for `-`), metres toward the clean images' correct side."""
     made = outcomes_of({"color": signs})
     names = [name.replace("__", "|").replace("_", "-") for name in changes]
-    more = np.stack([made.target_side * values for values in changes.values()])
+    more = np.stack([made.correct_sign * values for values in changes.values()])
     displacement = np.vstack([made.displacement, more])
     return replace(
         made,
@@ -80,12 +81,13 @@ def test_the_ledger_is_summed_and_norms_are_compared() -> None:
 
 
 def test_names_are_taken_apart() -> None:
-    assert ConditionName.of("backbone.02|image|control-1|2") == ConditionName(
+    assert ConditionName.parse("backbone.02|image|control-1|2") == ConditionName(
         "backbone.02", "image", "control-1", "2"
     )
-    whole, along = ConditionName.of("backbone.02|image"), ConditionName.of("backbone.02|image|probe")
-    control = ConditionName.of("backbone.02|image|control-1")
+    whole, along = ConditionName.parse("backbone.02|image"), ConditionName.parse("backbone.02|image|probe")
+    control = ConditionName.parse("backbone.02|image|control-1")
     assert control.is_control_of(along)
+    assert [str(name) for name in (whole, along)] == ["backbone.02|image", "backbone.02|image|probe"]
     assert not control.is_control_of(whole)
     assert not along.is_control_of(along)
 

@@ -88,9 +88,9 @@ def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy"
     assert set(said) == {f"{place}|{role}" for place in ("backbone.00", "kv.01") for role in roles}
     for place, fires in (("backbone.00", 2), ("kv.01", 4)):
         assert all(said[f"{place}|{role}"]["fires"] == fires for role in roles)
-        assert said[f"{place}|image.left"]["largest_change"] > 0
-        whole = said[f"{place}|image"]["largest"]
-        assert all(0 < said[f"{place}|{role}"]["largest"] <= whole for role in TILES)
+        assert said[f"{place}|image.left"]["max_action_change"] > 0
+        whole = said[f"{place}|image"]["largest_change"]
+        assert all(0 < said[f"{place}|{role}"]["largest_change"] <= whole for role in TILES)
 
 
 @pytest.mark.parametrize("family", ["xiaomi-r0", "magma", "internvla-m1"])
@@ -106,5 +106,5 @@ def test_what_needs_positions_or_means_is_not_asked_of_tiles() -> None:
         ConceptErasure(sites=("backbone.02",), roles=("image.left",))
     with pytest.raises(UsageError, match=r"image\.left has no mean"):
         Steering(sites=("backbone.02",), role="image.left")
-    with pytest.raises(UsageError, match="exchange them whole"):
+    with pytest.raises(UsageError, match="patch them in full"):
         Interchange(roles=("image.right",), direction="mean-difference")

@@ -62,7 +62,7 @@ def test_every_call_is_changed_and_nothing_of_it_is_carried_out(copy: Run, effec
     np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
     assert (outcomes.of("image_swap") != outcomes.of("clean")).any()
     assert outcomes.max_action_change[outcomes.conditions.index("backbone.03|all")].max() == 0.0
-    assert any("Shadow" in note for note in effects.notes)
+    assert any("teacher-forced" in note for note in effects.notes)
 
 
 def test_it_is_another_key_than_the_first_inference(copy: Run) -> None:
@@ -74,7 +74,7 @@ def test_it_is_another_key_than_the_first_inference(copy: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "intervention",
     [
         lambda: ClosedLoop(targets=("backbone.02|all",), readout="per-step"),
         lambda: ConceptErasure(sites=("backbone.02",), readout="per-step"),

@@ -114,8 +114,8 @@ def test_tokens_are_taken_over_along_them_and_along_controls(
         controls=1,
     )  # fmt: skip
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
-    assert [row.direction for row in effects.changes] == ["mean-difference:2", "control-1"]
-    own, control = effects.changes
+    assert [row.direction for row in effects.effects] == ["mean-difference:2", "control-1"]
+    own, control = effects.effects
     assert own.fires == control.fires == 4
     assert min(own.relative_change, control.relative_change) > 0
     assert own.control_displacement is not None
@@ -123,7 +123,7 @@ def test_tokens_are_taken_over_along_them_and_along_controls(
 
 @pytest.mark.parametrize("direction", ["mean-difference:0", "mean-difference:x", "leace", "inlp:2", "zap"])
 @pytest.mark.parametrize(
-    "asked",
+    "intervention",
     [
         lambda direction: Interchange(direction=direction),
         lambda direction: ClosedLoop(targets=("backbone.02|image",), direction=direction),

@@ -11,10 +11,8 @@ from probe_kit.cli import app
 from probe_kit.extract import Run, open_run
 from probe_kit.intervene import ConceptErasure, ImageSwap
 from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.store.answers import save
-from probe_kit.intervene.store.settings import key_of, settings_of
-from tests.intervene.answers import follower, outcomes_of
+from probe_kit.intervene.store.settings import settings_of
+from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 
 @pytest.fixture
@@ -24,8 +22,7 @@ def run(little_runs: Path, tmp_path: Path) -> Run:
 
 def store(run: Run, intervention: ImageSwap | ConceptErasure) -> str:
     outcomes, settings = outcomes_of({"color": follower(24)}), settings_of(intervention, run)
-    save(run.location, settings, key_of(settings), outcomes, effects_csv(outcomes, run.suite), {})
-    return key_of(settings)
+    return store_outcomes(run.location, run.suite, settings, outcomes)
 
 
 def shown(run: Run, *options: str) -> str:
@@ -48,7 +45,7 @@ def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> 
     assert "another one stands in its place" in text
     listed = json.loads(shown(run, "--json"))["interventions"]
     assert [one["key"] for one in listed] == [first.key, more, erased]
-    assert listed[2]["asked"]["method"] == "leace"
+    assert listed[2]["parameters"]["method"] == "leace"
 
 
 def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:

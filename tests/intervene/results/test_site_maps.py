@@ -8,6 +8,8 @@ import pytest
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks import Site
+from probe_kit.hooks.capturing.edit_engine import EditLog, _ActiveEdits
+from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith
 from probe_kit.intervene import (
     ClosedLoop,
     ConceptErasure,
@@ -18,15 +20,6 @@ from probe_kit.intervene import (
     load_effects,
     run_intervention,
     stored_site_effects,
-)
-from probe_kit.intervene.edits.patching import (
-    EVERY,
-    EditLog,
-    Identity,
-    ReplaceInSubspace,
-    ReplaceWith,
-    TokenSelection,
-    _Patch,
 )
 from probe_kit.intervene.edits.pooled_directions import fit_directions
 from probe_kit.intervene.edits.sites import resolve_sites, token_mask
@@ -57,7 +50,7 @@ def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: Interventio
 
 def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: InterventionResult) -> None:
     """The ledger tells it from hooks that missed: they fired, and moved what passed."""
-    (row,) = (row for row in whole.changes if (row.place, row.role) == ("backbone.03", "all"))
+    (row,) = (row for row in whole.effects if (row.place, row.role) == ("backbone.03", "all"))
     assert row.max_action_change == 0.0
     assert (row.fires, row.no_op_fires) == (4, 0)
     assert row.relative_change > 0
@@ -67,7 +60,7 @@ def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: Interv
 def test_words_are_the_same_before_and_after_the_exchange(whole: InterventionResult) -> None:
     """In the embeddings only pictures differ, so that taking the words over moves nothing."""
     said = whole.certificate["edits"]["backbone.00|language"]
-    assert (said["fires"], said["still"], said["largest_change"]) == (4.0, 4.0, 0.0)
+    assert (said["fires"], said["no_op_fires"], said["max_action_change"]) == (4.0, 4.0, 0.0)
 
 
 def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: InterventionResult) -> None:
@@ -80,7 +73,7 @@ def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: Interventi
     ("sites", "roles", "role"),
     [
         (("backbone.02",), ("imgae",), "imgae"),
-        (("backbone.02",), ("image", "instruction-swap"), "instruction-swap"),
+        (("backbone.02",), ("image", "words"), "words"),
         (("backbone.02",), ("image.wrist",), "image.wrist"),
         (("expert.*",), ("language",), "language"),
         (("kv.*",), ("action",), "action"),
@@ -95,7 +88,7 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
         ConceptErasure(categories=("color",), items=1, sites=sites[:1], roles=roles),
         ClosedLoop(categories=("color",), items=1, targets=(f"{sites[0]}|{role}",), direction="none", controls=0),
     ):
-        with pytest.raises(UsageError, match=f"plays '{role}'; expected one of all, "):
+        with pytest.raises(UsageError, match=f"has the role '{role}'; expected one of all, "):
             run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert keys_in_use(copy) == before
 
@@ -127,12 +120,12 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
     )
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     edits = effects.certificate["edits"]
-    assert edits["backbone.02|image|mean-difference|0"]["largest_change"] == 0.0
+    assert edits["backbone.02|image|mean-difference|0"]["max_action_change"] == 0.0
     own, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference", "control-1"))
-    assert own["moved"] > 0
-    assert control["moved"] == pytest.approx(own["moved"], rel=1e-4)
-    assert own["largest"] == pytest.approx(own["moved"], rel=0.5)
-    assert {row.coefficient for row in effects.changes} == {"0", "2"}
+    assert own["change"] > 0
+    assert control["change"] == pytest.approx(own["change"], rel=1e-4)
+    assert own["largest_change"] == pytest.approx(own["change"], rel=0.5)
+    assert {row.coefficient for row in effects.effects} == {"0", "2"}
 
 
 # -- along what ----------------------------------------------------------------------------------------------
@@ -200,15 +193,17 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     """Two fires of one shape, one of another; the second moves nothing. By hand."""
     import torch
 
-    edit_log, pairs = EditLog(), dict[torch.Size, list[torch.Tensor]]()
+    active, sites = _ActiveEdits(), (Site("backbone", 0), Site("backbone", 1), Site("expert", 0))
     one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
-    for before, after in ((one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (one, one), (other, -other)):
-        pairs.setdefault(before.shape, []).extend((before[None], after[None]))
-    _Patch(TokenSelection(2, EVERY), Identity(), pairs).into(edit_log)
-    assert (edit_log.fires, edit_log.no_op_fires) == (3, 1)
-    assert (edit_log.norm, edit_log.moved, edit_log.largest) == (3.0 + 3.0 + 2.0, 3.0 + 0.0 + 4.0, 4.0)
-    _Patch(TokenSelection(2, EVERY), Identity()).into(empty := EditLog())
-    assert empty == EditLog()
+    tokens = (one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (other, -other), (one, one)
+    active.fired += [
+        (site, before[None], after[None]) for site, (before, after) in zip(sites, tokens, strict=True)
+    ]
+    edit_log = EditLog(active.measured())
+    assert [entry.site for entry in edit_log.entries] == [str(site) for site in sites]
+    assert edit_log.row().tolist() == [3, 1, (3 + 2 + 3) / 3, (3 + 4 + 0) / 3, 4]
+    assert EditLog.sum([edit_log, edit_log]).row().tolist() == [6, 2, 8 / 3, 7 / 3, 4]
+    assert EditLog(_ActiveEdits().measured()) == EditLog()
 
 
 # -- where ---------------------------------------------------------------------------------------------------
@@ -243,7 +238,7 @@ def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "intervention",
     [
         lambda: Interchange(sites=()),
         lambda: Interchange(controls=2),

@@ -22,7 +22,7 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.results.results import effects_csv, effects_of
+from probe_kit.intervene.results.results import effects_of
 from probe_kit.intervene.results.site_maps import (
     stored_carrying_directions,
     stored_localised_sites,
@@ -30,10 +30,10 @@ from probe_kit.intervene.results.site_maps import (
     stored_steering,
     stored_subspace_effects,
 )
-from probe_kit.intervene.store.answers import ATTENTION_FILE, StoredIntervention, save
+from probe_kit.intervene.store.answers import ATTENTION_FILE, StoredIntervention
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.train import ArrayRun
-from tests.intervene.answers import follower, habit, outcomes_of
+from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
 MANY, FEW = 24, 4
 Moves = Mapping[str, float]
@@ -47,6 +47,14 @@ def color(episodes: int = MANY) -> ConditionOutcomes:
 def unmoved(outcomes: ConditionOutcomes) -> ConditionOutcomes:
     """Where the pictures change nothing."""
     return replace(outcomes, displacement=np.stack([outcomes.of("clean")] * 2))
+
+
+def asked_otherwise(outcomes: ConditionOutcomes) -> ConditionOutcomes:
+    """With the conditions of an instruction swap, none of which changes anything."""
+    names = ("clean", "instruction_swap", "image_swap", "noise")
+    clean = np.stack([outcomes.of("clean")] * 4)
+    logs = np.zeros((*clean.shape, 5))
+    return replace(outcomes, conditions=names, displacement=clean, max_action_change=0 * clean, edit_log=logs)
 
 
 def moved(outcomes: ConditionOutcomes, moves: Moves) -> ConditionOutcomes:
@@ -87,7 +95,7 @@ def ended(outcomes: ConditionOutcomes) -> ConditionOutcomes:
 
 
 CONTROL = "backbone.02|image|control-1"
-WRONG = {"toward": "wrong", "direction": "mean-difference", "seed": 0}
+WRONG = {"target_side": "wrong", "direction": "mean-difference", "seed": 0}
 STEERED = {"backbone.01|image|mean-difference|0": 0.0, "backbone.01|image|mean-difference|2": 0.5}
 MAP = {"backbone.00|all": 1.0, "backbone.00|image": 1.0, "backbone.02|all": 1.0, "backbone.02|image": 1.0,
        "backbone.10|all": 0.0}  # fmt: skip
@@ -95,7 +103,7 @@ POOL: dict[str, tuple[str, dict[str, Any], Callable[[], ConditionOutcomes]]] = {
     "image-swap": ("image-swap", {}, lambda: outcomes_of({"color": follower(MANY), "shape": habit(MANY)})),
     "follow, few": ("image-swap", {"items": 2}, lambda: color(FEW)),
     "follow, shadow": ("image-swap", {"readout": "per-step"}, lambda: unmoved(color())),
-    "instruction-swap": ("instruction-swap", {}, lambda: unmoved(color())),
+    "instruction-swap": ("instruction-swap", {}, lambda: asked_otherwise(color())),
     "map": ("interchange", {"direction": "none"}, lambda: moved(color(), MAP)),
     "map, few": ("interchange", {"direction": "none", "items": 2},
                  lambda: moved(color(FEW), dict.fromkeys(MAP, 0.0))),
@@ -114,11 +122,11 @@ POOL: dict[str, tuple[str, dict[str, Any], Callable[[], ConditionOutcomes]]] = {
     "along a probe": ("interchange", {"direction": "probe", "seed": 0},
                       lambda: moved(color(), {"backbone.02|image|probe": 0.0, CONTROL: 0.0})),
     "steer": ("steer", WRONG, lambda: moved(color(), STEERED)),
-    "steer, dose": ("steer", WRONG | {"doses": [4]},
+    "steer, dose": ("steer", WRONG | {"coefficients": [4]},
                     lambda: moved(color(), {"backbone.01|image|mean-difference|4": 1.0})),
     "steer, place": ("steer", WRONG | {"sites": "backbone.02"},
                      lambda: moved(color(), {"backbone.02|image|mean-difference|2": 0.0})),
-    "steer, left": ("steer", {"toward": "left", "direction": "mean-difference", "seed": 0},
+    "steer, left": ("steer", {"target_side": "left", "direction": "mean-difference", "seed": 0},
                     lambda: moved(color(), {"backbone.01|image|mean-difference|2": 0.0})),
     "steer, few": ("steer", WRONG | {"items": 2},
                    lambda: moved(color(FEW), dict.fromkeys(STEERED, 0.0))),
@@ -160,13 +168,9 @@ def settings_of(run: ArrayRun, name: str) -> dict[str, Any]:
 
 
 def store(run: ArrayRun, name: str) -> None:
-    kind, own, make = POOL[name]
+    _, _, make = POOL[name]
     outcomes, further = attention_records(*SHARES[name]) if name in SHARES else (make(), {})
-    settings = settings_of(run, name)
-    target_side = str(own.get("toward", "image_swap"))
-    written = effects_csv(outcomes, run.suite, target_side, kind, further)
-    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
-    save(run.location, settings, key_of(settings), outcomes, written, {"replay": check}, further)
+    store_outcomes(run.location, run.suite, settings_of(run, name), outcomes, further=further)
 
 
 def made_in(run: ArrayRun, names: list[str]) -> None:
@@ -187,7 +191,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
         "steering": stored_steering(run),
         "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
         "verdicts": classify_all(found, encoded, stored_localised_sites(run), stored_carrying_directions(run)),
-        "cells": best_patch_targets(run, ["color"]),
+        "targets": best_patch_targets(run, ["color"]),
     }
 
 
@@ -239,7 +243,7 @@ def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
         "backbone.01 image, toward left": ["2"], "backbone.01 image": ["0", "2", "4"], "backbone.02 image": ["2"],
     }  # fmt: skip
     assert stored_attention(run)["color"].roles == ("all", "image")
-    assert seen["cells"] == ("backbone.02|image",)
+    assert seen["targets"] == ("backbone.02|image",)
 
 
 def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
@@ -253,7 +257,7 @@ def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
     key = key_of(settings_of(run, "follow, few"))
     effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
-    assert effects.rows[0].n_episodes == FEW
+    assert effects.effects[0].n_episodes == FEW
     assert effects.verdicts["color"].verdict == "inconclusive"
 
 

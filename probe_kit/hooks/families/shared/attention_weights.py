@@ -54,7 +54,7 @@ def recomputed(attention: Any, _: tuple[Any, ...], given: dict[str, Any], __: An
     if getattr(attention, "o_proj", None) is None:
         raise UnsupportedInterventionError(
             f"{type(attention).__name__} rotates and projects in a way of its own, and its attention cannot be "
-            "computed once more here. Exchange the memory instead"
+            "computed once more here. Patch `kv` instead"
         )
     states: Tensor = given["hidden_states"][:, -1:]
     cosines, sines = (part[:, None, -1:] for part in given["position_embeddings"])

@@ -10,7 +10,7 @@ from probe_kit.models.prompt_kv import PromptKV
 
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
-"""Where the last token of the prompt already belongs to what acts: its keys and values are not the backbone's."""
+"""Where the last token of the prompt already acts: its keys and values are not the backbone's."""
 
 
 def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
@@ -20,14 +20,14 @@ def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
 
 
 def kept_prompt(text: Any) -> Stream:
-    """The kv of a decoder of transformers' configuration `text`."""
+    """The stream `kv` of a decoder of transformers' configuration `text`."""
     heads = int(getattr(text, "num_key_value_heads", None) or text.num_attention_heads)
     size = int(getattr(text, "head_dim", None) or text.hidden_size // text.num_attention_heads)
     return kv_stream(int(text.num_hidden_layers), heads * size)
 
 
 def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
-    """The kv of lerobot's `joint`, whose pass over the prompt leaves its keys and values there from now on.
+    """Keys and values of lerobot's `joint`, whose pass over the prompt leaves them there from now on.
 
     lerobot calls its `forward` by name, past all hooks, so the instance gets one that sends the cache through.
     """

@@ -218,7 +218,7 @@ class Xiaomi(QwenVLA):
         return {"backbone": self.backbone_roles(seen), "expert": [expert] * len(seen)}
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more from what a layer of the expert is given, under the block whose memory it reads."""
+        """Computed once more from what a layer of the expert is given, under the block whose keys it reads."""
         layers: Any = self.network.dit.layers
         first, own = len(self.language.layers) - len(layers), 1 + self.config.state_length
 

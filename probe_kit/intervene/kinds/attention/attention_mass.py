@@ -1,6 +1,6 @@
-"""What attention was paid: shares by block, iteration, head and role. Reads stored numbers; needs no model.
+"""Attention shares by block, iteration, head and role. Reads stored numbers; needs no model.
 
-It describes. Nothing of it enters a verdict.
+Descriptive: nothing of it enters a verdict.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
-from probe_kit.intervene.store.answers import ATTENTION, ATTENTION_FILE, StoredIntervention
+from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene.store.answers import ATTENTION, ATTENTION_FILE
 from probe_kit.intervene.store.selection import StoredResult, stored_results
 from probe_kit.statistics.bootstrap import GAINS, units_seed
 from probe_kit.statistics.student import student_interval
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 Axis = Literal["block", "iteration", "head", "call"]
 _AXES: Mapping[str, int] = {"block": 1, "iteration": 2, "head": 3}
-CORRECT, OTHER, OWN = "image.correct", "image.other", "own"
-"""Made of what is stored: the tile of the correct picture, the other one, and what acts itself."""
+CORRECT, OTHER, ACTION = "image.correct", "image.other", "action"
+"""Made of what is stored: the tile of the correct picture, the other one, and the acting stream itself."""
 Shares = NDArray[np.float64]
 
 
@@ -60,11 +61,9 @@ class AttentionShares:
         return cls(**{**found, "roles": tuple(map(str, found["roles"]))})
 
     @classmethod
-    def of(cls, stored: StoredIntervention) -> Self | None:
-        """What one stored intervention noted; None of another kind. Raises RunDamagedError if it was changed."""
-        if stored.settings["kind"] != ATTENTION:
-            return None
-        return cls.from_bytes(stored.bundle.read(ATTENTION_FILE))
+    def of(cls, measurement: Measurement) -> Self:
+        """Of a stored intervention of the kind `attention`. Raises RunDamagedError if it was changed."""
+        return cls.from_bytes(measurement.read(ATTENTION_FILE))
 
     def only(self, chosen: NDArray[np.bool_]) -> Self:
         """Some of the inferences. chosen: (N,)."""
@@ -83,7 +82,7 @@ class AttentionShares:
             left, right = (found[role] for role in TILE_ROLES)
             is_left = (self.sides == "left")[:, None, None, None]
             found |= {CORRECT: np.where(is_left, left, right), OTHER: np.where(is_left, right, left)}
-        return {**found, OWN: 1 - found[ALL]} if ALL in found else found
+        return {**found, ACTION: 1 - found[ALL]} if ALL in found else found
 
     def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
         """One per category, role and place along the axes `by`; means over the others, every episode alike.
@@ -166,6 +165,30 @@ class AttentionRow:
     call: int | None = None
     share: float
     n_episodes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, without the axes that it is a mean over."""
+        axes = get_args(Axis)
+        return {name: value for name, value in asdict(self).items() if value is not None or name not in axes}
+
+
+def measured_attention(measurement: Measurement) -> list[AttentionRow]:
+    """Shares by block, iteration, head and role. Raises RunDamagedError."""
+    return AttentionShares.of(measurement).rows()
+
+
+def attention_notes(rows: Sequence[AttentionRow], measurement: Measurement) -> list[str]:
+    """What a reader must know."""
+    del rows, measurement
+    return [
+        "Attention is descriptive, not causal, and does not enter the verdict. To test what is read, run --kind "
+        "interchange --sites kv.*"
+    ]
+
+
+def attention_in_use(run: RunReader) -> set[str]:
+    """Keys of the stored interventions that tables and figures read. Raises RunDamagedError."""
+    return {result.stored.key for result, _ in preferred_attention(run).values()}
 
 
 def stored_attention(run: RunReader) -> dict[str, AttentionShares]:

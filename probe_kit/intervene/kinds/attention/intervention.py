@@ -1,8 +1,7 @@
-"""Attention: how much of it what acts pays to the picture, its two tiles, the words and the state. No cause.
+"""Attention: the share of the acting stream's attention on images, tiles, instruction and state. Descriptive.
 
-A token can be weighed and not be used, and used where hardly anything is weighed. So this describes, beside what
-an exchange finds: it enters no verdict, and nothing is changed. Every inference is made twice, once with somebody
-who notes the weights, and both must be the same action bit for bit.
+An attended token need not be used, and a used one may get little attention. So this enters no verdict, and nothing
+is edited. Every inference runs twice, with and without recording, and both actions must be bit-identical.
 """
 
 from collections.abc import Sequence
@@ -40,11 +39,11 @@ ROLES = ("image", *TILES, "language", "state", "special")
 
 @dataclass(frozen=True, kw_only=True)
 class AttentionReadout(Intervention):
-    """Two inferences per episode, or with the readout `shadow` per call of it: plain, and noted.
+    """Two inferences per episode, or with the readout `per-step` per call of it: clean, and recorded.
 
-    roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always noted:
-    what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that comes twice.
-    """
+    roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always
+    recorded: what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that comes
+    twice."""
 
     roles: tuple[str, ...] = ()
 
@@ -68,7 +67,7 @@ class AttentionReadout(Intervention):
         return {"roles": list(self.roles)}
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """As the run made it, and the same with its attention noted. Raises UsageError for a role it lacks."""
+        """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
         return CleanRun(), AttentionRecorded(backbone_of(session.policy), self._roles(session.policy))
 
     def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
@@ -77,15 +76,15 @@ class AttentionReadout(Intervention):
         largest = float(found.max_action_change.max(initial=0.0))
         if largest:
             raise CaptureChangedActionError(
-                f"with its attention noted an action differs by {largest:.3g}; expected the same bit for bit. The "
-                "adapter's `weighing` changes the inference, or the model is not deterministic"
+                f"with its attention recorded an action differs by {largest:.3g}; expected the same bit for bit. "
+                "The adapter's `weighing` changes the inference, or the model is not deterministic"
             )
         assert found.mass is not None
         inferences, blocks, iterations, heads, _ = found.mass.shape
         return {
             ATTENTION: {
-                "stream": recording.stream, "roles": list(recording.roles), "inferences": inferences, "blocks": blocks,
-                "iterations": iterations, "heads": heads, "largest_change": largest,
+                "stream": recording.stream, "roles": list(recording.roles), "inferences": inferences,
+                "blocks": blocks, "iterations": iterations, "heads": heads, "max_action_change": largest,
             }
         }  # fmt: skip
 
@@ -114,7 +113,7 @@ class AttentionReadout(Intervention):
         there = roles_of(policy, stream, wanted)
         if missing := [role for role in self.roles if role not in there]:
             raise UsageError(
-                f"no token of {stream} plays {missing[0]!r}; there are "
+                f"no token of {stream} has the role {missing[0]!r}; there are "
                 f"{', '.join(policy.role_names[policy.tokens_of(stream)])}"
             )
         return tuple(dict.fromkeys((ALL, *there)))
@@ -122,7 +121,7 @@ class AttentionReadout(Intervention):
 
 @dataclass(frozen=True)
 class AttentionRecorded:
-    """The plain inference with somebody who notes what attention is paid. stream: whose tokens are weighed."""
+    """The clean inference with attention weights recorded. stream: whose tokens are attended to."""
 
     stream: str
     roles: tuple[str, ...]
@@ -149,8 +148,8 @@ class AttentionRecorded:
 def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
     """(B, I, H, R) shares by block, iteration, head and role.
 
-    NaN where a block is not read in an iteration, and of a role that nobody plays. Of one observation. masks: (T,)
-    each, None of nobody. Raises CaptureError for blocks with different numbers of heads.
+    NaN where a block is not read in an iteration, and of a role that no token has. Of one observation. masks: (T,)
+    each, None for no token. Raises CaptureError for blocks with different numbers of heads.
     """
     shapes = {found.shape[:2] for found in mass.by_head.values()}
     if len(shapes) != 1 or next(iter(shapes))[0] != 1:
@@ -166,7 +165,7 @@ def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | No
 
 
 def backbone_of(policy: "Policy") -> str:
-    """Name of the stream that what acts reads."""
+    """Name of the stream that the acting stream reads."""
     name = first_of("backbone", policy.streams.values())
     assert name is not None, "every policy has a backbone"
     return name

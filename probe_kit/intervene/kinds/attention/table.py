@@ -1,30 +1,33 @@
-"""What attention was paid, as a table for a console."""
+"""Attention shares, as a table for a terminal."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.edits.sites import TILE_ROLES
-from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, AttentionShares
+from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, AttentionRow, AttentionShares
+from probe_kit.intervene.kinds.base import TableContext
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import ResponsiveTable
 
 _LEGEND = (
-    "Describes and enters no verdict: what is weighed need not be used. Percent of the attention that what acts "
-    "pays, means over heads, iterations and inferences: all: on the backbone's tokens, own: on its own; "
-    "image.left, image.right: on patches that see a tile; correct − other: on the correct picture's tile less "
-    "the other's, by groups of items. By iteration and head: --format csv"
+    "Descriptive, in no verdict: attended tokens need not be used. Percent of the acting stream's attention, "
+    "means over heads, iterations and inferences: all: on the backbone's tokens, action: on its own; image.left, "
+    "image.right: on patches that see a tile; correct − other: on the correct picture's tile less the other's, by "
+    "groups of items. By iteration and head: --format csv"
 )
 
 
-def weighed_table(weighed: AttentionShares, suite: str, of: str) -> "ResponsiveTable":
-    """One line per category and block of the backbone that is read. of: model, suite."""
+def attention_table(_: Sequence[AttentionRow], context: TableContext) -> "ResponsiveTable":
+    """One line per category and block of the backbone that is read."""
     from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
+    attention = AttentionShares.of(context.measurement)
     names, shares, sides = [], [], []
-    rows = weighed.rows(("block",))
+    rows = attention.rows(("block",))
     roles = [role for role in dict.fromkeys(row.role for row in rows) if role not in (CORRECT, OTHER)]
-    for category, own in weighed.by_category():
-        apart = own.correct_minus_other(suite)
+    for category, own in attention.by_category():
+        apart = own.correct_minus_other(context.measurement.suite)
         blocks = dict.fromkeys(row.block for row in rows if row.category == category)
         for block in blocks:
             found = {row.role: row.share for row in rows if (row.category, row.block) == (category, block)}
@@ -39,7 +42,7 @@ def weighed_table(weighed: AttentionShares, suite: str, of: str) -> "ResponsiveT
     if set(TILE_ROLES) <= set(roles):
         parts.append(Part("Tiles by answer", ("correct − other [95 %]",), tuple(sides)))
     return ResponsiveTable(
-        title=f"What does it weigh? {of}, attention",
+        title=f"What does it attend to? {context.subject}, attention",
         caption=_LEGEND,
         name="category · read",
         names=tuple(names),

@@ -1,7 +1,7 @@
-"""Closed loop: the episode is really played again, with the change made at every inference.
+"""Closed loop: the episode is played again, with the edit at every inference.
 
-What the first inference would do is a forecast. Here the cube lands somewhere, and the run's own outcomes are what
-it is held against: the same scene, the same seeds, and a dose of zero that must give every one of them again.
+What the first inference would do is a forecast. Here the cube lands somewhere, and is compared with the run's own
+outcomes: the same scene, the same seeds, and an identity patch that must give every one of them again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,13 @@ from typing import Any
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patch
+from probe_kit.hooks.capturing.token_edits import Identity, TokenSelection
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.patching import EditLog, Identity, TokenSelection, apply_patch
 from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, token_mask
+from probe_kit.intervene.kinds.base import SEPARATOR, ConditionName
 from probe_kit.intervene.kinds.interchange.intervention import (
     NONE,
     PatchedFromSource,
@@ -37,17 +39,16 @@ from probe_kit.intervene.replay.token_directions import DirectionBasis, check_di
 from probe_kit.intervene.store.answers import CLEAN
 from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
 
-CELL = "|"
-KIND = "closed-loop"
+NAME = "closed-loop"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop(Intervention):
-    """Interchange at a few targets, carried out: dose zero, exchanged pictures, every target, and its controls.
+    """Interchange at a few targets in closed loop: identity patch, image swap, every target and its controls.
 
-    targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of an `Interchange`; along it
-    a target is taken over as well, beside `controls` random ones of the data's own covariance, where a place is one
-    site and the role no tile; `none` for neither. The tokens of every target are also taken over whole.
+    targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of `Interchange`;
+    a target is also patched within it, and within `controls` random ones of the data's own covariance, where a
+    place is one site and the role no tile; `none` for neither. Every target is also patched in full.
     """
 
     targets: tuple[str, ...]
@@ -59,7 +60,7 @@ class ClosedLoop(Intervention):
         super().__post_init__()
         if self.readout != FIRST_CHUNK:
             raise UsageError("a closed loop is read where the cube ends; leave --readout out")
-        if not self.targets or any(target.count(CELL) != 1 for target in self.targets):
+        if not self.targets or any(target.count(SEPARATOR) != 1 for target in self.targets):
             raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
         if self.direction != NONE:
             check_direction(self.direction)
@@ -69,11 +70,11 @@ class ClosedLoop(Intervention):
     @property
     def kind(self) -> str:
         """`closed-loop`."""
-        return KIND
+        return NAME
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Edits; and a memory, where one of its places is."""
+        """Edits; and `kv`, where one of its places is."""
         sites, roles = zip(*map(self._split, self.targets), strict=True)
         return capabilities_for(sites, roles)
 
@@ -99,7 +100,7 @@ class ClosedLoop(Intervention):
         return super().categories_in(run)
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Dose zero, exchanged pictures, and every target. Raises UnknownSiteError, NoProbesError."""
+        """The identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
         split = [self._split(target) for target in self.targets]
         tried = [(place, role) for pattern, role in split for place in resolve_sites(pattern, session.policy)]
         source_sites = tuple(dict.fromkeys(site for place, _ in tried for site in place.sites))
@@ -130,8 +131,8 @@ class ClosedLoop(Intervention):
 
     @staticmethod
     def _split(target: str) -> tuple[str, str]:
-        place, _, role = target.partition(CELL)
-        return place, role
+        name = ConditionName.parse(target)
+        return name.place, name.role
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.kinds.closed_loop.effects import MIN_IN_ZONE_RATIO, ClosedLoopEffect
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.intervene.store.answers import CLEAN
@@ -11,22 +12,23 @@ if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 _LEGEND = (
-    "every episode played again, same scene and seeds, with the change at every inference; in a zone: whichever "
-    "picture; turned: share of episodes that end on the wrong picture, minus that at dose 0; p: family-wise, of "
-    f"what goes beyond the controls, one-sided; confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; hand broken: "
-    f"in a zone less than {MIN_IN_ZONE_RATIO:g} times as often as at dose 0, and then in no verdict"
+    "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
+    "picture; net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch; "
+    "p: family-wise, of what goes beyond the controls, one-sided; confirmed: p < 0.05 and "
+    f"{SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone less than "
+    f"{MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict"
 )
 
 
-def carried_out_table(rows: Sequence[ClosedLoopEffect], of: str) -> "ResponsiveTable":
-    """One line per category and condition, dose 0 first. of: which model, on which suite."""
+def closed_loop_table(rows: Sequence[ClosedLoopEffect], context: TableContext) -> "ResponsiveTable":
+    """One line per category and condition, the identity patch first."""
     from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     return ResponsiveTable(
-        title=f"Is it so when carried out? {of}",
+        title=f"Is it so in closed loop? {context.subject}",
         caption=_LEGEND,
-        name="category · change",
-        names=tuple(f"{row.category} · {'dose 0' if row.place == CLEAN else row.name}" for row in rows),
+        name="category · edit",
+        names=tuple(f"{row.category} · {'identity patch' if row.place == CLEAN else row.name}" for row in rows),
         styles=tuple("bold" if row.finding == "confirmed" else "" for row in rows),
         parts=(
             Part(
@@ -35,8 +37,8 @@ def carried_out_table(rows: Sequence[ClosedLoopEffect], of: str) -> "ResponsiveT
                 tuple(_ends(row) for row in rows),
             ),
             Part(
-                "Against dose 0",
-                ("turned [95 %]", "left / right", "controls", "only with : only without", "p", "finding"),
+                "Compared with the identity patch",
+                ("net flip rate [95 %]", "left / right", "controls", "only with : only without", "p", "finding"),
                 tuple(_against(row) for row in rows),
             ),
         ),

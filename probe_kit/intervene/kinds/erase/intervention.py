@@ -1,23 +1,26 @@
-"""Erasing: what is linearly readable of the answer taken away, token by token, beside random controls.
+"""Concept erasure: the linearly decodable answer is removed from each token, with random controls.
 
-A supplement, and the weakest of them. What a policy reads need not be linear, an answer that is erased at one
-place may pass at another, and what is taken away along with it breaks the hand: a place where an exchange passes
-tells more than a place where an eraser breaks something. Erasers that know only the mean over tokens blind a probe
-and leave the behaviour, so that there is one per position.
+A supplement, and the weakest. What a policy reads need not be linear, an answer that is erased at one place may
+pass at another, and what is removed along with it disrupts the task. Erasers that know only the mean over tokens
+blind a probe and leave the behaviour, so that there is one per position.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens
-from probe_kit.intervene.edits.patching import Identity, TokenIndex, apply_patch
 from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.kinds.base import ConditionName
+from probe_kit.intervene.kinds.erase.effects import UNTOUCHED, ZERO
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
     Condition,
@@ -41,7 +44,7 @@ from probe_kit.statistics.folds import Fold
 if TYPE_CHECKING:
     from torch import Tensor
 
-LEACE, UNTOUCHED = "leace", "none|0"
+LEACE = "leace"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +75,14 @@ class ConceptErasure(Intervention):
             )
         object.__setattr__(self, "method", str(Method.of(self.method)))
 
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """`direction` is its method. Raises UsageError without sites."""
+        if "sites" not in options:
+            raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
+        method = options.pop("direction", LEACE)
+        return super().from_options(run, method=method, **options)
+
     @property
     def kind(self) -> str:
         """`erase`."""
@@ -90,11 +101,11 @@ class ConceptErasure(Intervention):
         }  # fmt: skip
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Plain, then every place and role at dose 0, erased, and with its controls. Raises UnknownSiteError."""
+        """Clean, then every place and role untouched, erased and with its controls. Raises UnknownSiteError."""
         found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
         wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
         if not any(wanted.values()):
-            raise UsageError(f"no token of {', '.join(found)} plays {', '.join(self.roles)}")
+            raise UsageError(f"no token of {', '.join(found)} has the role {', '.join(self.roles)}")
         cells: dict[tuple[SiteGroup, str], _FittedErasers] = {}
         for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
             self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
@@ -136,11 +147,12 @@ class ErasedCondition:
 
     @property
     def name(self) -> str:
-        """Place, role and what is taken away, apart by `|`."""
-        return f"{self.place.name}|{self.role}|{self.what}"
+        """See `ConditionName`."""
+        coefficient = ZERO if self.what == UNTOUCHED else ""
+        return str(ConditionName(self.place.name, self.role, self.what, coefficient))
 
     def play(self, context: ConditionContext) -> ConditionResult:
-        """The plain inference without it."""
+        """The clean inference without it."""
         replay_input, session = context.replay_input, context.session
         tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
         change = ApplyEraser(self.erasers[replay_input.episode_id]) if self.erasers else Identity()

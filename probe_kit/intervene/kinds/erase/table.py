@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.kinds.erase.effects import ErasureEffect
 
 if TYPE_CHECKING:
@@ -11,32 +12,31 @@ if TYPE_CHECKING:
 _LEGEND = (
     "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
     "not; controls: the mean of random subspaces of the same rank; p: exact, that the action moves away farther "
-    "than under the controls, by item and by group, the larger one; readable: a fresh probe on the mean over "
-    "tokens; moved: how far tokens were moved, in their own norms. Erasing says less than exchanging: see the "
-    "interchange"
+    "than under the controls, by item and by group, the larger one; probe accuracy: a fresh probe on the mean "
+    "over tokens; relative change: how far tokens were moved, in their own norms. Weaker evidence than interchange"
 )
 
 
-def erased_table(rows: Sequence[ErasureEffect], of: str) -> "ResponsiveTable":
-    """One line per category and place; controls stand beside what they are held against. of: model, suite."""
+def erasure_table(rows: Sequence[ErasureEffect], context: TableContext) -> "ResponsiveTable":
+    """One line per category and place; controls are columns of what is compared with them."""
     from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
-    shown = [row for row in rows if row.finding not in ("control", "dose 0")]
+    shown = [row for row in rows if row.finding not in ("control", "identity patch")]
     return ResponsiveTable(
-        title=f"What is lost without it? {of}, erase",
+        title=f"What is lost without it? {context.subject}, erase",
         caption=_LEGEND,
         name="category · erased",
         names=tuple(f"{row.category} · {row.name}" for row in shown),
-        styles=tuple("bold" if row.finding == "lost" else "" for row in shown),
+        styles=tuple("bold" if row.finding == "effect" else "" for row in shown),
         parts=(
             Part(
                 "What the action does",
-                ("goes there %", "controls %", "kept", "controls", "shift cm", "p", "moved"),
+                ("goes there %", "controls %", "kept", "controls", "displacement cm", "p", "relative change"),
                 tuple(_action_cells(row) for row in shown),
             ),
             Part(
                 "What a probe reads",
-                ("readable %", "finding"),
+                ("probe accuracy %", "finding"),
                 tuple(_probe_cells(row) for row in shown),
             ),
         ),
@@ -51,7 +51,8 @@ def _action_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
         f"{100 * row.right_before:.1f} → {100 * row.right:.1f}", "–" if beside is None else f"{100 * beside:.1f}",
         "n/a" if row.kept is None else f"{row.kept:.2f}",
         "–" if row.control_kept is None else f"{row.control_kept:.2f}",
-        f"{-100 * row.mean_displacement:+.2f}", "–" if row.p is None else f"{row.p:.2g}", f"{row.relative_change:.2f}",
+        f"{-100 * row.mean_displacement:+.2f}", "–" if row.p is None else f"{row.p:.2g}",
+        f"{row.relative_change:.2f}",
     )  # fmt: skip
     return tuple(map(Cell, texts))
 

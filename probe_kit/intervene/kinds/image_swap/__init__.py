@@ -1,1 +1,1 @@
-"""Image swap: exchange the two pictures and see which one the action follows."""
+"""Image swap: swap the two images and see which one the action follows."""

@@ -1,4 +1,4 @@
-"""What the exchange of the two pictures did, per category. Reads stored answers; needs no model."""
+"""What image swaps did, per category. Reads stored outcomes; needs no model."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, ConditionOutcomes
 from probe_kit.intervene.store.selection import preferred_by_category
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
@@ -13,19 +14,20 @@ from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 
+NAME = "image-swap"
 SMALLEST_EFFECT_OF_INTEREST = 0.25
-"""Share of episodes by which following must outweigh going against, to be called following."""
+"""Net follow rate from which the action is said to follow."""
 
 
 @dataclass(frozen=True)
 class ImageSwapEffect:
     """Whether the action follows the pictures, in one category.
 
-    follows: share of episodes in which the action goes to the correct picture, and to the other side once the two
-    are exchanged; against: in which it does the reverse. net: follows − against, with its 95 % interval by groups.
-    p_follows, p_against: exact, one-sided: an item's action moves toward (away from) the correct picture more
-    often than a coin would have it; the larger of by items and by groups. median_displacement: median metres between the two
-    actions. key: of the stored intervention.
+    follow_rate: share of episodes in which the action goes to the correct picture, and to the other side once the
+    two are swapped; reversal_rate: in which it does the reverse. net_follow_rate: their
+    difference, with its 95 % interval by groups. follow_p, reversal_p: exact, one-sided: an item's action moves
+    toward (away from) the correct picture more often than by chance; the larger of by items and by groups.
+    median_displacement: metres between the two actions. key: of the stored intervention.
     """
 
     category: str
@@ -61,30 +63,38 @@ class ImageSwapEffect:
         return asdict(self)
 
 
+def measured_image_swap(measurement: Measurement) -> list[ImageSwapEffect]:
+    """The effects of a stored image swap."""
+    return image_swap_effects(measurement.outcomes, measurement.suite, measurement.key)
+
+
 def image_swap_effects(outcomes: ConditionOutcomes, suite: str, key: str = "") -> list[ImageSwapEffect]:
     """One per category, in the order of the episodes. suite: its identity, of which intervals are drawn."""
-    return [_of_category(own, category, suite, key) for category, own in outcomes.by_category()]
+    return [
+        ImageSwapEffect(**swap_columns(own, category, IMAGE_SWAP, suite), key=key)
+        for category, own in outcomes.by_category()
+    ]
 
 
-def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: str) -> ImageSwapEffect:
-    plain, exchanged = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, IMAGE_SWAP))
-    follows, against = (plain > 0) & (exchanged < 0), (plain < 0) & (exchanged > 0)
-    net = follows.astype(float) - against
-    median_displacement = plain - exchanged
-    return ImageSwapEffect(
-        category=category,
-        n_episodes=net.size,
-        n_items=np.unique(outcomes.items).size,
-        n_groups=np.unique(outcomes.groups).size,
-        follow_rate=float(follows.mean()),
-        reversal_rate=float(against.mean()),
-        net_follow_rate=float(net.mean()),
-        net_follow_rate_ci=net_interval(net, outcomes, suite),
-        follow_p=paired_greater_p(median_displacement, outcomes.items, outcomes.groups),
-        reversal_p=paired_greater_p(-median_displacement, outcomes.items, outcomes.groups),
-        median_displacement=float(np.median(np.abs(median_displacement))),
-        key=key,
-    )
+def swap_columns(outcomes: ConditionOutcomes, category: str, swapped: str, suite: str) -> dict[str, Any]:
+    """The columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
+    clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
+    follows, reverses = (clean > 0) & (other < 0), (clean < 0) & (other > 0)
+    net = follows.astype(float) - reverses
+    displacement = clean - other
+    return {
+        "category": category,
+        "n_episodes": net.size,
+        "n_items": np.unique(outcomes.items).size,
+        "n_groups": np.unique(outcomes.groups).size,
+        "follow_rate": float(follows.mean()),
+        "reversal_rate": float(reverses.mean()),
+        "net_follow_rate": float(net.mean()),
+        "net_follow_rate_ci": net_interval(net, outcomes, suite),
+        "follow_p": paired_greater_p(displacement, outcomes.items, outcomes.groups),
+        "reversal_p": paired_greater_p(-displacement, outcomes.items, outcomes.groups),
+        "median_displacement": float(np.median(np.abs(displacement))),
+    }
 
 
 def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: str) -> tuple[float, float]:
@@ -95,13 +105,18 @@ def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: s
 
 
 def stored_image_swaps(run: RunReader) -> dict[str, ImageSwapEffect]:
-    """By category, what the exchange of pictures did, of those that are stored for the episodes the run has now.
+    """By category, what the image swaps did that are stored for the episodes the run has now.
 
-    Of several the one that says most, see `standing`; empty if there is none. Raises RunDamagedError if any stored
-    intervention was changed.
+    Of several the preferred one, see `store.selection`; empty if there is none. Raises RunDamagedError if any
+    stored intervention was changed.
     """
     return {
         category: row
-        for category, result in preferred_by_category(run, "follow").items()
+        for category, result in preferred_by_category(run, NAME).items()
         for row in image_swap_effects(result.outcomes, run.suite, result.stored.key)
     }
+
+
+def image_swaps_in_use(run: RunReader) -> set[str]:
+    """Keys of the stored image swaps that verdicts and tables read. Raises RunDamagedError."""
+    return {row.key for row in stored_image_swaps(run).values()}

@@ -1,4 +1,4 @@
-"""Following: with the two pictures exchanged, and nothing else, does the action change sides?"""
+"""Image swap: with the two images swapped, and nothing else, does the action change sides?"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from probe_kit.intervene.replay.session import ReplaySession
 
 @dataclass(frozen=True, kw_only=True)
 class ImageSwap(Intervention):
-    """Two inferences per episode, same state and noise: with its pictures, and with the two exchanged."""
+    """Two inferences per episode, same state and noise: clean, and with the two images swapped."""
 
     @property
     def kind(self) -> str:
-        """`follow`."""
-        return "follow"
+        """`image-swap`."""
+        return "image-swap"
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
@@ -23,6 +23,6 @@ class ImageSwap(Intervention):
         return ("swap",)
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """As the run made it, and exchanged."""
+        """Clean, and with swapped images."""
         del session
         return CleanRun(), ImagesSwapped()

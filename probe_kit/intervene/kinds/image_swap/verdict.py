@@ -40,7 +40,7 @@ def classify_use(
     located: Sequence[str] | None = None,
     carried: Sequence[str] = (),
 ) -> UseVerdict:
-    """What probes and the exchange of pictures say together.
+    """The verdict of probes and the image swap together.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
     without probes. control: another category of the run that follows, which shows that following would have been
@@ -60,7 +60,7 @@ def classify_use(
         low, high = found.net_follow_rate_ci
         return UseVerdict(
             "inconclusive",
-            f"follows − against may be anything from {low:.2f} to {high:.2f}; {SMALLEST_EFFECT_OF_INTEREST} would count",
+            f"the net follow rate may lie from {low:.2f} to {high:.2f}; {SMALLEST_EFFECT_OF_INTEREST} would count",
         )
     if encoded and control is None:
         return UseVerdict(
@@ -71,10 +71,10 @@ def classify_use(
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
-    """Where the answer passes, of keys and values that what acts reads where it is read, and along what.
+    """Where the answer passes, of keys and values that the acting stream reads where it is read, and along what.
 
-    An exchange in the backbone says that something behind it depends on that place; one in the memory, which only
-    what acts looks at, that it is read there.
+    A patch in the backbone shows that something downstream depends on that place; one in `kv`, which only the
+    acting stream reads, that it is read there.
     """
     read = [place for place in located if place.partition(".")[0] == KV_STREAM]
     passes = [place for place in located if place not in read]

@@ -1,51 +1,68 @@
-"""How much one step's action owes to words, to pictures and to noise. Reads stored answers; needs no model."""
+"""What a swap of the instruction did, and how much one step's action owes to instruction, images and noise.
 
-from dataclasses import asdict, dataclass
+Reads stored outcomes; needs no model.
+"""
+
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, NOISE, PICTURES, ConditionOutcomes
+from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, swap_columns
+from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes
 
-_CONDITIONS = {"words": IMAGE_SWAP, "pictures": PICTURES, "noise": NOISE}
+_CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
 
 
 @dataclass(frozen=True)
 class InputSensitivity:
-    """Of the first inferences of one category; one is exchanged, the others stay.
+    """Of the first inferences of one category; one input is swapped, the others stay.
 
-    words, pictures, noise: median metres between where the two actions would bring the hand, across.
-    words_changed, pictures_changed: share of episodes in which any number of the action changed at all; 0 is a
-    policy that is deaf or blind.
+    instruction, images, noise: median lateral metres between where the two actions would bring the hand.
+    instruction_changed, images_changed: share of episodes in which any number of the action changed at all; 0
+    means that the policy ignores that input.
     """
 
-    category: str
-    n_episodes: int
-    words: float
-    pictures: float
+    instruction: float
+    images: float
     noise: float
-    words_changed: float
-    pictures_changed: float
+    instruction_changed: float
+    images_changed: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstructionSwapEffect(ImageSwapEffect):
+    """As `ImageSwapEffect`, of the swapped instruction. sensitivity: of one step to each input."""
+
+    sensitivity: InputSensitivity
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
+        """Plain values, the sensitivity's among them."""
+        plain = super().to_json()
+        return {**{name: value for name, value in plain.items() if name != "sensitivity"}, **plain["sensitivity"]}
 
 
-def input_sensitivity(outcomes: ConditionOutcomes) -> list[InputSensitivity]:
-    """One per category, in the order of the episodes; empty where words were not exchanged."""
-    if not {PICTURES, NOISE} <= set(outcomes.conditions):
-        return []
-    return [_of_category(own, category) for category, own in outcomes.by_category()]
+def instruction_swap_effects(measurement: Measurement) -> list[InstructionSwapEffect]:
+    """One per category, in the order of the episodes."""
+    return [
+        InstructionSwapEffect(
+            **swap_columns(own, category, INSTRUCTION_SWAP, measurement.suite),
+            key=measurement.key,
+            sensitivity=input_sensitivity(own),
+        )
+        for category, own in measurement.outcomes.by_category()
+    ]
 
 
-def _of_category(outcomes: ConditionOutcomes, category: str) -> InputSensitivity:
-    plain = outcomes.of(CLEAN)
-    apart = {name: float(np.median(np.abs(outcomes.of(own) - plain))) for name, own in _CONDITIONS.items()}
+def input_sensitivity(outcomes: ConditionOutcomes) -> InputSensitivity:
+    """Of the episodes of one category."""
+    clean = outcomes.of(CLEAN)
+    apart = {name: float(np.median(np.abs(outcomes.of(own) - clean))) for name, own in _CONDITIONS.items()}
     changed = {
         f"{name}_changed": float(
             (outcomes.max_action_change[outcomes.conditions.index(_CONDITIONS[name])] > 0).mean()
         )
-        for name in ("words", "pictures")
+        for name in ("instruction", "images")
     }
-    return InputSensitivity(category, plain.size, **apart, **changed)
+    return InputSensitivity(**apart, **changed)

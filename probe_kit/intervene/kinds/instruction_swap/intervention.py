@@ -1,7 +1,7 @@
-"""Words as donors: before the same pictures, asked for the other one, does the action change sides?
+"""Instruction swap: asked for the other picture before the same images, does the action change sides?
 
-Whoever follows the pictures reads them; whoever follows the words reads the question. A policy may do one and not
-the other: it can have learnt what to look for, whatever is asked.
+Following the images shows that they are read; following the instruction shows that it is read. A policy may do one
+and not the other: it can have learnt what to look for, whatever is asked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from probe_kit.intervene.replay.conditions import (
     Intervention,
 )
 from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.store.answers import IMAGE_SWAP, NOISE, PICTURES
+from probe_kit.intervene.store.answers import INSTRUCTION_SWAP, NOISE
 from probe_kit.suite.items import Episode, Layout
 from probe_kit.suite.ladder import check_wordings, in_words
 
@@ -28,16 +28,16 @@ _TURNED: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"
 
 @dataclass(frozen=True, kw_only=True)
 class InstructionSwap(Intervention):
-    """Four inferences per episode: as it was, with its twin's words, with exchanged pictures, with other noise.
+    """Four inferences per episode: clean, other instruction, swapped images, other noise.
 
-    A twin shows the same two pictures and asks for the other one; items without one are passed over and counted.
-    The last two are what the words are held against: how much one step's action owes to pictures and to noise.
+    A counterpart shows the same two pictures and asks for the other one; items without one are skipped and
+    counted. The last two are for comparison: the sensitivity of one step's action to images and to noise.
     """
 
     @property
     def kind(self) -> str:
         """`words`."""
-        return "words"
+        return "instruction-swap"
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
@@ -45,32 +45,32 @@ class InstructionSwap(Intervention):
         return ("swap",)
 
     def eligible_items(self, session: ReplaySession, items: Sequence[str]) -> list[str]:
-        """Those of `items` that have a twin with words for the run's wording. Raises UsageError if none has."""
+        """Those of `items` with a counterpart in the run's wording. Raises UsageError if there is none."""
         found = [item for item in items if counterpart_instruction(session, item, "original") is not None]
         if not found:
             raise UsageError(
-                f"none of the {len(items)} items has a twin in its suite: the same two pictures, asked for the "
-                "other one. Suites of `probe-kit suite build` have them; else exchange pictures (--kind image-swap)"
+                f"none of the {len(items)} items has a counterpart in its suite: the same two pictures, asked for "
+                "the other one. Suites of `probe-kit suite build` have them; else swap images (--kind image-swap)"
             )
         return found
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """As the run made it; asked for the other picture; the pictures exchanged; the noise drawn anew."""
+        """As the run made it; asked for the other picture; the images swapped; the noise drawn anew."""
         del session
-        return CleanRun(), InstructionSwapped(), ImagesSwapped(PICTURES), NoiseResampled()
+        return CleanRun(), InstructionSwapped(), ImagesSwapped(), NoiseResampled()
 
 
 @dataclass(frozen=True)
 class InstructionSwapped:
     """The same state, noise and pictures, asked for the other one of the two."""
 
-    name: str = IMAGE_SWAP
+    name: str = INSTRUCTION_SWAP
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Only what is asked is another."""
         replay_input = context.replay_input
         words = counterpart_instruction(context.session, replay_input.item_id, replay_input.layout)
-        assert words is not None, "items without a twin are passed over"
+        assert words is not None, "items without a counterpart are skipped"
         return ConditionResult(
             context.session.act(replace(replay_input.seen, instruction=words), replay_input.seed)
         )
@@ -89,14 +89,14 @@ class NoiseResampled:
 
 
 def counterpart_instruction(session: ReplaySession, item_id: str, layout: Layout) -> str | None:
-    """What the item's twin is asked in the run's wording, its pictures lying as the item's do in `layout`."""
-    twin = session.counterparts.get(item_id)
-    if twin is None:
+    """The counterpart's instruction in the run's wording, its pictures lying as the item's do in `layout`."""
+    counterpart = session.counterparts.get(item_id)
+    if counterpart is None:
         return None
     if session.run.wording is None:
-        return twin.instruction
+        return counterpart.instruction
     own = session.items[item_id]
-    alike = own.left_pixels_sha256 == twin.left_pixels_sha256
+    alike = own.left_pixels_sha256 == counterpart.left_pixels_sha256
     (wording,) = check_wordings([session.run.wording])
-    intervention = in_words(Episode(twin, layout if alike else _TURNED[layout]), wording)
+    intervention = in_words(Episode(counterpart, layout if alike else _TURNED[layout]), wording)
     return None if intervention is None else intervention.item.instruction

@@ -1,1 +1,1 @@
-"""Interchange intervention (activation patching) from the run with exchanged pictures."""
+"""Interchange intervention (activation patching) from the run with swapped images."""

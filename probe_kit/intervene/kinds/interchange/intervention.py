@@ -1,18 +1,21 @@
-"""Interchange: one part of the stream taken from the same inference before exchanged pictures.
+"""Interchange intervention (activation patching): tokens are patched from the same inference with swapped images.
 
-What is put in is what this very policy has there in this very state, so it lies where streams lie, has no dose,
-and can do no more than the exchange itself: with all that differs put in, the effect is 1.
+What is patched in is what this policy computes there in this state, so it is on the policy's own distribution, has
+no strength to choose, and can do no more than the image swap: with all that differs patched, the effect is 1.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith, TokenEdit
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
-from probe_kit.intervene.edits.patching import ReplaceInSubspace, ReplaceWith, TokenEdit, apply_patch
 from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
     Condition,
@@ -36,8 +39,8 @@ NONE = "none"
 
 def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
     """What a family must support for changes at such places and roles."""
-    memory = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
-    further: dict[InterventionKind, bool] = {"kv": memory, "tiles": bool(set(roles) & set(TILES))}
+    reads_kv = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
+    further: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": bool(set(roles) & set(TILES))}
     return ("edit", *(kind for kind, is_needed in further.items() if is_needed))
 
 
@@ -45,8 +48,8 @@ def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[Interv
 class Interchange(Intervention):
     """Every place is tried at every role, alone.
 
-    sites: patterns of places, see `resolve_sites`. roles: of the tokens that are taken over; a stream is tried at those
-    that it has. direction: `none` takes tokens over whole; `mean-difference` or `probe` only along that direction
+    sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
+    that it has. direction: `none` patches tokens in full; `mean-difference` or `probe` only along that direction
     of each place (rank 1), found in means over tokens without the episode it is used on; `mean-difference:K` along
     K directions found in the tokens themselves, see `token_directions`. controls: so many times as many random
     directions of the data's own covariance, orthogonal to it, per place and role.
@@ -64,13 +67,19 @@ class Interchange(Intervention):
             raise UsageError("an interchange needs at least one site and one role")
         if set(self.roles) & set(TILES) and self.direction != NONE:
             raise UsageError(
-                "tiles have no mean in the run from which a direction could be found; exchange them whole: leave "
+                "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
                 "--direction out"
             )
         if self.direction != NONE:
             check_direction(self.direction)
         elif self.controls:
             raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Five controls where a direction is given, if their number is not."""
+        options.setdefault("controls", 5 if "direction" in options else 0)
+        return super().from_options(run, **options)
 
     @property
     def kind(self) -> str:
@@ -79,7 +88,7 @@ class Interchange(Intervention):
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Edits; and a memory, where one of its places is."""
+        """Edits; and `kv`, where one of its places is."""
         return capabilities_for(self.sites, self.roles)
 
     @property
@@ -95,7 +104,7 @@ class Interchange(Intervention):
         }  # fmt: skip
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Plain, exchanged, and every place at every role. Raises UnknownSiteError, NoProbesError."""
+        """Clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
         found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
         source_sites = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
         wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
@@ -113,10 +122,10 @@ class Interchange(Intervention):
 
 @dataclass(frozen=True)
 class PatchedFromSource:
-    """The tokens of one role at one place, from the inference before exchanged pictures.
+    """The tokens of one role at one place, from the inference with swapped images.
 
     donors: all sites of which that inference is asked, once for all conditions. direction: the name of one of
-    `bases`, empty to take tokens over whole.
+    `bases`, empty to patch tokens in full.
     """
 
     place: SiteGroup
@@ -127,11 +136,11 @@ class PatchedFromSource:
 
     @property
     def name(self) -> str:
-        """Place, role and direction, apart by `|`."""
-        return "|".join(filter(None, (self.place.name, self.role, self.direction)))
+        """See `ConditionName`."""
+        return str(ConditionName(self.place.name, self.role, self.direction))
 
     def play(self, context: ConditionContext) -> ConditionResult:
-        """The plain inference with these tokens in it."""
+        """The clean inference with these tokens in it."""
         replay_input, session = context.replay_input, context.session
         tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
         with apply_patch(
@@ -151,14 +160,14 @@ class PatchedFromSource:
 def patches_within(
     direction: str, bases: DirectionBasis, place: SiteGroup, role: str, source_sites: tuple[Site, ...]
 ) -> list[PatchedFromSource]:
-    """What is taken over along a direction, and along each of its controls."""
+    """What is patched along a direction, and along each of its controls."""
     return [
         PatchedFromSource(place, role, source_sites, name, bases) for name in (direction, *bases.control_names)
     ]
 
 
 def source_of(context: ConditionContext, sites: Sequence[Site]) -> "ActivationCache":
-    """What all these sites hold before exchanged pictures, with the question's state and noise; made once."""
+    """What all these sites hold with swapped images, with the question's state and noise; made once."""
     from probe_kit.hooks import capture
 
     if "donor" not in context.memo:

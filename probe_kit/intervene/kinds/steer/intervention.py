@@ -1,19 +1,21 @@
-"""Steering: a direction added to the tokens of one role, beside matched controls of the same norm.
+"""Steering: a direction added to the tokens of one role, with matched controls of the same norm.
 
-A supplement to the interchange, not a replacement. What is added lies nowhere the network ever was; a dose has no
-natural size; and at a large one every direction breaks the hand. So a dose counts half gaps between the class
-means (2 goes from one to the other), controls are orthogonal directions of the data's own covariance with the same
-norm, and both sides are reported.
+A supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a coefficient
+has no natural size, and at a large one every direction disrupts the task. So coefficients count half class-mean
+differences (2 goes from one mean to the other), controls are orthogonal directions of the data's own covariance
+with the same norm, and both sides are reported.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.edits.patching import AddVector, apply_patch
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import AddVector
 from probe_kit.intervene.edits.pooled_directions import (
     DIRECTIONS,
     MEAN_DIFFERENCE,
@@ -21,6 +23,7 @@ from probe_kit.intervene.edits.pooled_directions import (
     fit_directions,
 )
 from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites
+from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
     Condition,
@@ -37,11 +40,12 @@ COEFFICIENTS = (1.0, 2.0, 4.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Steering(Intervention):
-    """Every place and dose, toward one side, and the same for the controls; dose 0 is always played as well.
+    """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
 
-    sites: patterns of places. role: whose tokens are moved, along the direction found in their own mean. doses: in
-    half gaps of the class means along the direction. toward: the side, `wrong` and `correct` of the plain
-    pictures. controls: so many orthogonal directions. Raises UsageError for a dose or side that cannot be.
+    sites: patterns of places. role: whose tokens are moved, along the direction found in their own mean.
+    coefficients: in half class-mean differences along the direction. target_side: `wrong` and `correct` are those
+    of the clean images. controls: so many orthogonal directions. Raises UsageError for a coefficient or side that
+    does not exist.
     """
 
     sites: tuple[str, ...]
@@ -61,17 +65,27 @@ class Steering(Intervention):
             )
         if self.direction not in DIRECTIONS:
             raise UsageError(
-                f"{self.direction!r} is no direction for a dose: steering adds one vector to every token. Use "
+                f"{self.direction!r} is no direction of one vector: steering adds one vector to every token. Use "
                 f"{' or '.join(DIRECTIONS)}"
             )
         if self.target_side not in get_args(TargetSide):
-            raise UsageError(f"toward is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}")
-        if not self.coefficients or not all(0 < coefficient <= 1000 for coefficient in self.coefficients):
             raise UsageError(
-                f"doses are {self.coefficients}; expected positive numbers of half gaps, such as 1, 2, 4"
+                f"target_side is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}"
             )
+        if not self.coefficients or not all(0 < coefficient <= 1000 for coefficient in self.coefficients):
+            raise UsageError(f"coefficients are {self.coefficients}; expected positive numbers, such as 1, 2, 4")
         if len(set(self.coefficients)) != len(self.coefficients):
-            raise UsageError(f"doses are {self.coefficients}; give each once")
+            raise UsageError(f"coefficients are {self.coefficients}; give each once")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Raises UsageError without sites or with other than one role."""
+        roles = options.pop("roles", ())
+        if "sites" not in options or len(roles) != 1:
+            raise UsageError(
+                "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
+            )
+        return super().from_options(run, role=roles[0], **options)
 
     @property
     def kind(self) -> str:
@@ -81,12 +95,13 @@ class Steering(Intervention):
     def parameters(self) -> dict[str, Any]:
         """Where, along what, how far and to which side."""
         return {
-            "sites": list(self.sites), "role": self.role, "direction": self.direction, "doses": list(self.coefficients),
-            "toward": self.target_side, "controls": self.controls, "seed": self.seed,
+            "sites": list(self.sites), "role": self.role, "direction": self.direction,
+            "coefficients": list(self.coefficients),
+            "target_side": self.target_side, "controls": self.controls, "seed": self.seed,
         }  # fmt: skip
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Plain, then every place at dose 0 and every other, each with its controls. Raises UnknownSiteError."""
+        """Clean, then every place at every coefficient, with its controls. Raises UnknownSiteError."""
         found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
         conditions: list[Condition] = [CleanRun()]
         for place in found.values():
@@ -115,11 +130,11 @@ class Steered:
 
     @property
     def name(self) -> str:
-        """Place, role, direction and dose, apart by `|`."""
-        return f"{self.place.name}|{self.role}|{self.direction}|{self.coefficient:g}"
+        """See `ConditionName`."""
+        return str(ConditionName(self.place.name, self.role, self.direction, f"{self.coefficient:g}"))
 
     def play(self, context: ConditionContext) -> ConditionResult:
-        """The plain inference with these tokens moved."""
+        """The clean inference with these tokens moved."""
         replay_input, session = context.replay_input, context.session
         left = replay_input.side_correct == "left"
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}

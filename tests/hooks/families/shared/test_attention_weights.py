@@ -69,5 +69,5 @@ def test_xiaomis_weights_on_its_values_are_what_its_attention_reads() -> None:
 
 
 def test_an_attention_of_another_kind_is_refused() -> None:
-    with pytest.raises(UnsupportedInterventionError, match="Exchange the memory"):
+    with pytest.raises(UnsupportedInterventionError, match="Patch `kv`"):
         recomputed(torch.nn.Identity(), (), {}, None)

@@ -1,4 +1,4 @@
-"""SmolVLA's packing, held against lerobot's own masks."""
+"""SmolVLA's packing, compared with lerobot's own masks."""
 
 from pathlib import Path
 

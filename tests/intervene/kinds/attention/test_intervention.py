@@ -26,10 +26,12 @@ from probe_kit.intervene import (
     stored_attention,
 )
 from probe_kit.intervene.kinds.attention.intervention import AttentionRecorded, shares_by_role
-from probe_kit.intervene.kinds.attention.table import weighed_table
+from probe_kit.intervene.kinds.attention.table import attention_table
+from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.replay.conditions import ReplayBatch
 from probe_kit.intervene.replay.image_tokens import TILES
 from probe_kit.intervene.replay.session import ReplaySession
+from tests.intervene.answers import follower, outcomes_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -46,8 +48,7 @@ def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> Interv
 
 @pytest.fixture
 def weighed(attention_records: InterventionResult) -> AttentionShares:
-    assert attention_records.attention is not None
-    return attention_records.attention
+    return AttentionShares.of(attention_records.measurement)
 
 
 def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
@@ -76,20 +77,20 @@ def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionRes
         ITERATIONS,
         HEADS,
     )
-    assert said["largest_change"] == 0.0
+    assert said["max_action_change"] == 0.0
     assert attention_records.certificate["replay"]["equal"] == 4
     found = ReplayBatch(
         np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)), np.zeros(1),
         mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
     )  # fmt: skip
     with pytest.raises(CaptureChangedActionError, match="1e-06"):
-        AttentionReadout().told([AttentionRecorded("backbone", ("all",))], found)
+        AttentionReadout().certificate_entries([AttentionRecorded("backbone", ("all",))], found)
 
 
 def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: AttentionShares) -> None:
     shares = weighed.shares()
     assert set(TILES) <= set(weighed.roles)
-    np.testing.assert_allclose(shares["all"] + shares["own"], 1)
+    np.testing.assert_allclose(shares["all"] + shares["action"], 1)
     rest = sum(shares[role] for role in weighed.roles if role not in ("all", *TILES))
     np.testing.assert_allclose(rest, shares["all"], atol=1e-6)
     np.testing.assert_allclose(
@@ -131,6 +132,11 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
         weighed.rows(("layer",))  # type: ignore[arg-type]
 
 
+def headings(shares: AttentionShares) -> tuple[str, ...]:
+    measurement = Measurement(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: shares.to_bytes())
+    return attention_table([], TableContext(measurement, "of", {})).parts[0].headings
+
+
 def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
     mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
     mass[..., at["special"]] = np.nan
@@ -142,15 +148,12 @@ def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen
     values = (hidden.shares()["image.correct"] - hidden.shares()["image.other"])[1:, 1]
     assert hidden.correct_minus_other("suite")[1][0] == pytest.approx(values.mean())
     every = replace(weighed, mass=np.where(np.arange(mass.shape[-1]) == at["special"], np.nan, weighed.mass))
-    assert weighed_table(every, "suite", "of").parts[0].headings == tuple(
-        role for role in weighed_table(weighed, "suite", "of").parts[0].headings if role != "special"
-    )
+    assert headings(every) == tuple(role for role in headings(weighed) if role != "special")
 
 
 def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, attention_records: InterventionResult) -> None:
-    assert any("no cause" in note for note in attention_records.notes)
+    assert any("not causal" in note for note in attention_records.notes)
     assert attention_records.verdicts == {}
-    assert attention_records.changes == attention_records.rows == []
     assert load_effects(copy, kind="attention").to_csv() == attention_records.to_csv()
     assert set(stored_attention(copy)) == {"color"}
 
@@ -161,11 +164,11 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
         told = CliRunner().invoke(app, ["intervene", str(copy.path), *options])
         assert told.exit_code == 0
         assert f"stored as {attention_records.key}" in told.stderr
-        assert "no cause" in " ".join(told.stderr.split())
+        assert "not causal" in " ".join(told.stderr.split())
         return told.stdout
 
     shown = " ".join(ask("table").split())
-    assert "What does it weigh?" in shown
+    assert "What does it attend to?" in shown
     assert "correct − other" in shown
     assert "block 02" in shown
     found = json.loads(ask("json"))
@@ -178,11 +181,11 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
 def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
-    assert effects.attention is not None
-    assert effects.attention.roles == ("all", "language")
-    calls = effects.attention.calls
+    attended = AttentionShares.of(effects.measurement)
+    assert attended.roles == ("all", "language")
+    calls = attended.calls
     assert calls.tolist() == 2 * list(range(ceil(STEPS / int(copy.settings["execute"]))))
-    assert effects.certificate["attention"]["largest_change"] == 0.0
+    assert effects.certificate["attention"]["max_action_change"] == 0.0
     assert effects.to_rich() is not None
 
 
@@ -216,7 +219,7 @@ def test_what_cannot_be_told_is_refused_by_name(session: ReplaySession) -> None:
     ):
         with pytest.raises(UnsupportedInterventionError, match=f"{family} does not support.*{missing}"):
             list(map(find_family(family).check_intervention, intervention.required_capabilities))
-    with pytest.raises(UsageError, match=r"no token of backbone plays 'smell'; there are image"):
+    with pytest.raises(UsageError, match=r"no token of backbone has the role 'smell'; there are image"):
         AttentionReadout(roles=("smell",)).conditions(session)
     with pytest.raises(UsageError, match="give each once"):
         AttentionReadout(roles=("image", "image"))

@@ -21,7 +21,7 @@ RIGHT, WRONG, OUT = "correct", "wrong", "oob"
 
 
 def made(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> ConditionOutcomes:
-    """outcomes: (K, E), two layouts an item, each item a group of its own."""
+    """episode_outcomes: (K, E), two layouts an item, each item a group of its own."""
     episodes = len(episode_outcomes[0])
     items = np.array([f"color-{number // 2}" for number in range(episodes)])
     shape = len(names), episodes
@@ -46,7 +46,7 @@ def found(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAME
 
 def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
     rows = found([[RIGHT] * 16, [WRONG] * 16, [WRONG] * 16, [WRONG] * 14 + [OUT] * 2, [RIGHT] * 16])
-    assert [row.finding for row in rows.values()] == ["dose 0", *["confirmed"] * 3, "control"]
+    assert [row.finding for row in rows.values()] == ["identity patch", *["confirmed"] * 3, "control"]
     along = rows["backbone.02 image mean-difference"]
     assert (along.net, along.control_net, along.in_zone, along.wrong_in_zone) == (0.875, 0.0, 0.875, 1.0)
     assert (along.gained, along.lost) == (14, 0)
@@ -62,13 +62,13 @@ def test_what_its_control_does_as_well_is_not_confirmed() -> None:
 
 
 def test_a_broken_hand_enters_no_verdict_and_no_family() -> None:
-    """Neither as a claim, nor as a control that a claim is held against."""
+    """Neither as a claim, nor as a control that a claim is compared with."""
     broken = [WRONG] * 7 + [OUT] * 9
     rows = found([[RIGHT] * 16, [WRONG] * 16, broken, [WRONG] * 16, broken])
-    assert rows["backbone.02 image"].finding == "hand broken"
+    assert rows["backbone.02 image"].finding == "task disrupted"
     assert rows["backbone.02 image"].p_fwe is None
     assert rows["backbone.02 image"].net > 0
-    assert rows["backbone.02 image control-1"].finding == "hand broken"
+    assert rows["backbone.02 image control-1"].finding == "task disrupted"
     assert rows["backbone.02 image mean-difference"].control_net is None
     assert rows["backbone.02 image mean-difference"].finding == "confirmed"
     half = [WRONG] * 8 + [OUT] * 8
@@ -113,8 +113,10 @@ def test_stored_answers_come_back_with_outcomes_and_without() -> None:
 
 def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
     return PatchEffect(
-        category="color", place=name, role=role, direction="", coefficient="", is_control=False, n_episodes=8, n_items=4,
-        effect=effect, net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0, mean_displacement=0.0, control_displacement=None,
+        category="color", place=name, role=role, direction="", coefficient="", is_control=False,
+        n_episodes=8, n_items=4,
+        effect=effect, net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0, mean_displacement=0.0,
+        control_displacement=None,
         t=0.0, p=p, p_fwe=p, max_action_change=0.0, fires=0, no_op_fires=0, relative_change=0.0,
     )  # fmt: skip
 

@@ -61,7 +61,7 @@ def effects(run: Run, source: ReplaySource, twin: "Policy") -> InterventionResul
 
 
 def row_of(effects: InterventionResult, place: str, direction: str = "") -> dict[str, object]:
-    (row,) = (row for row in effects.carried_out if (row.place, row.direction) == (place, direction))
+    (row,) = (row for row in effects.effects if (row.place, row.direction) == (place, direction))
     return row.to_json()
 
 
@@ -71,7 +71,7 @@ def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effect
         "episodes": 2, "compared": 2, "equal": 2, "largest_difference": 0.0, "outcomes_equal": 2,
     }  # fmt: skip
     said = effects.certificate["edits"]["clean"]
-    assert said["fires"] == said["still"] == 2 * CALLS * (2 + 2)
+    assert said["fires"] == said["no_op_fires"] == 2 * CALLS * (2 + 2)
     assert [note for note in effects.notes if "of items no p" not in note] == []
 
 
@@ -79,15 +79,15 @@ def test_edits_are_in_force_at_every_inference(effects: InterventionResult) -> N
     edits = effects.certificate["edits"]
     assert edits["backbone.00|all"]["fires"] == 2 * CALLS
     assert edits["expert.01@0-1|all"]["fires"] == 2 * 2 * CALLS
-    assert edits["backbone.00|all"]["still"] == 0
+    assert edits["backbone.00|all"]["no_op_fires"] == 0
 
 
 def test_what_nothing_reads_changes_no_episode_and_what_all_reads_is_the_whole_exchange(
     effects: InterventionResult,
 ) -> None:
-    assert row_of(effects, "backbone.03")["changed"] == 0.0
+    assert row_of(effects, "backbone.03")["max_action_change"] == 0.0
     assert row_of(effects, "backbone.03")["fires"] == 2 * CALLS
-    assert row_of(effects, "image_swap")["changed"] > 0  # type: ignore[operator]
+    assert row_of(effects, "image_swap")["max_action_change"] > 0  # type: ignore[operator]
     outcomes = effects.outcomes
     np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
     np.testing.assert_array_equal(outcomes.episode_outcomes[2], outcomes.episode_outcomes[1])  # type: ignore[index]
@@ -99,7 +99,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: In
     assert effects.settings["readout"] == "episode"
     assert stored_image_swaps(run) == {}
     assert verify_run(run.path, deep=True).ok
-    assert set(effects.table["finding"]) <= {"dose 0", "control", "not confirmed", "hand broken"}
+    assert set(effects.table["finding"]) <= {"identity patch", "control", "not confirmed", "task disrupted"}
 
 
 def test_another_outcome_stops_before_anything_is_stored(
@@ -158,7 +158,7 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "intervention",
     [
         lambda: ClosedLoop(targets=()),
         lambda: ClosedLoop(targets=("backbone.02",)),

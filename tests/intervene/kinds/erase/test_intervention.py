@@ -35,13 +35,18 @@ def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResu
 
 
 def row_of(effects: InterventionResult, place: str, direction: str) -> ErasureEffect:
-    (row,) = (row for row in effects.erased if (row.place, row.direction) == (place, direction))
+    (row,) = (row for row in effects.effects if (row.place, row.direction) == (place, direction))
     return row
 
 
 def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: InterventionResult) -> None:
     row = row_of(effects, "backbone.02", "none")
-    assert (row.finding, row.max_action_change, row.fires, row.no_op_fires) == ("dose 0", 0.0, EPISODES, EPISODES)
+    assert (row.finding, row.max_action_change, row.fires, row.no_op_fires) == (
+        "identity patch",
+        0.0,
+        EPISODES,
+        EPISODES,
+    )
 
 
 def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: InterventionResult) -> None:
@@ -56,7 +61,7 @@ def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: I
 
 
 def test_the_certificate_says_what_a_fresh_probe_reads(effects: InterventionResult) -> None:
-    said = effects.certificate["readable"]
+    said = effects.certificate["probe_accuracy"]
     assert set(said) == {
         f"{place}|image|{what}"
         for place in ("backbone.02", "backbone.03")
@@ -73,8 +78,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(copy: Run, effects: I
     assert load_effects(copy, kind="erase").to_json() == effects.to_json()
     assert stored_image_swaps(copy) == {}
     assert verify_run(copy.path, deep=True).ok
-    assert effects.changes == effects.rows == []
-    assert "says less than exchanging" in " ".join(effects.notes)
+    assert "weaker evidence than interchange" in " ".join(effects.notes)
     stored = (copy.path / "interventions" / effects.key / "effects.csv").read_text(encoding="utf-8")
     assert stored.splitlines()[0].split(",")[:4] == ["category", "place", "role", "direction"]
 
@@ -119,18 +123,18 @@ def erased_answers(own: float, beside: float, base: str = "follower") -> Conditi
 @pytest.mark.parametrize(
     ("own", "beside", "base", "finding"),
     [
-        (0.1, 0.95, "follower", "lost"),
-        (-0.5, 0.9, "follower", "lost"),
-        (0.9, 0.95, "follower", "kept"),
-        (0.05, 0.3, "follower", "controls break too"),
-        (0.1, 0.95, "habit", "nothing to lose"),
+        (0.1, 0.95, "follower", "effect"),
+        (-0.5, 0.9, "follower", "effect"),
+        (0.9, 0.95, "follower", "no effect"),
+        (0.05, 0.3, "follower", "controls also disrupt"),
+        (0.1, 0.95, "habit", "no baseline effect"),
     ],
 )
 def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, base: str, finding: str) -> None:
     row, *controls = erasure_effects(erased_answers(own, beside, base), "suite")
     assert row.finding == finding
     assert [one.finding for one in controls] == ["control", "control"]
-    if finding == "nothing to lose":
+    if finding == "no baseline effect":
         assert row.kept is None
         return
     assert row.kept == pytest.approx(own)
@@ -152,7 +156,7 @@ def test_a_loss_in_one_group_is_no_evidence() -> None:
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "intervention",
     [
         lambda: ConceptErasure(sites=()),
         lambda: ConceptErasure(sites=("backbone.02",), roles=()),

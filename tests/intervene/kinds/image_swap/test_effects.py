@@ -21,9 +21,9 @@ def of(signs: tuple[np.ndarray, np.ndarray], groups: int | None = None) -> Image
 
 def test_who_goes_where_the_correct_picture_lies_follows() -> None:
     found = of(follower(48))
-    assert (found.follow_rate, found.reversal_rate, found.net) == (1.0, 0.0, 1.0)
+    assert (found.follow_rate, found.reversal_rate, found.net_follow_rate) == (1.0, 0.0, 1.0)
     assert found.follow_p == 2.0**-24
-    assert found.mean_displacement == pytest.approx(0.2)
+    assert found.median_displacement == pytest.approx(0.2)
     assert found.follows_images
     assert not found.is_against
 
@@ -42,7 +42,7 @@ def test_a_habit_is_no_following_however_often_it_is_right() -> None:
     assert (found.follow_rate, found.reversal_rate) == (0.0, 0.0)
     assert found.follow_p > 0.1
     assert found.is_bounded
-    assert found.net_ci[1] > 0  # that nothing was seen does not prove that nothing is there
+    assert found.net_follow_rate_ci[1] > 0  # that nothing was seen does not prove that nothing is there
 
 
 def test_following_in_few_episodes_is_not_called_following() -> None:
@@ -51,7 +51,7 @@ def test_following_in_few_episodes_is_not_called_following() -> None:
     exchanged[:4] = -0.01
     found = of((plain, exchanged))
     assert found.follow_p == 2.0**-24
-    assert found.net < SMALLEST_EFFECT_OF_INTEREST
+    assert found.net_follow_rate < SMALLEST_EFFECT_OF_INTEREST
     assert not found.follows_images
 
 
@@ -66,8 +66,14 @@ def test_one_group_unlike_the_others_makes_nothing_surer(
         for part, source in zip((plain, exchanged), other(64), strict=True):
             part[unlike] = source[unlike]
         found = of((plain, exchanged), groups=16)
-        assert found.net_ci[0] <= like.net_ci[0] or found.net > like.net
-        assert found.net_ci[1] >= like.net_ci[1] or found.net < like.net
+        assert (
+            found.net_follow_rate_ci[0] <= like.net_follow_rate_ci[0]
+            or found.net_follow_rate > like.net_follow_rate
+        )
+        assert (
+            found.net_follow_rate_ci[1] >= like.net_follow_rate_ci[1]
+            or found.net_follow_rate < like.net_follow_rate
+        )
 
 
 def test_items_that_share_pictures_do_not_add_up() -> None:

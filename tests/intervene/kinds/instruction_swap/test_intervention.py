@@ -1,7 +1,7 @@
 """Words as donors, what one step owes to them, and the memory as a place: on a real run of the random twin."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -22,7 +22,6 @@ from probe_kit.intervene.edits.sites import resolve_sites, roles_of, token_mask
 from probe_kit.intervene.kinds.instruction_swap.effects import input_sensitivity
 from probe_kit.intervene.kinds.instruction_swap.intervention import counterpart_instruction
 from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.store.answers import ConditionOutcomes
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -50,7 +49,7 @@ def test_an_item_asked_in_its_twins_words_does_what_its_twin_does(
             != replay_input.seen.instruction
         )
         chunk = session.act(replace(replay_input.seen, instruction=words), replay_input.seed)
-        assert outcomes.of("image_swap")[row] == pytest.approx(
+        assert outcomes.of("instruction_swap")[row] == pytest.approx(
             session.lateral_displacement(chunk, replay_input.seen), abs=0
         )
 
@@ -58,16 +57,15 @@ def test_an_item_asked_in_its_twins_words_does_what_its_twin_does(
 def test_four_inferences_per_episode_tell_words_from_pictures_and_noise(
     copy: Run, worded: InterventionResult
 ) -> None:
-    assert worded.outcomes.conditions == ("clean", "image_swap", "pictures", "noise")
+    assert worded.outcomes.conditions == ("clean", "instruction_swap", "image_swap", "noise")
     assert worded.certificate["items"] == {"asked": 2, "played": 2}
     assert worded.certificate["replay"]["equal"] == 4
     (line,) = worded.table.to_dict("records")
     assert line["category"] == "color"
-    assert line["words_changed"] == line["pictures_changed"] == 1.0
-    assert min(line["instruction-swap"], line["pictures"], line["noise"]) > 0
-    assert worded.changes == []
+    assert line["instruction_changed"] == line["images_changed"] == 1.0
+    assert min(line["instruction"], line["images"], line["noise"]) > 0
     assert load_effects(copy, kind="instruction-swap").to_csv() == worded.to_csv()
-    assert "Is the question read?" in str(worded.to_rich().title)
+    assert "Is the instruction read?" in str(worded.to_rich().title)
 
 
 def test_a_policy_that_is_deaf_is_told_from_one_that_is_blind(worded: InterventionResult) -> None:
@@ -75,19 +73,13 @@ def test_a_policy_that_is_deaf_is_told_from_one_that_is_blind(worded: Interventi
     moved = np.zeros_like(outcomes.displacement)
     moved[2] = 0.07
     deaf = replace(outcomes, displacement=moved, max_action_change=np.abs(moved))
-    (row,) = input_sensitivity(deaf)
-    assert (row.words, row.pictures, row.noise) == (0.0, 0.07, 0.0)
-    assert (row.words_changed, row.pictures_changed) == (0.0, 1.0)
-    assert input_sensitivity(_without_words(outcomes)) == []
+    row = input_sensitivity(deaf)
+    assert (row.instruction, row.images, row.noise) == (0.0, 0.07, 0.0)
+    assert (row.instruction_changed, row.images_changed) == (0.0, 1.0)
 
 
-def _without_words(outcomes: ConditionOutcomes) -> ConditionOutcomes:
-    return replace(
-        outcomes,
-        conditions=("clean", "image_swap"),
-        displacement=outcomes.displacement[:2],
-        max_action_change=outcomes.max_action_change[:2],
-    )
+def with_certificate(result: InterventionResult, certificate: dict[str, Any]) -> InterventionResult:
+    return replace(result, measurement=replace(result.measurement, certificate=certificate))
 
 
 def test_items_without_a_twin_are_passed_over_and_counted(
@@ -96,16 +88,16 @@ def test_items_without_a_twin_are_passed_over_and_counted(
     alone, paired = str(worded.outcomes.items[0]), str(worded.outcomes.items[-1])
     session.counterparts = {name: twin for name, twin in session.counterparts.items() if name != alone}
     assert InstructionSwap().eligible_items(session, [alone, paired]) == [paired]
-    with pytest.raises(UsageError, match="has a twin in its suite"):
+    with pytest.raises(UsageError, match="has a counterpart in its suite"):
         InstructionSwap().eligible_items(session, [alone])
-    passed = replace(worded, certificate={**worded.certificate, "items": {"asked": 2, "played": 1}})
-    assert passed.notes[0] == "1 of 2 items have no twin and were passed over."
+    passed = with_certificate(worded, {**worded.certificate, "items": {"asked": 2, "played": 1}})
+    assert passed.notes[0] == "1 of 2 items have no counterpart and were skipped."
 
 
 def test_a_family_whose_inference_is_one_action_is_marked(worded: InterventionResult) -> None:
     shadow = {**worded.certificate, "supported": {"readout": "per-step"}}
     for certificate, is_said in ((worded.certificate, False), (shadow, True)):
-        notes = replace(worded, certificate=certificate).notes
+        notes = with_certificate(worded, certificate).notes
         assert any("one action in greedy bins" in note for note in notes) is is_said
 
 
@@ -119,12 +111,15 @@ def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert twin.prompt_kv is not None
     blocks = twin.prompt_kv.layers - 1
-    assert {row.place for row in effects.changes} == {f"memory.{block:02d}" for block in range(blocks)}
+    assert {row.place for row in effects.effects} == {f"kv.{block:02d}" for block in range(blocks)}
     for name, said in effects.certificate["edits"].items():
         assert said["fires"] == 2 * 2, name  # keys and values, in two episodes
     words = effects.certificate["edits"]["kv.00|language"]
-    assert (words["still"], words["largest_change"]) == (4.0, 0.0)  # block 0's own words have seen no picture yet
-    assert effects.certificate["edits"]["kv.00|image"]["largest_change"] > 0
+    assert (words["no_op_fires"], words["max_action_change"]) == (
+        4.0,
+        0.0,
+    )  # block 0's own words have seen no picture yet
+    assert effects.certificate["edits"]["kv.00|image"]["max_action_change"] > 0
 
 
 def test_a_memory_has_the_backbones_roles_and_no_layer_behind_its_last_block(
@@ -137,7 +132,7 @@ def test_a_memory_has_the_backbones_roles_and_no_layer_behind_its_last_block(
     (place,) = resolve_sites("kv.01", session.policy)
     assert [str(site) for site in place.sites] == ["kv.01.keys", "kv.01.values"]
     assert session.policy.prompt_kv is not None
-    for wrong in (f"memory.{session.policy.prompt_kv.layers - 1:02d}", "kv.00@1"):
+    for wrong in (f"kv.{session.policy.prompt_kv.layers - 1:02d}", "kv.00@1"):
         with pytest.raises(UnknownSiteError):
             resolve_sites(wrong, session.policy)
 

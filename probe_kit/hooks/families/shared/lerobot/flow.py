@@ -425,7 +425,7 @@ class LerobotFlow(Policy):
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the stack's final norm, or a block's output.
 
-        The memory passes once the prompt is read; every iteration then begins with a copy of it.
+        Keys and values pass once the prompt is read; every iteration then begins with a copy of it.
         """
         stream = self.stream_of(site)
         if stream is self.prompt_kv:

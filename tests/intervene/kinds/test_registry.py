@@ -1,0 +1,93 @@
+"""A kind is a folder and one registry entry: help, options, results and lists are made from the entry alone."""
+
+import importlib
+import json
+from collections.abc import Iterator
+from types import ModuleType
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.extract import Run
+from probe_kit.intervene import commands, load_effects
+from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.retention import retention
+from probe_kit.suite import Suite
+from tests.intervene.kinds.dimmed_images.kind import KIND
+
+
+@pytest.fixture
+def with_entry(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The command as it is where the entry stands in the registry."""
+    monkeypatch.setitem(KINDS, KIND.name, KIND)
+    yield importlib.reload(commands)
+    monkeypatch.undo()
+    importlib.reload(commands)
+
+
+def invoke(module: ModuleType, *arguments: str) -> tuple[int, str, str]:
+    own = typer.Typer()
+    own.command(cls=module.KindHelp)(module.intervene)
+    told = CliRunner().invoke(own, arguments, env={"COLUMNS": "200"})
+    return told.exit_code, told.stdout, told.stderr
+
+
+def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
+    with_entry: ModuleType, copy: Run, small_suite: Suite
+) -> None:
+    before = retention([copy]).to_json()
+    asked = ("--kind", KIND.name, "--categories", "color", "--items", "1", "--coefficients", "0,1")
+    where = (str(copy.path), "--suite", str(small_suite.folder))
+    code, shown, said = invoke(with_entry, *where, *asked)
+    assert code == 0, said
+    assert "Is the image read?" in shown
+    result = load_effects(copy, kind=KIND.name)
+    dark, same = result.effects
+    assert (same.condition, same.median_displacement) == ("dimmed-1", 0.0)
+    assert dark.median_displacement > 0
+    stored = (copy.path / "interventions" / result.key / "effects.csv").read_text()
+    assert stored.splitlines()[0] == "category,condition,n_episodes,median_displacement"
+    code, shown, said = invoke(with_entry, str(copy.path), *asked, "--format", "json")
+    assert [row["condition"] for row in json.loads(shown)["effects"]] == ["dimmed-0", "dimmed-1"]
+    assert json.loads(shown)["effects"][0]["median_displacement"] == pytest.approx(dark.median_displacement)
+    assert "loaded the stored result" in said
+    assert [(one.kind, one.state) for one in listed_interventions(copy)] == [(KIND.name, "used")]
+    assert retention([copy]).to_json() == before
+
+
+def test_help_names_every_kind_and_what_its_options_mean_to_it(with_entry: ModuleType) -> None:
+    code, shown, _ = invoke(with_entry, "--help")
+    assert code == 0
+    words = " ".join(shown.replace("│", " ").split())
+    for kind in KINDS.values():
+        assert f"--kind {kind.name}" in words
+        assert kind.summary in words
+        for option, meaning in kind.options.items():
+            assert f"--{option.replace('_', '-')}: {meaning}" in words
+
+
+def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
+    with_entry: ModuleType, copy: Run
+) -> None:
+    code, _, _ = invoke(with_entry, str(copy.path), "--kind", KIND.name, "--coefficients", "1", "--sites", "kv.*")
+    assert code == 1
+    told = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "erase", "--target-side", "left"])
+    assert told.exit_code == 2
+    said = " ".join(told.stderr.split())
+    assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in said
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_entry_names_functions_that_exist(name: str) -> None:
+    kind = KINDS[name]
+    for part in (
+        "build",
+        "effects",
+        "table",
+        *("notes",) * bool(kind.notes),
+        *("keys_in_use",) * bool(kind.keys_in_use),
+    ):
+        assert callable(kind.function(part)), part
