@@ -30,7 +30,7 @@ def extract(
     device: common.Device = "cpu",
     dtype: own.Dtype = None,
     execute: own.Execute = None,
-    listen: own.Listen = False,
+    capture_only: own.CaptureOnly = False,
     label: own.Label = None,
     tokens: own.StoredTokens = "pooled",
     captured_calls: own.CapturedCalls = 1,

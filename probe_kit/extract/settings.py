@@ -311,7 +311,7 @@ class AskSettings(RunSettings):
                 "batch and processes are chosen for runs that act; ask with a number, such as batch=8"
             )
         self._check_one_of("picture", get_args(Picture))
-        self._check_one_of("asked", get_args(Query))
+        self._check_one_of("query", get_args(Query))
         if self.query == "absent" and not self.prompt.yes_or_no:
             raise UsageError(
                 f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask "

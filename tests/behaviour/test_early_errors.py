@@ -46,7 +46,6 @@ CASES = {
         3,
         "scene.max_steps: stored 2, asked 3",
     ),
-    f"{EXTRACT} expert --unnorm-key x": (2, "is now -M unnorm_key=KEY"),
     "verify pi0 nowhere": (2, "is no golden reference"),
     "verify pi0 reference": (3, "holds a 'smolvla' model"),
     "verify pi0-tiny --keys nowhere": (2, "cannot be verified"),
