@@ -102,7 +102,9 @@ def extract(
     ] = None,
     capture_only: Annotated[
         bool,
-        typer.Option("--no-act", help="Hear the first inference of every episode, do not act; no success rate."),
+        typer.Option(
+            "--no-act", help="Capture the first inference of each episode; do not act (no success rate)."
+        ),
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of cube places and policy noise.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
@@ -241,7 +243,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         **(
-            {"acts": "no: it is listened to once per episode; no success rate"}
+            {"acts": "no: only captured, once per episode; no success rate"}
             if identity.get("capture_only")
             else {}
         ),

@@ -1,4 +1,4 @@
-"""`probe-kit run` and `probe-kit export`: look after runs."""
+"""`probe-kit run` and `probe-kit export`: inspect, verify and finalise runs."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.console import err, out, print_json
 
-app = typer.Typer(help="Look after runs.", no_args_is_help=True)
+app = typer.Typer(help="Inspect, verify and finalise runs.", no_args_is_help=True)
 DAMAGED = 1
 
 

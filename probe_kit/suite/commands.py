@@ -1,4 +1,4 @@
-"""`probe-kit suite`: build, convert, check and look at suites."""
+"""`probe-kit suite`: build, convert, validate and show suites."""
 
 from pathlib import Path
 from typing import Annotated, Any

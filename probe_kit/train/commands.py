@@ -79,7 +79,7 @@ def train(
 ) -> None:
     """Fit logistic probes at every site and store their scores in the run.
 
-    Nested, grouped cross-validation; p-values by relabelling groups of items. Same settings are read back.
+    Nested, grouped cross-validation; p-values by label permutations of groups. Stored results are reused.
     """
     from probe_kit.extract import open_run
     from probe_kit.train import FOLD_UNITS, INCOMPLETE, TARGETS, train_probes

@@ -1,4 +1,4 @@
-"""A run in one line and as a notebook shows it; and which runs a folder that is none holds."""
+"""A run in one line and as a notebook table; and the runs that a folder contains."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -34,7 +34,7 @@ class Summarised(Protocol):
 
     @property
     def random_weights(self) -> bool:
-        """Whether nobody trained them."""
+        """Whether the weights are random."""
 
     @property
     def suite(self) -> str:
@@ -56,7 +56,7 @@ class Summarised(Protocol):
 def run_text(run: Summarised) -> str:
     """One line: model, suite, how much is there, where."""
     random = ", RANDOM WEIGHTS" if run.random_weights else ""
-    random += ", CAPTURE_ONLY TO (it did not act)" if CAPTURE_ONLY in _outcomes(run) else ""
+    random += ", CAPTURED ONLY (it did not act)" if CAPTURE_ONLY in _outcomes(run) else ""
     return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
 
 
