@@ -137,7 +137,7 @@ LOOKED_FOR = {
     "retention": "Make one with",
     "join": "Make one with",
     "from-csv": "questions.csv",
-    "convert": "no such|is no folder|not a folder|does not exist|holds no|missing",
+    "convert": "no such|not a folder|does not exist|holds no|missing",
 }
 """What a command complains of in an empty folder, when nothing is wrong with the command itself."""
 

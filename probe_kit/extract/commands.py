@@ -99,7 +99,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         **(
-            {"acts": "no: it is captured once per episode; no success rate"}
+            {"acts": "no: only captured, once per episode; no success rate"}
             if identity.get("capture_only")
             else {}
         ),

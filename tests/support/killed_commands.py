@@ -176,7 +176,7 @@ def _kill_until_done(
         course = run_command(command.arguments(place), place, None if moment is None else _at(moment, usual))
         courses.append(course)
         assert course.code in (0, -signal.SIGKILL), f"after {number} kills: {course.output}"
-        assert "Unforeseen" not in course.output, course.output
+        assert "InternalError" not in course.output, course.output
         now = command.finished(place)
         lost = sorted(one for one in seen - now if _head_of(one) not in now)
         assert lost == [], f"{command.name} lost {lost[:5]} by a kill at {moment}"
