@@ -1,4 +1,4 @@
-"""Carrying out edits while a model runs, with a ledger of what they did.
+"""Application of edits while a model runs, with a log of their effects.
 
 move = Edit("add", (Site("backbone", 2),), roles=("language",), vector=vector_hash(direction), strength=2.0)
 with applied(model, [move], seen, {move.vector: direction}) as ledger:
