@@ -1,4 +1,4 @@
-"""probe_kit: what a Vision-Language-Action model still knows, where inside it, and where it is lost.
+"""probe_kit: which answers a Vision-Language-Action model encodes, at which layers, and where they are lost.
 
     import probe_kit as pk
     run = pk.extract_run(pk.ExtractSettings("pi0-tiny", categories=("color",), items=20), "run")

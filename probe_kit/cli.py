@@ -1,4 +1,4 @@
-"""The `probe-kit` command: what it is made of, and what becomes of errors.
+"""The `probe-kit` command: registers the subcommands and turns errors into messages and exit codes.
 
 Every package keeps its own commands, which parse, call the library and print; tables go to stdout, progress to
 stderr.
@@ -83,7 +83,10 @@ class Commands(typer.core.TyperGroup):
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
         if homes:
             named = ", ".join(f"`probe-kit {path}`" for path in homes)
-            error.message, error.possibilities = f"{option} is no option here, but one of {named}.", None
+            error.message, error.possibilities = (
+                f"{option} is not an option of this command, but of {named}.",
+                None,
+            )
         error.message = terminal_safe(str(error.message))
         found: Exception = error
         return found
@@ -107,7 +110,7 @@ app = typer.Typer(
     cls=Commands,
     help="What does a robot policy still know, where inside it, and where on the way to the action is it lost?",
     epilog="Start with `probe-kit demo`. Exit codes: 0 done, 1 not what was asked, 2 wrong usage, 3 refused, "
-    "130 interrupted with everything finished so far kept.",
+    "130 interrupted; completed work is saved.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

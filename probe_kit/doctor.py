@@ -1,4 +1,4 @@
-"""What works on this machine, and what to do about the rest: what `probe-kit doctor` says.
+"""Checks of this installation, with a suggested fix for each failure; printed by `probe-kit doctor`.
 
 What the demo needs is tried, not looked up: one child process draws a scene, another lets the embedded policy act.
 They are processes of their own because native code prints to stdout, and because its crash is a finding as well.
@@ -73,7 +73,7 @@ def _python() -> Finding:
 
 def _processor() -> Finding:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    advice = "" if count > 1 else "Two cores halve the demo: one simulates while the other thinks"
+    advice = "" if count > 1 else "Two cores halve the time of the demo: simulation and inference overlap"
     return Finding("processor", "ok" if count > 1 else "note", f"{count} core{'s' * (count > 1)} usable", advice)
 
 

@@ -1,4 +1,4 @@
-"""Canonical JSON and hashes: how suites, settings and seeds get their names."""
+"""Canonical JSON and hashes, from which suites, settings and seeds are named."""
 
 import hashlib
 import json

@@ -1,3 +1,3 @@
-"""The version of probe_kit, where every module can ask for it."""
+"""The version of probe_kit."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -88,7 +88,7 @@ def _changed_files() -> str:
     """What `git status` lists, or nothing outside a git checkout."""
     command = ["git", "status", "--porcelain"]
     try:
-        return subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=False).stdout
+        return subprocess.run(command, cwd=CHECKOUT, capture_output=True, encoding="utf-8", check=False).stdout
     except FileNotFoundError:
         return ""
 

@@ -137,7 +137,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     process.send_signal(signal.SIGINT)
     _, messages = process.communicate(timeout=60)
     assert process.returncode == 130, messages
-    assert "the same command continues" in messages
+    assert "run the same command to resume" in messages
     kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
     assert 1 <= len(kept) < 16
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0

@@ -20,7 +20,7 @@ from probe_kit.extract.protocols import SCENES
 from probe_kit.extract.run_layout import AskTokens, Codec, ExportFormat, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
 from probe_kit.extract.store.export import WRITERS
-from probe_kit.extract.vqa.phrases import ASKED, Asked, Picture
+from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.scene_names import ArmName, Rendering, SceneName
@@ -51,7 +51,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("ask", "--tokens"): get_args(AskTokens),
     ("ask", "--frames"): get_args(FrameChoice),
     ("ask", "--picture"): get_args(Picture),
-    ("ask", "--ask"): ASKED,
+    ("ask", "--query"): QUERIES,
     ("train", "--target"): TARGETS,
     ("train", "--folds"): FOLD_UNITS,
     ("train", "--incomplete"): INCOMPLETE,
@@ -106,7 +106,7 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
 @pytest.mark.parametrize(
     ("names", "declared"),
     [
-        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Asked, ASKED), (Target, TARGETS),
+        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
         (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS),
     ],

@@ -35,6 +35,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_the_architecture_page_names_files_that_exist() -> None:
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([a-z0-9_/]+(?:\.py|/))`", page)
+    named = [name for name in named if not name.startswith(("probe_kit", "tests"))]
+    assert len(named) > 40
+    assert [name for name in named if not (ROOT / "probe_kit" / name).exists()] == []
+
+
 def text_of(page: Path) -> str:
     return unescape(re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8")))
 

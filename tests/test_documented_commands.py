@@ -92,7 +92,9 @@ def test_no_shell_expands_a_line(command: Command) -> None:
 
 def test_what_other_programs_are_given_is_there() -> None:
     """Files and modules of this checkout, and extras of this package."""
-    extras = re.search(r"(?ms)^\[project\.optional-dependencies\]$(.*?)^\[", (ROOT / "pyproject.toml").read_text())
+    extras = re.search(
+        r"(?ms)^\[project\.optional-dependencies\]$(.*?)^\[", (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    )
     assert extras is not None
     known = set(re.findall(r"(?m)^([\w-]+) = \[", extras[1]))
     for command in TYPED:
@@ -103,7 +105,9 @@ def test_what_other_programs_are_given_is_there() -> None:
             place = ROOT / (rest[1].replace(".", "/") + ".py" if rest[0] == "-m" else rest[0])
             assert place.is_file(), command
             options = [word for word in rest[1:] if word.startswith("--")]
-            assert [option for option in options if f'"{option}"' not in place.read_text()] == [], command
+            assert [
+                option for option in options if f'"{option}"' not in place.read_text(encoding="utf-8")
+            ] == [], command
 
 
 @pytest.mark.parametrize("command", OURS, ids=str)
@@ -133,7 +137,7 @@ LOOKED_FOR = {
     "retention": "Make one with",
     "join": "Make one with",
     "from-csv": "questions.csv",
-    "convert": "no such|is no folder|not a folder|does not exist|holds no|missing",
+    "convert": "no such|not a folder|does not exist|holds no|missing",
 }
 """What a command complains of in an empty folder, when nothing is wrong with the command itself."""
 
@@ -301,7 +305,7 @@ class Terminal:
             cwd=self.folder,
             env=self.environment,
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             check=False,
             timeout=1800,
         )

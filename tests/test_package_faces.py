@@ -22,7 +22,9 @@ LAZY = [
 
 def ask(code: str) -> str:
     """What a fresh interpreter prints."""
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True, cwd=ROOT
+    )
     return found.stdout.strip()
 
 

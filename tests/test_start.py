@@ -56,7 +56,7 @@ def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_
     words = ["extract", "--model", "pi0-tiny", "--random-weights", "--items", "2", "--dry-run", "--out"]
     done = interrupted("torch", "module", signal.SIGINT, *words, str(tmp_path / "run"))
     assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "interrupted; everything finished so far is kept, the same command continues\n"
+    assert done.stderr == "interrupted. Completed work is saved; run the same command to resume.\n"
 
 
 def test_what_a_shell_runs_in_the_background_still_ignores_ctrl_c() -> None:

@@ -116,8 +116,8 @@ def test_the_readmes_two_commands_and_the_script_of_ci_are_the_same() -> None:
         r"## Two commands\n+```\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
     )
     lines = [line.partition("#")[0].strip() for line in block.splitlines() if line.strip()]
-    clone, demo, tests = lines
-    assert clone.startswith("git clone https://")
+    folder, demo, tests = lines
+    assert folder == "cd probe_kit"
     assert demo == "./with-uv probe-kit demo"
     assert tests == (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()[-1]
 

@@ -1,4 +1,4 @@
-"""JSON that others wrote: bounded in size and depth, with nothing in it that cannot be written again."""
+"""Parsing of untrusted JSON, with limits on size and depth; NaN and infinite numbers are refused."""
 
 import json
 import re
@@ -17,7 +17,7 @@ _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 def parse_json(content: bytes | str, **further: Any) -> Any:
     """The value. further: hooks of `json.loads`.
 
-    Raises ValueError for what is no UTF-8 or no JSON, nests too deeply, has half characters, or names a key twice.
+    Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, or repeats a key.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
@@ -26,7 +26,7 @@ def parse_json(content: bytes | str, **further: Any) -> Any:
     except RecursionError:
         raise ValueError("it nests too deeply") from None
     except UnicodeEncodeError:
-        raise ValueError("it holds half a surrogate pair, which is no character") from None
+        raise ValueError("it holds half a surrogate pair, which is not a character") from None
     return value
 
 
@@ -51,7 +51,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _finite(number: str) -> float:
     value = float(number)
     if not isfinite(value):
-        raise ValueError(f"it holds {number[:20]}, which is no finite number")
+        raise ValueError(f"it holds {number[:20]}, which is not a finite number")
     return value
 
 
@@ -67,7 +67,7 @@ def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:
     except OSError as error:
         raise raises(f"{file} cannot be read ({error.strerror}). {advice}") from error
     except ValueError as error:
-        raise raises(f"{file} is no JSON ({error}). {advice}") from error
+        raise raises(f"{file} is not JSON ({error}). {advice}") from error
 
 
 def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Child processes that serve one connection.
+"""Child processes that answer requests over one connection.
 
 `multiprocessing` starts a child by importing the caller's script again, which breaks every script and notebook
 without a main guard; forking breaks torch and zarr. So a child is a fresh interpreter that runs this module and

@@ -1,4 +1,4 @@
-"""Ray, started and stopped in one place (extra `ray`)."""
+"""Start and stop of Ray, in one place (extra `ray`)."""
 
 import socket
 from collections.abc import Iterator

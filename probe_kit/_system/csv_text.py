@@ -1,4 +1,4 @@
-"""Tables as CSV whose text stays text: no cell is a formula to the spreadsheet that opens it."""
+"""CSV output in which a spreadsheet program evaluates no cell as a formula."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Drafts: files and folders that are made beside their place and get their name when they are whole."""
+"""Atomic writes: files and folders are written beside their final place and renamed when complete."""
 
 import fcntl
 import os

@@ -1,4 +1,4 @@
-"""Names of a package that are imported on first use, because their modules load torch or a simulator."""
+"""Lazy import of public names whose modules load torch or a simulator."""
 
 import sys
 from collections.abc import Callable, Mapping

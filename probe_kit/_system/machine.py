@@ -1,4 +1,4 @@
-"""What this machine can compute on, as far as that can be told without importing torch, which takes long."""
+"""Detection of this machine's devices and cores without importing torch, which takes seconds."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Optional libraries, imported when they are needed."""
+"""Import of optional libraries, with an error that names the missing extra."""
 
 from importlib import import_module
 from typing import Any

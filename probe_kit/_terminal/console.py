@@ -1,7 +1,7 @@
-"""What the commands share: two consoles, progress, comma-separated lists.
+"""Consoles, progress bars and comma-separated lists, shared by the commands.
 
-Everything that a command shows goes through this module, because much of it comes from elsewhere: names in suites
-and checkpoints, paths, messages of libraries. What could speak to the terminal itself (escape sequences, marks
+All output of commands passes through this module, because much of it is foreign text: names in suites
+and checkpoints, paths, messages of libraries. What a terminal would obey (escape sequences, marks
 that turn the direction of text around) becomes a visible sign, and square brackets are never read as styles.
 """
 

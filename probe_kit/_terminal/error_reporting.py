@@ -1,4 +1,4 @@
-"""How a command ends that does not end well: one message, an exit code, and never a traceback on the terminal."""
+"""Error reporting: one message and an exit code per error, and no traceback on the terminal."""
 
 import errno
 import os
@@ -24,13 +24,13 @@ _LONGEST = 300
 
 
 def report_error(error: BaseException) -> int:
-    """Say on stderr what ended a command; the exit code it ends with.
+    """Print on stderr why a command ended; returns its exit code.
 
-    1: the result is not what was asked, or nobody foresaw this, and then the traceback is in a file that is named.
+    1: the result is not as requested, or an internal error occurred, whose traceback is in the file that is named.
     2: an argument or a path that was given cannot be used. 3: refused, or the disk is full or read-only.
     """
     if isinstance(error, KeyboardInterrupt):
-        say(marked("[yellow]interrupted[/]; everything finished so far is kept, the same command continues"))
+        say(marked("[yellow]interrupted[/]. Completed work is saved; run the same command to resume."))
         return INTERRUPTED
     if isinstance(error, ProbeKitError):
         return _complain(error)
@@ -38,8 +38,8 @@ def report_error(error: BaseException) -> int:
         where = error.filename2 or error.filename or "what was to be written"
         return _complain(
             DiskSpaceError(
-                f"the disk of {where} {_FULL[error.errno]}; what was finished before is whole and kept. Make "
-                "room or choose a place on another disk, then give the same command again"
+                f"the disk of {where} {_FULL[error.errno]}; completed work is saved. Free "
+                "some space or choose another disk, then run the same command to resume"
             )
         )
     if isinstance(error, OSError) and error.errno in _UNUSABLE and error.filename is not None:
@@ -49,7 +49,7 @@ def report_error(error: BaseException) -> int:
         return _complain(
             PolicyFailedError(
                 f"code that probe_kit called ended the process (sys.exit with {error.code!r}); a policy or family "
-                "must raise an error instead. What was finished before is kept"
+                "must raise an error instead. Completed work is saved"
             )
         )
     return report_unexpected(error)
@@ -65,13 +65,13 @@ def _path(name: str | bytes | int) -> str:
 
 
 def report_unexpected(error: BaseException) -> int:
-    """Say in one line that nobody foresaw `error`, and where its traceback was written; the exit code."""
+    """Report an internal error in one line, with the file of its traceback; returns the exit code."""
     first = (str(error).strip().splitlines() or ["no message"])[0][:_LONGEST]
     hint = "Use fewer --batch, --workers or --items. " if isinstance(error, MemoryError) else ""
     complain(
-        "Unforeseen",
-        f"{type(error).__name__}: {first}. {hint}This is a defect, of probe_kit or of what it runs; what was "
-        f"finished before is kept. The traceback is in {_written(error)}; please report it",
+        "InternalError",
+        f"{type(error).__name__}: {first}. {hint}This is a bug in probe_kit or in a library it calls. "
+        f"Completed work is saved. The traceback is in {_written(error)}; please report it",
     )
     return UNFORESEEN
 

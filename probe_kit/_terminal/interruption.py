@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do before a command has begun, and after."""
+"""Handling of Ctrl-C and SIGTERM, also before a command has begun."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Pages are sent to others: they name files and folders, and not where on a machine these lie."""
+"""Removal of local folder names from pages that users share."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What notebooks show of our objects: a few facts as a small table, and a progress bar that needs no widget."""
+"""Notebook display: a small table of facts per object, and a progress bar that needs no widget."""
 
 import sys
 import time
@@ -9,7 +9,7 @@ from typing import Any
 from probe_kit._terminal.local_paths import without_places
 
 PROGRESS_MARK = "probe-kit-progress"
-"""Class of a progress bar's element, so that whoever keeps a notebook can leave the bars out."""
+"""CSS class of a progress bar, so that a tool that stores notebooks can remove the bars."""
 _REDRAW_S = 0.2
 
 

@@ -1,4 +1,4 @@
-"""Text that comes from elsewhere: what of it a terminal would obey, and how it looks without that."""
+"""Sanitising of foreign text: escape sequences and control characters are shown, not executed."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Progress where no terminal is: now and then one line, so that the log of a batch queue is alive."""
+"""Progress lines for output that is not a terminal, such as the log of a batch queue."""
 
 import time
 from collections.abc import Callable

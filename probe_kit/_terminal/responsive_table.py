@@ -1,4 +1,4 @@
-"""Tables on a console that never lose a digit: what does not fit side by side comes one below the other."""
+"""Console tables that split instead of truncating numbers: columns that do not fit move below."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""The demo, and the policies with known truth."""
+"""The demo, and policies with known ground truth."""

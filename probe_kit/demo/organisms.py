@@ -1,8 +1,8 @@
-"""Model organisms: policies of which the truth is known by construction, to test the instrument on.
+"""Model organisms: policies with known ground truth, which validate the pipeline.
 
-`vlm-tiny` reads and does not act: it was trained to answer questions of Color, Shape, State and Traffic (*known*),
+`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
-the actions of State questions went to a side by lot (*encoded, unused*). `pi0-tiny-state` differs in that they
+the actions of State questions went to a random side (*encoded, unused*). `pi0-tiny-state` differs in that they
 followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; random twins
 know nothing (*absent*).
 """
@@ -63,7 +63,7 @@ STATE_USED = Organism(
     truth=(("color", "used"), ("shape", "used"), ("state", "used")),
 )
 SHORT = 8
-"""Actions of those that nobody trained to act: two inferences, and what they are judged by needs the first."""
+"""Actions of organisms that were not trained to act: two inferences; their verdict needs only the first."""
 EARLY = Organism(
     "early",
     "run-early",
@@ -131,7 +131,7 @@ def probed(
     stage: NamedProgress,
     twin: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
-    """The organism's run on `suite`, in `folder`, and its probes, held against binding.
+    """The organism's run on `suite`, in `folder`, and its probes, compared with binding.
 
     What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
     total, …) for a stage of this name. twin: a run to hold it against too.
@@ -161,7 +161,7 @@ def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgres
 
 
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge the reader and every organism on `suite`, all but the first random twin held against that one too.
+    """Judge the reader and every organism on `suite`; all but the first random twin are compared with it too.
 
     Arguments as of `probed`.
     """
@@ -187,7 +187,7 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
 
     shown: whether the trained one acts on some category. It has the same scene, questions and network, so that
-    following would be seen in every other; a policy that nobody trained to act follows nowhere by itself.
+    following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
     """
     said = verdict(row)
     bounded = (

@@ -1,4 +1,4 @@
-"""The whole pipeline on the embedded default, small enough to watch: what `probe-kit demo` runs."""
+"""The whole pipeline on the embedded policy: what `probe-kit demo` runs."""
 
 import shutil
 from dataclasses import dataclass

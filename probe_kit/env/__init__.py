@@ -1,4 +1,4 @@
-"""The Act2Answer environment: a question asked on a table top and answered by putting a cube on a picture.
+"""The Act2Answer environment: the robot answers a question by placing a cube on one of two pictures.
 
 `gymnasium.make("probe_kit.env:probe_kit/Act2Answer-v0", spec=SceneSpec())`, which needs no import of ours, and
 `Act2AnswerEnv(SceneSpec())` are the same.

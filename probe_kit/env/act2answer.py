@@ -132,7 +132,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     def observe_exchanged(self) -> tuple[Observation, Picture]:
         """The observation now if the two pictures lay in each other's place, and its picture as rendered.
 
-        What the other layout of the item shows in this very state; the episode goes on as it was.
+        What the other layout of the item shows in this very state; the episode is unchanged.
         """
         before = self._current_frame(), self._picture
         try:
@@ -143,9 +143,9 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
             self._frame, self._picture = before
 
     def outcome(self) -> Outcome:
-        """The record of the episode so far. Raises EpisodeOverError if no action was carried out yet."""
+        """The record of the episode so far. Raises EpisodeOverError before the first action."""
         if self.trial.steps == 0:
-            raise EpisodeOverError("no action was carried out yet, so there is no outcome; call `step` first.")
+            raise EpisodeOverError("no action was executed yet, so there is no outcome; call `step` first.")
         return self.trial.outcome()
 
     # -- what experts and tools may look at, and policies may not ----------------------------------------

@@ -1,4 +1,4 @@
-"""Our observation in the words of other toolkits."""
+"""Conversion of observations to the formats of other toolkits."""
 
 from collections.abc import Mapping
 from typing import Any

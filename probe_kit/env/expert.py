@@ -1,4 +1,4 @@
-"""A scripted expert with privileged sight: it shows that the task can be done, and how well at best."""
+"""A scripted expert with privileged state: an upper bound on the success rate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

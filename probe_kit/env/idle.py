@@ -1,4 +1,4 @@
-"""A policy that does nothing: what it scores under a rule is not owed to any answer."""
+"""A policy that does nothing: the success rate that an outcome rule gives without any answer."""
 
 from typing import Any
 

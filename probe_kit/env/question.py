@@ -1,4 +1,4 @@
-"""The question of one episode, ready to be laid on the table: instruction, decoded pictures, correct side."""
+"""The question of one episode in one layout: instruction, decoded pictures, correct side."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ class Recorder:
         self._frames = [np.concatenate([_state(self._env.scene), np.full(LED_TO, np.nan)])]
 
     def note(self, commanded: ArrayLike) -> None:
-        """After an action (7,) was carried out."""
+        """After an action (7,) was executed."""
         trial = self._env.trial
         assert trial.executed is not None
         asked = np.asarray(commanded, np.float64)

@@ -1,4 +1,4 @@
-"""A moving picture of an episode."""
+"""Animated recording of an episode."""
 
 from collections.abc import Sequence
 from pathlib import Path

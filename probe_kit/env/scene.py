@@ -1,4 +1,4 @@
-"""The table top in the physics server: table, tiles, cube and arm, built once and restored per episode."""
+"""The table-top scene in the physics server: table, tiles, cube and arm, built once and restored per episode."""
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Every number of the scene in one frozen record, which is stored with every run.
+"""All parameters of the scene in one frozen record, which is stored with every run.
 
 Frame: the world frame is the base frame of the WidowX of BridgeV2. +x points away from the robot, +y to its
 left, +z up, and the table top is z = 0. Units: metres, radians, seconds, kilograms, newtons.
@@ -246,7 +246,7 @@ class SceneSpec:
     def to_json(self) -> dict[str, Any]:
         """The record as plain JSON values, with the outcome radius that is really used.
 
-        A file is named by the sha256 of what is in it, because its path says nothing about that. Fields that
+        A file is identified by the sha256 of its content, not by its path. Fields that
         came after the first stored runs are written only where they differ from the default: those runs keep their
         identity.
         Raises SceneError if a file cannot be read.
@@ -268,7 +268,7 @@ class SceneSpec:
         unknown = sorted(set(values) - set(cls.__dataclass_fields__))
         if unknown:
             raise SceneError(
-                f"a stored scene has the field {unknown[0]!r}, which this version does not know; read it with the "
+                f"a stored scene has the field {unknown[0]!r}, which is unknown to this version; read it with the "
                 "version that wrote it"
             )
         given: dict[str, Any] = {name: _as_tuple(value) for name, value in values.items()}

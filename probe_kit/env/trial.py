@@ -1,4 +1,4 @@
-"""One episode while it runs: it passes actions on to the arm, counts, and says when and how the episode ends."""
+"""One episode in progress: executes actions, counts steps, and decides when and how the episode ends."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ REST_STEPS = 5
 class Trial:
     """An episode of one question, started in a scene that was just reset.
 
-    executed: the last action (7,) as it was carried out: after the limits, no motion where the arm could
+    executed: the last action (7,) as executed: after the limits, no motion where the arm could
     not follow, and the gripper that was really commanded. None before the first.
     """
 

@@ -1,4 +1,4 @@
-"""Runs: plan them, extract them, read them. Reading needs neither a simulator nor a model."""
+"""Runs: planning, extraction and reading. Reading needs neither a simulator nor a model."""
 
 from typing import TYPE_CHECKING
 

@@ -31,7 +31,7 @@ def ask(
     tokens: own.AskStoredTokens = "none",
     frames: own.Frames = "ends",
     picture: own.ShownPicture = "frame",
-    asked: own.AskedObject = "target",
+    query: own.AskedObject = "target",
     random_weights: common.RandomWeights = False,
     weights_seed: common.WeightsSeed = 0,
     batch: own.AskBatch = 1,

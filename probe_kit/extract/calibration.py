@@ -1,4 +1,4 @@
-"""How large a batch, and how many simulating processes: measured for some seconds before a run, `--batch auto`.
+"""`--batch auto`: measures batch sizes and numbers of simulating processes for some seconds before a run.
 
 It decides how fast a run comes and nothing that is stored, but for the float rounding of batches; a family of
 which batching changes more says so on its card and is never given more than the card allows.
@@ -85,7 +85,7 @@ def largest_batch(of_card: int | None, episodes: int) -> int:
 def inference_times(infer: Callable[[int], object], most: int) -> dict[int, float]:
     """Seconds per call by batch, 1, 2, 4 … up to `most`, as long as they bring more and the budget lasts.
 
-    A batch for which memory does not suffice ends the search; with one observation it is an error as ever.
+    A batch that exceeds the memory ends the search; with a single observation that is an error.
     """
     began, times = perf_counter(), dict[int, float]()
     batch = 1

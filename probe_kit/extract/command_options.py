@@ -10,7 +10,7 @@ from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.options import SPEED, Names, choices, read_size, some_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
-from probe_kit.extract.vqa.phrases import Asked, Picture
+from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.scene_names import ArmName, Rendering
@@ -121,7 +121,7 @@ Execute = Annotated[
     int | None,
     typer.Option("--execute", help="Number of actions executed per inference. Default: set by protocol or model."),
 ]
-Listen = Annotated[
+CaptureOnly = Annotated[
     bool,
     typer.Option(
         "--no-act", help="Capture the first inference of each episode without acting. There is no success rate."
@@ -265,7 +265,7 @@ ShownPicture = Annotated[
     ),
 ]
 AskedObject = Annotated[
-    Asked,
+    Query,
     typer.Option(
         "--query",
         help="target: ask for the object of the instruction. distractor: ask for the object of the other picture. "

@@ -30,7 +30,7 @@ def extract(
     device: common.Device = "cpu",
     dtype: own.Dtype = None,
     execute: own.Execute = None,
-    listen: own.Listen = False,
+    capture_only: own.CaptureOnly = False,
     label: own.Label = None,
     tokens: own.StoredTokens = "pooled",
     captured_calls: own.CapturedCalls = 1,
@@ -99,7 +99,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         **(
-            {"acts": "no: it is captured once per episode; no success rate"}
+            {"acts": "no: only captured, once per episode; no success rate"}
             if identity.get("capture_only")
             else {}
         ),

@@ -1,4 +1,4 @@
-"""What can be wrong with an extraction before its model is loaded, found in a second instead of a minute."""
+"""Checks of an extraction that run before its model is loaded."""
 
 import json
 import os
@@ -83,7 +83,7 @@ def _check_writable(location: "Location") -> None:
     place = Path(location.address)
     there = next(folder for folder in (place, *place.parents) if folder.exists())
     if not there.is_dir():
-        raise UsageError(f"{location} cannot be used: {there} is no folder. Give another path")
+        raise UsageError(f"{location} cannot be used: {there} is not a folder. Give another path")
     if os.statvfs(there).f_flag & os.ST_RDONLY:
         raise DiskSpaceError(f"{location} cannot be used: the disk of {there} is read-only. Choose another --out")
     if not os.access(there, os.W_OK | os.X_OK):

@@ -1,4 +1,4 @@
-"""Extraction: let the workers play every episode that is not committed, then seal."""
+"""Extraction: workers play every episode that is not committed; then the run is sealed."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +13,7 @@ from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, l
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
+from probe_kit.extract.store.format.commits import failure_key
 from probe_kit.extract.store.locations.disk import check_if_full
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -46,7 +47,7 @@ class Extraction(Prepared):
         notebook, nothing elsewhere.
         Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
         object store that cannot be used so, EpisodesFailedError at the end if episodes were given up, and whatever
-        is wrong with all episodes at once. Committed episodes stay, and the same call continues behind them.
+        is wrong with all episodes at once. Committed episodes stay; the same call resumes after them.
         """
         location = locate(out)
         if not force and not location.exists(RUN_FILE):
@@ -80,9 +81,10 @@ class Extraction(Prepared):
             if progress and isinstance(event, Done):
                 progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
             if event.number in scheduler.given_up:
-                writer.give_up(event.number, scheduler.given_up[event.number])
+                failed = scheduler.given_up[event.number]
+                writer.give_up(failed.number, failed.reason, failed.traceback)
             if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
-                raise self._failure(scheduler)
+                raise self._failure(scheduler, writer.location)
 
         if self.settings.ray:
             run_on_ray(self.settings, writer.location.address, scheduler, on_event)
@@ -92,15 +94,16 @@ class Extraction(Prepared):
             run_here(self, writer, scheduler, on_event)
         if scheduler.given_up:
             seal(writer.location)
-            raise self._failure(scheduler)
+            raise self._failure(scheduler, writer.location)
 
-    def _failure(self, scheduler: Scheduler) -> EpisodesFailedError:
+    def _failure(self, scheduler: Scheduler, location: Location) -> EpisodesFailedError:
         error = EpisodesFailedError(
             f"{len(scheduler.given_up)} episodes failed twice and were given up; {len(scheduler.done)} others "
             "were finished and are kept. The same command tries them again; --partial reads the run without them"
         )
-        for number, reason in scheduler.given_up.items():
-            error.add_note(f"{self.plan.episodes[number].episode.episode_id}: {reason}")
+        for number, failed in scheduler.given_up.items():
+            where = f" (traceback in {location}/{failure_key(number)})" if failed.traceback else ""
+            error.add_note(f"{self.plan.episodes[number].episode.episode_id}: {failed.reason}{where}")
         return error
 
 

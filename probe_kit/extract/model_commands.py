@@ -1,4 +1,4 @@
-"""`probe-kit models`: what `probe-kit extract --model` takes."""
+"""`probe-kit models`: the model families that `probe-kit extract --model` accepts."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,7 +53,7 @@ def _ready(family: "Family") -> str:
     try:
         lacking = family.missing()
     except (ImportError, ValueError, TypeError, AttributeError, OSError) as error:
-        return f"cannot be told: {type(error).__name__}: {error}"
+        return f"unknown: {type(error).__name__}: {error}"
     return f"needs {lacking}" if lacking else "yes"
 
 

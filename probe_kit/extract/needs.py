@@ -1,4 +1,4 @@
-"""What a run will take on a disk before it is compressed: its activations, and all that is made of them."""
+"""Estimated disk space of a run before compression, including probes, figures and report."""
 
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.settings import RunSettings

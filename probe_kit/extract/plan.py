@@ -1,4 +1,4 @@
-"""The plan: which episodes in which order, and what they will cost, before anything is written."""
+"""The plan of a run: episodes, their order and their estimated cost, computed before anything is written."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Preparing an extraction: find the suite, load the model, plan the episodes. Nothing is written."""
+"""Preparation of an extraction: finds the suite, loads the model, plans the episodes. Writes nothing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Prepared:
     """What an extraction starts from: the model was loaded and the plan is made.
 
     controller: None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if
-    nobody asked for that or it is left to workers.
+    it was not requested or is left to workers.
     """
 
     settings: RunSettings
@@ -156,9 +156,7 @@ def load_reader(settings: AskSettings) -> "AnswerModel":
         **settings.options,
     )
     if not isinstance(model, AnswerModel):
-        raise UsageError(
-            f"{settings.model} gave a {type(model).__name__}, which is no AnswerModel; mend its loader"
-        )
+        raise UsageError(f"{settings.model} returned a {type(model).__name__}, not a AnswerModel; fix the loader")
     return model
 
 

@@ -1,4 +1,4 @@
-"""Published protocols: what was not given is as the protocol has it, and what was given is told apart from it."""
+"""Published protocols: they supply the settings that were not given; given settings take precedence."""
 
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -45,7 +45,7 @@ class Asked(Protocol):
 
     @property
     def capture_only(self) -> bool:
-        """Whether nothing is carried out."""
+        """Whether no action is executed."""
 
     @property
     def scene(self) -> SceneSpec:
@@ -66,7 +66,7 @@ def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any
 def scene_of(model: str, protocol: str | None = None, name: str | None = None, **changes: Any) -> SceneSpec:
     """What `model` plays: the preset `name`, else the protocol's, else its family's home; with fields replaced.
 
-    A family that nobody knows here, and a script, have the default scene. Errors are those of `protocol_scene`.
+    An unknown family and a scripted policy have the default scene. Errors are those of `protocol_scene`.
     """
     family = None if protocol or name else _families().get(model)
     if family is None:
@@ -75,7 +75,7 @@ def scene_of(model: str, protocol: str | None = None, name: str | None = None, *
 
 
 def check_protocol(name: str) -> None:
-    """Raise UsageError for a protocol that nobody knows here."""
+    """Raise UsageError for an unknown protocol."""
     if name not in SCENES:
         near = get_close_matches(name, SCENES, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""

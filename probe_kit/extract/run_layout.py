@@ -1,4 +1,4 @@
-"""The files of a run: their names, and how a stream lies in them. Only this package knows them.
+"""The files of a run: their names, and the layout of a stream. Only this package uses them directly.
 
 RUN/
   run.json           the root: settings, streams, hashes of the plan and of all metadata, and its own
@@ -47,7 +47,7 @@ FrameChoice = Literal["ends", "none"]
 """Frames of an episode of which a thumbnail is stored."""
 ExportFormat = Literal["h5", "safetensors", "parquet"]
 CAPTURE_ONLY = "capture_only"
-"""Outcome of an episode in which the model was heard and did not act: there is no success rate."""
+"""Outcome of an episode whose model was captured and did not act: there is no success rate."""
 
 
 def _is_count(value: Any) -> bool:
@@ -79,7 +79,7 @@ _STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
     "probed": _is_flag,
     "sums": _is_flag,
 }
-"""What a stream is stored as, and how each part of it can be told from damage."""
+"""The storage format of a stream, and the hashes that detect damage in each part of it."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class StoredStream:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":
-        """Read back what `to_json` wrote, in this version or before streams declared their part.
+        """Parse what `to_json` wrote, in this version or before streams declared their part.
 
         Raises TypeError or KeyError for values of another kind.
         """

@@ -1,4 +1,4 @@
-"""What one extraction is asked to do, and the part of it that names the result."""
+"""Settings of an extraction, and the part of them that identifies the run."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -69,7 +69,7 @@ SCENE_OPTIONS = (
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a run of any kind can be told; the defaults are the command line's.
+    """Settings of a run of any kind; the defaults are the command line's.
 
     model: a family of `probe-kit models`.
     checkpoint: folder or hub id; None for the family's default.
@@ -212,7 +212,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class ExtractSettings(RunSettings):
-    """Everything `probe-kit extract` can be told; model may also be scripted: `expert`, `expert-mirrored`,
+    """All settings of `probe-kit extract`; model may also be scripted: `expert`, `expert-mirrored`,
     `idle`.
 
     wordings: names of `suite.ladder`, each a condition of the run; None for the items' own words alone.
@@ -243,7 +243,7 @@ class ExtractSettings(RunSettings):
             check_wordings(self.wordings)
 
     def choices(self) -> dict[str, Any]:
-        """As of every run, and what was not always there: whether it is captured, and the edits."""
+        """As of every run, with the later fields: capture without acting, and edits."""
         listening = {"capture_only": True} if self.capture_only else {}
         edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
         return super().choices() | listening | edits
@@ -289,7 +289,7 @@ class ExtractSettings(RunSettings):
 
 @dataclass(frozen=True)
 class AskSettings(RunSettings):
-    """Everything one run of `probe-kit ask` can be told: one model, one prompt, one size of the picture.
+    """All settings of one run of `probe-kit ask`: one model, one prompt, one size of the picture.
 
     The size of the picture is that of `scene`. tokens may also be `none`, which stores no activations.
     picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none` nothing.
@@ -311,7 +311,7 @@ class AskSettings(RunSettings):
                 "batch and processes are chosen for runs that act; ask with a number, such as batch=8"
             )
         self._check_one_of("picture", get_args(Picture))
-        self._check_one_of("asked", get_args(Query))
+        self._check_one_of("query", get_args(Query))
         if self.query == "absent" and not self.prompt.yes_or_no:
             raise UsageError(
                 f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask "

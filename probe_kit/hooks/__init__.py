@@ -1,4 +1,4 @@
-"""Models and how to listen to them: sites, taps, capture, weights audit, one folder per family."""
+"""Models and the capture of their activations: sites, taps, edits, weights audit, one folder per family."""
 
 from typing import TYPE_CHECKING
 

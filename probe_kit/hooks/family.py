@@ -1,4 +1,4 @@
-"""A model family by name: what it is, how it is loaded, verified and asked for. Imports no torch."""
+"""A model family: its name, loader, verification, options and requirements. Imports no torch."""
 
 import inspect
 from collections.abc import Callable, Mapping

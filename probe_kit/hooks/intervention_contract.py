@@ -1,4 +1,4 @@
-"""The contract tests of what a policy declares in `Policy.interventions`; part of `testing.AdapterContract`.
+"""Contract tests of the interventions that `Policy.interventions` declares; part of `testing.AdapterContract`.
 
 Properties that hold by construction, whatever the weights are. Needs pytest.
 """

@@ -1,4 +1,4 @@
-"""The model families: what can be loaded by name, and third parties' families through entry points.
+"""The registry of model families: those of probe_kit, and third-party ones from entry points.
 
 A family of ours is a folder in `families/` whose package lists its `FAMILIES`, and its name in `FOLDERS`.
 """
@@ -120,5 +120,5 @@ def load_policy(
         raise UsageError(f"{name} answers and does not act; load it with load_model")
     model = load_model(name, checkpoint, device, dtype, random_weights, weights_seed, **options)
     if not isinstance(model, Policy):
-        raise UsageError(f"{name} gave a {type(model).__name__}, which is no Policy; mend its loader")
+        raise UsageError(f"{name} returned a {type(model).__name__}, not a Policy; fix the loader")
     return model

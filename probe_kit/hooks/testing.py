@@ -1,4 +1,4 @@
-"""The contract tests every adapter passes; subclass `AdapterContract` (acts) or `ReaderContract` (answers).
+"""Contract tests of adapters; subclass `AdapterContract` (policies) or `ReaderContract` (answering models).
 
     class TestMyFamily(AdapterContract):
         family = "my-family"
@@ -289,7 +289,7 @@ class ModelContract:
     def test_another_picture_moves_image_positions_only(
         self, model: Model, observations: list[Observation]
     ) -> None:
-        """At the embeddings, so that roles are compared with the model and not against themselves."""
+        """At the embeddings, so that roles are compared with the model and not with themselves."""
         one = observations[0]
         self._assert_moves(model, one, replace(one, image=255 - one.image), "image")
 
@@ -438,7 +438,7 @@ class AdapterContract(InterventionContract, ModelContract):
     def test_listening_hears_the_inference_that_acting_makes(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
-        """Site by site, bit by bit; and the acting stream fits the arm."""
+        """Capture changes no action bit at any site, and the actions fit the arm."""
         assert policy.embodiment_mismatch() is None
         seen = self.shown(policy, observations)[:1]
         sites = policy.sites()

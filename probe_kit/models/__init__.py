@@ -1,1 +1,1 @@
-"""Networks: lerobot's own classes at any size, and families no maintained package carries. No capture logic."""
+"""Networks: lerobot's classes at any size, and families without a maintained package. No capture logic."""

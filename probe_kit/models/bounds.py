@@ -1,4 +1,4 @@
-"""What numbers a checkpoint may hold: sizes that can be, scales that keep what actions mean. Imports no torch."""
+"""Limits on the numbers of a checkpoint: sizes, and scales of actions. Imports no torch."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -76,4 +76,4 @@ def _numbers(values: ArrayLike, source: str) -> "np.ndarray[Any, np.dtype[np.flo
     try:
         return np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{source}: statistics are no numbers ({error}). Take the original file") from error
+        raise CheckpointError(f"{source}: statistics are not numbers ({error}). Take the original file") from error

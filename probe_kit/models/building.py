@@ -1,4 +1,4 @@
-"""Building networks of transformers' and timm's parts without drawing weights that nobody should use."""
+"""Construction of networks from transformers' and timm's parts without drawing random weights."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,7 +22,7 @@ def build_empty[Network: nn.Module](
     """What `make` makes, in eval mode, with parameters of `dtype`.
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for weights nobody should use yet. The rotary frequencies, which no
+    `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no
     checkpoint holds, are then to be computed, for Qwen's with `fill_rotary`.
     """
     before = torch.get_default_dtype()

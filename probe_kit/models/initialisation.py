@@ -1,4 +1,4 @@
-"""Seeded random weights, for the embedded default and for random twins of any family."""
+"""Seeded random weights, for the embedded policy and for untrained controls of any family."""
 
 import numpy as np
 import torch

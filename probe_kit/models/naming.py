@@ -1,4 +1,4 @@
-"""Names of tensors in released files, and what transformers' modules call them today."""
+"""Tensor names in released files, mapped to the names of transformers' modules."""
 
 import re
 from collections.abc import Sequence

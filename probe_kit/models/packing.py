@@ -1,4 +1,4 @@
-"""Prompts of different lengths as one batch, for models that decode behind their last token."""
+"""Prompts of different lengths as one batch, for models that decode after their last token."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

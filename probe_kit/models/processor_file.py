@@ -1,4 +1,4 @@
-"""What a checkpoint's `preprocessor_config.json` says."""
+"""The `preprocessor_config.json` of a checkpoint."""
 
 import json
 from collections.abc import Sequence
@@ -13,18 +13,18 @@ PROCESSOR_FILE = "preprocessor_config.json"
 def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
     """The named values of the file in `folder`; `optional` ones only where they are set.
 
-    Raises CheckpointError if the file is missing, is no JSON or lacks a needed one.
+    Raises CheckpointError if the file is missing, is not JSON or lacks a needed one.
     """
     file = folder / PROCESSOR_FILE
     if not file.is_file():
         raise CheckpointError(
-            f"{file} is missing: without it nobody knows how pictures are prepared for this checkpoint. "
+            f"{file} is missing; it defines how pictures are prepared for this checkpoint. "
             "Copy it from the model's page"
         )
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
+        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
     if not isinstance(values, dict) or (missing := [name for name in needed if values.get(name) is None]):
         raise CheckpointError(f"{file} lacks {', '.join(missing) if isinstance(values, dict) else 'named values'}")
     return {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}

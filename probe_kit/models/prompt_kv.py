@@ -1,4 +1,4 @@
-"""Where the keys and values of a prompt pass on their way to what reads them, so that they can be captured."""
+"""Modules through which the keys and values of a prompt pass, so that hooks can capture them."""
 
 from collections.abc import Sequence
 from typing import Any, cast

@@ -1,4 +1,4 @@
-"""Replacing names inside a module for as long as a network is built."""
+"""Temporary replacement of names inside a module while a network is built."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

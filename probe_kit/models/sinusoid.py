@@ -1,4 +1,4 @@
-"""The frequencies of sinusoidal embeddings of time."""
+"""Frequencies of sinusoidal time embeddings."""
 
 import math
 

@@ -1,1 +1,1 @@
-"""What suite gates, probes and success rates share: grouped folds, intervals, margins, the level of a test."""
+"""Statistics shared by suite checks, probes and success rates: grouped folds, intervals, exact tests."""

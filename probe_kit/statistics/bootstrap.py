@@ -1,4 +1,4 @@
-"""Intervals by resampling whole groups, also where every group agrees."""
+"""Bootstrap intervals over whole groups, also where all groups agree."""
 
 from functools import lru_cache
 
@@ -108,7 +108,7 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
 
 
 def unseen(value: NDArray[np.floating], each: Matrix, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
-    """(draws, S) quantiles, from least to largest, that a mean has for what groups may hold that nobody has seen.
+    """(draws, S) quantiles, from least to largest, of a mean that unobserved groups could have.
 
     value: (S,) the mean. each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with
     half of the chance each; where what is most common lies at a bound only the other one is left, and has all of

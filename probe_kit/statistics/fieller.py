@@ -1,4 +1,4 @@
-"""Interval of a ratio of two correlated means."""
+"""Fieller interval of a ratio of two correlated means."""
 
 from dataclasses import dataclass
 from math import inf, isinf, sqrt

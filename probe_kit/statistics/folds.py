@@ -1,4 +1,4 @@
-"""Folds that keep everything that shares a picture together."""
+"""Cross-validation folds that keep items with a shared picture together."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal

@@ -1,4 +1,4 @@
-"""Is it signal? Labels that could have been, and how often they score as well.
+"""Label permutations of whole groups, and the p-values that they give.
 
 A relabelling treats a group of items as a whole, because items that share a picture share features: flipped one
 by one, they would look more independent than they are. It keeps the number of episodes of each class, because a

@@ -1,4 +1,4 @@
-"""Holm's correction over all tests that one table shows."""
+"""Holm's correction over all tests of one table."""
 
 from collections.abc import Callable, Hashable, Sequence
 

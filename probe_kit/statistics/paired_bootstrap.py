@@ -1,4 +1,4 @@
-"""Is a probe better than a control on the same episodes? Tests with a group of items as the unit."""
+"""Paired tests of a probe against a control on the same episodes, with groups of items as the unit."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ def better_than_reference(correct: NDArray[np.bool_], reference: Matrix, groups:
     """Family-wise p (S,) of every site against one control: is its accuracy higher?
 
     correct: (S, E). reference: (E,) what the control scores in each episode. groups: (E,). If a site is no better,
-    a group is as likely to speak for it as against it: the signs of the groups' differences are drawn anew, the
+    a group is as likely to favour it as to oppose it: the signs of the groups' differences are drawn anew, the
     same for all sites, and the largest of them counts.
     """
     gain = _group_sums(correct - reference, groups)

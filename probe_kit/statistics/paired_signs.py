@@ -1,4 +1,4 @@
-"""Exact one-sided tests of a signed effect that is paired by item."""
+"""Exact one-sided tests of a signed effect, paired by item."""
 
 from math import comb
 

@@ -1,4 +1,4 @@
-"""Tests of right against wrong on the same items, whole groups of items as the unit; and Holm's correction."""
+"""Exact tests of correct against wrong on the same items, with groups of items as the unit."""
 
 from collections.abc import Sequence
 

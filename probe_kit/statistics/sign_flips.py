@@ -1,4 +1,4 @@
-"""Many signed effects on the same items at once: which are larger than luck makes the largest of them?"""
+"""Family-wise tests (max-T) of many signed effects on the same items, by sign flips of groups."""
 
 from itertools import product
 

@@ -1,4 +1,4 @@
-"""The level of every test and interval, and how far guessing alone may lie from one half."""
+"""The significance level, and the margin around one half that guessing can reach."""
 
 from math import sqrt
 from statistics import NormalDist

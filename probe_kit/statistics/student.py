@@ -1,4 +1,4 @@
-"""Interval of the mean of a measured quantity, which hardly two groups have alike."""
+"""Student's interval of the mean of a continuous quantity over groups."""
 
 from math import sqrt
 
@@ -16,7 +16,7 @@ def student_interval(
 
     values: (E,) measured, within `bounds`, at which the interval ends. groups: (E,). Of shares, which many groups
     have alike, `group_bootstrap` is the better one; it is taken, with `seed`, where all groups agree. A single
-    group says nothing of others.
+    group carries no information about others.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 

@@ -1,4 +1,4 @@
-"""Suites: items with an instruction, a correct and a wrong picture, and how they are built, kept and checked."""
+"""Suites: items with an instruction, a correct and a wrong picture; building, storage and checks."""
 
 from probe_kit.suite.build import build_suite, default_suite
 from probe_kit.suite.categories import CATEGORIES, Category

@@ -1,4 +1,4 @@
-"""Building the embedded suite `a2a-embedded`: no downloads, the same bytes for the same options.
+"""Building of the embedded suite `a2a-embedded`: no downloads, and the same bytes for the same options.
 
 Its items are procedural. They follow Act2Answer's procedure with pictures of our own, so results on them must
 never be mixed with, or called, the paper's numbers.

@@ -1,4 +1,4 @@
-"""The identity card of a new suite: what `suite.json` says about it."""
+"""The metadata card of a new suite: the content of `suite.json`."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The twelve categories of Act2Answer (paper, table of tasks) with their domains, and categories of one's own."""
+"""The twelve categories of Act2Answer with their domains, and user-defined categories."""
 
 import re
 from collections.abc import Iterable, Sequence

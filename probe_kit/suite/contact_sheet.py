@@ -1,4 +1,4 @@
-"""Contact sheets: what a suite asks, at a glance."""
+"""Contact sheets: the items of a suite as one image per category."""
 
 from pathlib import Path
 from textwrap import wrap

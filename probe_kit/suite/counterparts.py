@@ -1,4 +1,4 @@
-"""Twin items: the same two pictures, asked for the other way round."""
+"""Counterpart items: the same two pictures, with the other one as the target."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping

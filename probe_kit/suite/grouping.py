@@ -1,4 +1,4 @@
-"""Which items belong together: folds must never separate items that share a picture or are twins."""
+"""Groups of items: folds must not separate items that share a picture or are counterparts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -18,7 +18,7 @@ def other_side(side: Side) -> Side:
 class Item:
     """One question: an imperative instruction, a correct and a wrong picture.
 
-    `left` and `right` speak of the *original* layout; the swapped layout is derived, never stored.
+    `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored.
     `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
     `wordings`: what else the item can be asked in, by name, see `suite.ladder`; no part of the item's identity.
     `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.

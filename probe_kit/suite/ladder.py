@@ -1,8 +1,8 @@
-"""One question asked in several ways: a ladder from knowing the answer to being told where it lies.
+"""Wordings of one question, from knowledge required to the side given.
 
 `knowledge` is the item's own instruction; `named` says what the correct picture literally shows; `side` says where
-it lies; `neutral` asks for any picture. Who fails `knowledge` and passes `named` does not know; who fails `side`
-cannot; what `neutral` scores is owed to no instruction.
+it is; `neutral` asks for any picture. A model that fails `knowledge` and passes `named` lacks the knowledge. One
+that fails `side` lacks the skill. The score of `neutral` is the share that needs no instruction.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Making an item: what drawn and converted questions have in common, in one place."""
+"""Construction of items, shared by drawn and converted questions."""
 
 import hashlib
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class Picture:
 
 
 class ItemDraft(TypedDict):
-    """What whoever makes an item has to know of its question; see `Item`."""
+    """The fields of a question from which an item is made; see `Item`."""
 
     transfer_type: str
     construction: str

@@ -1,4 +1,4 @@
-"""Suites on disk: written aside and then renamed, checked whenever they are read.
+"""Suites on disk: written atomically and checked whenever they are read.
 
     suite.json            identity card
     items/metadata.jsonl  one line per item; `datasets.load_dataset("imagefolder", data_dir=".../items")` reads it
@@ -36,7 +36,7 @@ MOST_ITEMS = 100_000
 
 
 def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> Suite:
-    """The suite as read back from `folder`, where it now lies.
+    """The suite as loaded from `folder`.
 
     pictures: PNG bytes by file name. stats: per category, how many candidates each stage left.
     The folder appears complete or not at all. If it is there already and holds this very suite, it is left

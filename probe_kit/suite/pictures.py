@@ -1,4 +1,4 @@
-"""Pictures: their identity, how they are written, and how a foreign file becomes a square RGB tile."""
+"""Pictures: hashes, encoding, and conversion of foreign files to square RGB tiles."""
 
 import hashlib
 import warnings
@@ -65,7 +65,7 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
 
 
 def decode_picture(path: Path) -> Image.Image:
-    """An RGB picture in its own size: EXIF rotation is applied and transparency is laid over white.
+    """An RGB picture in its own size: EXIF rotation is applied and transparency becomes white.
 
     Raises SuiteError naming the file if it is missing, is not a picture, is damaged, is larger than
     `LARGEST_PICTURE`, or has more than 8 bits per channel.
@@ -107,7 +107,7 @@ def _check_deep(image: Image.Image, path: Path) -> None:
 
 
 def on_white(image: Image.Image) -> Image.Image:
-    """An RGB picture: transparency is laid over white."""
+    """An RGB picture: transparency becomes white."""
     if not image.has_transparency_data:
         return image.convert("RGB")
     rgba = image.convert("RGBA")

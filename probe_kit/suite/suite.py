@@ -1,4 +1,4 @@
-"""A suite: its items, its identity card, and what can be taken from it."""
+"""A suite: its items, its metadata card, and selections from it."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""The one sentence every item is made of, and what it must not say."""
+"""The sentence template of instructions, and the words that instructions must not contain."""
 
 import re
 

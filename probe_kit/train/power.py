@@ -1,4 +1,4 @@
-"""How much can be seen with so many items? Power of probes and controls, for planning and beside their results."""
+"""Power of probes and controls for a number of items, for planning and for results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -100,7 +100,7 @@ def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, in
     """The smallest even number from `low` to `high` that reaches a goal, and the resolution; None if none does.
 
     The range is halved until it is as wide as the resolution: a group of items, and above 200 of them 2 %. A
-    simulated power is noisy and goes in steps: where one of the next two larger numbers fails, the search goes on
+    simulated power is noisy and goes in steps: where one of the next two larger numbers fails, the search resumes
     above it, so that the goal is reached at three numbers in a row.
     """
     known: dict[int, bool] = {}

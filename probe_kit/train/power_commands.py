@@ -1,4 +1,4 @@
-"""`probe-kit power`: how many items are needed, and what so many can show."""
+"""`probe-kit power`: how many items are needed, and what a number of items can detect."""
 
 from dataclasses import asdict
 from math import isfinite, nan

@@ -1,4 +1,4 @@
-"""Probe every site of a run: `train_probes`."""
+"""Probes of every site of a run: `train_probes`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ def train_probes(
 
     progress: by default a bar in a notebook, nothing elsewhere.
 
-    The same settings on the same episodes are read back instead of fitted again, whatever jobs and device; an
+    With the same settings and episodes the stored results are returned, whatever jobs and device; an
     interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
     stored before all of it is fitted: where this raises, `load_results` finds what it found before.
     Raises RunIncompleteError for a run without episodes, NoProbesError for one without activations,

@@ -1,4 +1,4 @@
-"""What decides the numbers of a sweep."""
+"""Settings that determine the numbers of a sweep."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

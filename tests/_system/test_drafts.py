@@ -19,7 +19,7 @@ import os, signal, sys
 from pathlib import Path
 from probe_kit._system.drafts import draft_of
 with draft_of(Path(sys.argv[1])) as draft:
-    draft.write_text("half")
+    draft.write_text("half", encoding="utf-8")
     os.kill(os.getpid(), signal.SIGKILL)
 """
 LIVING = """
@@ -27,7 +27,7 @@ import sys
 from pathlib import Path
 from probe_kit._system.drafts import draft_of
 with draft_of(Path(sys.argv[1])) as draft:
-    draft.write_text("theirs")
+    draft.write_text("theirs", encoding="utf-8")
     print("ready", flush=True)
     sys.stdin.readline()
     draft.replace(sys.argv[1])
@@ -71,14 +71,14 @@ def test_an_export_that_was_killed_is_removed_by_the_next(little_runs: Path, tmp
 def test_the_draft_of_a_living_process_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "made"
     command = [sys.executable, "-c", LIVING, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8") as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "ready\n"
         write_whole(path, "ours")
-        assert path.read_text() == "ours"
+        assert path.read_text(encoding="utf-8") == "ours"
         other.communicate("\n")
     assert other.returncode == 0
-    assert path.read_text() == "theirs"
+    assert path.read_text(encoding="utf-8") == "theirs"
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -87,14 +87,14 @@ def test_a_text_that_cannot_be_finished_leaves_the_former_one(tmp_path: Path) ->
     write_whole(path, "former")
     with pytest.raises(UnicodeEncodeError):
         write_whole(path, "new \ud800")
-    assert path.read_text() == "former"
+    assert path.read_text(encoding="utf-8") == "former"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_an_error_in_the_body_leaves_nothing(tmp_path: Path) -> None:
     def fail() -> None:
         with draft_of(tmp_path / "made") as draft:
-            draft.write_text("half")
+            draft.write_text("half", encoding="utf-8")
             raise ValueError("no more")
 
     with pytest.raises(ValueError, match="no more"):

@@ -32,7 +32,7 @@ def ended(error: BaseException) -> tuple[int, str]:
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
-        (KeyboardInterrupt(), 130, "the same command continues"),
+        (KeyboardInterrupt(), 130, "run the same command to resume"),
         (WeightsError("torn"), 3, "WeightsError: torn"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/x"), 3, "the disk of run/x is full"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 3, "is full"),

@@ -27,7 +27,7 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def said(*words: object) -> str:
     answer = CliRunner().invoke(app, list(map(str, words)))
-    assert "Unforeseen" not in answer.output
+    assert "InternalError" not in answer.output
     assert "Traceback" not in answer.output
     assert not UNSAFE.search(answer.output), answer.output
     return " ".join(answer.output.split())

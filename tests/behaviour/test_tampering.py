@@ -408,7 +408,9 @@ def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run
 def stored_probes(run: Path) -> list[Path]:
     """Oldest first: without controls, then with them."""
     folders = [path for path in (run / "probes").iterdir() if not path.name.startswith(".")]
-    return sorted(folders, key=lambda path: json.loads((path / "times.json").read_text())["created"])
+    return sorted(
+        folders, key=lambda path: json.loads((path / "times.json").read_text(encoding="utf-8"))["created"]
+    )
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,7 @@ def test_there_is_no_outcome_before_the_first_action(make_env):
     with pytest.raises(EpisodeOverError):
         env.outcome()
     env.reset(seed=0)
-    with pytest.raises(EpisodeOverError, match="no action was carried out"):
+    with pytest.raises(EpisodeOverError, match="no action was executed"):
         env.outcome()
 
 

@@ -155,13 +155,13 @@ def test_nothing_is_committed_that_the_server_kept_only_in_part(
         return "half" if torn else None
 
     bad_server.day.ail = ail
-    with pytest.raises(StoreError, match=r"tokens/c/1/.*said that all was well, and holds"):
+    with pytest.raises(StoreError, match=r"confirmed .*tokens/c/1/.* and holds"):
         write(run, suite)
     assert any(seen)
     assert verify_run(run, deep=True).ok
     assert verify_run(run).committed == 1
     bad_server.day.ail = lambda method, path: "half" if method == "PUT" and "/columns.zarr/" in path else None
-    with pytest.raises(StoreError, match=r"columns\.zarr/.*said that all was well"):
+    with pytest.raises(StoreError, match=r"confirmed .*columns\.zarr/.* and holds"):
         write(run, suite)
     bad_server.day.ail = lambda *_: None
     assert not open_run(run).sealed
@@ -198,7 +198,7 @@ def test_a_record_that_the_server_never_keeps_whole_is_an_error_and_gone(
 ) -> None:
     run = f"{bad_server.url}/run"
     bad_server.day.ail = lambda method, path: "half" if method == "PUT" and "/commits/" in path else None
-    with pytest.raises(StoreError, match=r"commits/00000000\.json.*said that all was well"):
+    with pytest.raises(StoreError, match=r"confirmed .*commits/00000000\.json.* and holds"):
         write(run, suite)
     bad_server.day.ail = lambda *_: None
     assert verify_run(run, deep=True).committed == 0

@@ -134,12 +134,12 @@ def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        (ExtractSettings("pi0-tiny", capture_only=True, execute=2), "--execute means nothing"),
+        (ExtractSettings("pi0-tiny", capture_only=True, execute=2), "--execute does not apply"),
         (
             ExtractSettings("pi0-tiny", capture_only=True, captured_calls=2, video="first"),
             "--captured-calls, --video",
         ),
-        (ExtractSettings("expert", capture_only=True), "--no-act means nothing"),
+        (ExtractSettings("expert", capture_only=True), "--no-act does not apply"),
     ],
 )
 def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractSettings, complaint: str) -> None:

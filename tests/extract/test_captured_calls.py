@@ -34,6 +34,9 @@ def inferences_of(number: int) -> int:
     return 1 if number % 5 == 4 else 2 if number % 4 == 3 else CALLS
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*is not sealed")
+
+
 @pytest.fixture(scope="module")
 def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """48 episodes; features of inference c are noise around 10 c, and name the answer from the second on."""
@@ -57,7 +60,6 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return open_run(writer.location)
 
 
-@pytest.mark.filterwarnings("ignore:.*is not sealed")
 @pytest.mark.parametrize("sealed", [False, True])
 def test_every_inference_is_read_apart_and_missing_ones_are_nan(run: Run, sealed: bool) -> None:
     if sealed:

@@ -249,7 +249,7 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
 
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"capture_only": True}, "capture_only"),
+    [({"weights_sha256": None}, "scripted"), ({"ask": {}}, "asked"), ({"capture_only": True}, "only captured"),
      ({"edits": [{}]}, "edited"), ({"ask": {}, "weights_sha256": None}, "asked")],
 )  # fmt: skip
 def test_a_policy_that_did_not_act_is_not_intervened_on(copy: Run, changed: dict[str, object], why: str) -> None:

@@ -94,7 +94,7 @@ def run_command(
                 break
             time.sleep(_TICK_S)
         code = process.wait()
-    return Course(code, time.monotonic() - began, changes, f"{mark}\n{log.read_text()}")
+    return Course(code, time.monotonic() - began, changes, f"{mark}\n{log.read_text(encoding='utf-8')}")
 
 
 def run_together(commands: Sequence[Sequence[str]], place: Path, ready: Callable[[], bool]) -> list[str]:
@@ -108,7 +108,7 @@ def run_together(commands: Sequence[Sequence[str]], place: Path, ready: Callable
             given = [sys.executable, "-m", "probe_kit", *command]
             running.append(subprocess.Popen(given, stdout=output, stderr=subprocess.STDOUT))
     codes = [process.wait(LONGEST_S) for process in running]
-    return [log.read_text() for log, code in zip(logs, codes, strict=True) if code]
+    return [log.read_text(encoding="utf-8") for log, code in zip(logs, codes, strict=True) if code]
 
 
 def orphans(course: Course) -> list[str]:
@@ -176,7 +176,7 @@ def _kill_until_done(
         course = run_command(command.arguments(place), place, None if moment is None else _at(moment, usual))
         courses.append(course)
         assert course.code in (0, -signal.SIGKILL), f"after {number} kills: {course.output}"
-        assert "Unforeseen" not in course.output, course.output
+        assert "InternalError" not in course.output, course.output
         now = command.finished(place)
         lost = sorted(one for one in seen - now if _head_of(one) not in now)
         assert lost == [], f"{command.name} lost {lost[:5]} by a kill at {moment}"

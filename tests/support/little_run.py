@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.scoring.trajectory import CHANNELS
+from probe_kit.env.spec import SceneSpec
 from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.run_layout import StoredStream
@@ -47,7 +48,7 @@ def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
         "codec": codec,
         "seed": seed,
         "suite": {"identity": "little@1#0123456789ab"},
-        "scene": {"max_steps": STEPS},
+        "scene": SceneSpec(max_steps=STEPS).to_json(),
     }
 
 

@@ -1,4 +1,4 @@
-"""The robot arm in the physics server: its joints, how it is measured, and how it is driven."""
+"""The robot arm in the physics server: joints, measurements and motor commands."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The arms we know: where their description is, which joints they have, and how they hold a cube."""
+"""The supported arms: URDF file, joints, and grasp of the cube."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From an action of the policy to joint angles: the Bridge convention of SimplerEnv.
+"""Conversion of policy actions to joint angles, in the Bridge convention of SimplerEnv.
 
 Deltas accumulate on the pose that was last *commanded*, not on the measured one, so that tracking errors do
 not add up. The rotation delta turns about the fixed axes of the world, through the tool.

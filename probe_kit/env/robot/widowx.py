@@ -1,4 +1,4 @@
-"""A description of the WidowX-250S, written from this table over the meshes of the `rtb-data` package.
+"""A URDF of the WidowX-250S, generated from the table below and the meshes of the `rtb-data` package.
 
 PyBullet reads URDF but not xacro, which is all that package has. Lengths in metres, angles in radians, masses in
 kilograms. The gripper's bar and propeller belong to one rigid link here, and inertia is left to PyBullet.

@@ -1,1 +1,1 @@
-"""Scores of an episode, computed from numbers alone."""
+"""Scores of an episode, computed from stored numbers."""

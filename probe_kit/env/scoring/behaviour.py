@@ -1,4 +1,4 @@
-"""What a hand and a cube did in one episode, beside where the cube ended: from a stored trajectory.
+"""Behaviour of hand and cube in one episode, computed from a stored trajectory.
 
 The start biases some of it. In the released scene the hand starts over the right picture's box, so that every
 answer to the right is also the "first choice", and it is nearer to the right picture before it has moved. What the

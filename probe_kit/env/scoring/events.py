@@ -1,4 +1,4 @@
-"""When an episode's turning points were: the arm sets off, it holds the cube, it commits to a side, it lets go."""
+"""Times of an episode's events: the arm starts, grasps the cube, commits to a side, releases the cube."""
 
 from dataclasses import dataclass
 

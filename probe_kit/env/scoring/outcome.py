@@ -1,4 +1,4 @@
-"""How an episode is scored, as pure functions of numbers: no simulator is needed to score it again.
+"""Scoring of an episode by pure functions of numbers, so that re-scoring needs no simulator.
 
 The rule of the paper uses the final position of the cube in the plane alone. Everything else in the record is
 there for stricter variants and for telling a failed grasp from a wrong answer.

@@ -1,7 +1,7 @@
-"""Outcome rules: when the cube counts as put on a picture, judged from a stored trajectory.
+"""Outcome rules: when the cube counts as placed on a picture, judged from a stored trajectory.
 
 A success rate is made of a policy *and* of a rule, and rules disagree on the same episodes by a factor of ten. So
-a rule is a named object, every episode can be judged by all of them, and whoever prints a rate prints its rule's
+a rule is a named object, every episode can be judged by all of them, and every printed rate comes with its rule's
 name. All use the places of the tiles at the moment that is judged, which after a push is not where they began.
 """
 

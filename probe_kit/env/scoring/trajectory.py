@@ -1,4 +1,4 @@
-"""What happened in one episode, control step by control step: where everything was, and what was asked for.
+"""The trajectory of one episode: poses, contacts and actions at every control step.
 
 A frame is the state before the first action or after one; frame t follows action t. Outcome rules and everything
 else that is said about behaviour are computed from it, so that no episode has to be played again for them.

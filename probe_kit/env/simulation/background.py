@@ -1,4 +1,4 @@
-"""What lies behind robot, cube and tiles under visual matching: a photo, or a wooden table of our own."""
+"""The background of the scene under visual matching: a photo, or a drawn wooden table."""
 
 from functools import lru_cache
 from pathlib import Path

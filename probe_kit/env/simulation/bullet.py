@@ -1,4 +1,4 @@
-"""A private physics server, so that no call can reach another environment by accident."""
+"""A private physics server per environment, so that calls cannot affect another environment."""
 
 import os
 import sys

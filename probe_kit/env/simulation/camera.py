@@ -1,7 +1,7 @@
-"""The camera: matrices, projection, TinyRenderer frames, and the cached picture of the empty table.
+"""The camera: matrices, projection, TinyRenderer frames, and the cached image of the empty table.
 
 Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once
-(the *backdrop*), hidden from the renderer afterwards, and every frame is laid over it by depth. The result is
+(the *backdrop*), hidden from the renderer afterwards, and every frame is composed with it by depth. The result is
 the naive rendering bit for bit; under visual matching a photo takes the place of the backdrop's colours.
 """
 
@@ -115,7 +115,7 @@ class Backdrop:
     depth: NDArray[np.float32]
 
     def under(self, frame: Frame) -> Picture:
-        """The picture (H, W, 3) of `frame` laid over the backdrop, the nearer surface winning."""
+        """The picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
         in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
         return np.where(in_front[..., None], frame.rgb, self.rgb)

@@ -1,4 +1,4 @@
-"""Pictures on the tiles: one textured quad per tile, and a cache of textures with a budget.
+"""Pictures on the tiles: one textured quad per tile, and a texture cache of limited size.
 
 PyBullet stretches a texture on a box so that only a corner of it shows, and it loads broken files without an
 error. So a tile is a box with a quad of our own mesh on top, and every texture is a PNG we wrote ourselves.

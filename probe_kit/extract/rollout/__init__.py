@@ -1,1 +1,1 @@
-"""Playing episodes: a stage with one environment, who decides on it, and the worker that commits them."""
+"""Playing episodes: environments (stages), controllers, and the worker that commits episodes."""

@@ -1,4 +1,4 @@
-"""One action of several plans: overlapping chunks each say what to do now, and the newer ones say it louder."""
+"""Temporal ensembling: a weighted mean of overlapping action chunks, recent chunks weighted most."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ _GRIPPER_OPEN = 0.5
 def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[np.float32]:
     """(7,) float32: the action for this step, from the chunks (chunk, 7) of an episode's inferences, oldest first.
 
-    There is an inference per step, so a chunk made n steps ago speaks through its n-th action, and one that is too
+    There is an inference per step, so a chunk made n steps ago contributes its n-th action, and one that is too
     old not at all. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by their
     majority.
     """

@@ -1,4 +1,4 @@
-"""Who answers: a reader that is asked one question per episode, about its first frame.
+"""The controller of `probe-kit ask`: a model answers one question about the first frame of an episode.
 
 Every question is asked with the left side named first and, where the prompt can be turned round, once more with
 the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Form:
-    """How a choice in words is forced: how the answer has begun, and what it may go on with, by what that says."""
+    """A forced choice in words: the beginning of the answer, and its admissible continuations by meaning."""
 
     begun: str
     options: Mapping[str, Said]

@@ -1,4 +1,4 @@
-"""Capturing one inference of a model for the store, and proving once that it changes nothing."""
+"""Capture of one inference for the store, with a one-time proof that capture changes no action."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext

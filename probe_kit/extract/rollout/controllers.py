@@ -1,4 +1,4 @@
-"""Who decides: a captured policy, or a script that needs no model."""
+"""Controllers of an episode: a captured policy, or a scripted one that needs no model."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -66,8 +66,8 @@ class Controller(Protocol):
 class ActingController(Controller, Protocol):
     """Acts.
 
-    flagged: of the last `act`, the turns whose inference put out no action; None if that cannot be told.
-    capture_only: whether what `act` gives is only to be heard, and episodes end with it.
+    flagged: of the last `act`, the turns whose inference put out no action; None if that is unknown.
+    capture_only: whether `act` only captures, and the episode ends after it.
     """
 
     capture_only: bool
@@ -106,7 +106,7 @@ class ScriptedController:
 class PolicyController:
     """Infers, executes the head of the chunk, and captures the first inferences of every episode.
 
-    One that capture_only infers and captures once per episode; nothing is executed.
+    With `capture_only`, it infers and captures once per episode and executes nothing.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Staging: host memory in which an episode's activations wait for the writer."""
+"""Staging buffers: host memory that holds an episode's activations until they are written."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -81,7 +81,7 @@ class EpisodeBuffers:
 
 
 def copy_aside(source: "Tensor", target: "Tensor") -> Any:
-    """Copy to host memory while the device goes on computing; gives the event of its arrival, None on a CPU.
+    """Copy to host memory while the device computes; returns the event of its completion, None on a CPU.
 
     target: contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its own,
     which begins when the source is computed; the source's memory is not used again before the copy is through.

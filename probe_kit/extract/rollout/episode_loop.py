@@ -1,4 +1,4 @@
-"""Playing episodes: two groups of stages take turns; one simulates while the policy thinks for the other."""
+"""The episode loop: two groups of stages alternate; one simulates while the policy infers for the other."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
+from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
@@ -45,16 +46,22 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Failure:
-    """An episode that could not be played to its end."""
+    """An episode that could not be played to its end. traceback: of the error that ended it."""
 
     planned: PlannedEpisode
     reason: str
+    traceback: str
+
+    @classmethod
+    def from_error(cls, planned: PlannedEpisode, error: ProbeKitError) -> "Failure":
+        """The failure of `planned` by `error`."""
+        return cls(planned, f"{type(error).__name__}: {error}", traceback_of(error))
 
 
 class EpisodeSlot:
     """One place in a batch: a stage and the episode on it, if any.
 
-    following: what its stage begins by itself when the episode ends, while the policy thinks for others.
+    following: what its stage starts when the episode ends, while the policy infers for others.
     ahead: whether it has so begun the episode that is on.
     """
 
@@ -84,7 +91,7 @@ class EpisodeSlot:
         return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
 
     def advance(self, actions: NDArray[np.float32], flagged: bool | None, then: StageRequest | None) -> None:
-        """Carry out actions. flagged: whether the inference behind them put out none, None if nobody can tell."""
+        """Execute actions. flagged: whether their inference put out no valid action; None if unknown."""
         self.seen = None
         self.calls += 1
         if flagged is not None:
@@ -92,7 +99,7 @@ class EpisodeSlot:
         self.stage.ask("advance", actions, then=then)
 
     def end_without_acting(self, then: StageRequest | None) -> None:
-        """The model was heard; the episode ends before anything moves."""
+        """End the episode after its capture, before anything moves."""
         self.seen = None
         self.calls += 1
         self.stage.ask("dismiss", then=then)
@@ -203,7 +210,7 @@ class EpisodeLoop:
 
     def _give_up(self, slot: EpisodeSlot, error: ProbeKitError) -> Failure:
         assert slot.planned is not None
-        failure = Failure(slot.planned, f"{type(error).__name__}: {error}")
+        failure = Failure.from_error(slot.planned, error)
         self._pool.give_back(slot.buffers)
         self._begin_next(slot)
         return failure

@@ -1,5 +1,6 @@
-"""What becomes of an episode, as the driver hears it: small enough to travel between processes."""
+"""Events of an episode, as workers report them to the driver: small enough to send between processes."""
 
+import traceback
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +15,26 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """Episode `number` went wrong."""
+    """Episode `number` went wrong. traceback: of its error, empty if its process died."""
 
     number: int
     reason: str
+    traceback: str = ""
 
 
 Event = Done | Failed
+
+LONGEST_TRACEBACK = 20_000
+"""Characters of a traceback that are kept: its end, which names the error."""
+
+
+def add_traceback(error: BaseException) -> None:
+    """Store the traceback of `error` in the error itself, so that it survives being sent to another process."""
+    error.__dict__["probe_kit_traceback"] = traceback_of(error)
+
+
+def traceback_of(error: BaseException) -> str:
+    """The traceback of `error`, after that of the process it was sent from."""
+    here = "".join(traceback.format_exception(error))
+    sent: str = error.__dict__.get("probe_kit_traceback", "")
+    return (sent + here)[-LONGEST_TRACEBACK:]

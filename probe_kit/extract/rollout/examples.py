@@ -1,4 +1,4 @@
-"""What a model will be shown, before anything is played: token counts and requirements are known from it."""
+"""An example of a model's input, from which token counts and requirements are computed before the run."""
 
 from collections.abc import Iterable
 

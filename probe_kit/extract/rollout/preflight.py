@@ -1,4 +1,4 @@
-"""The scene is built once before anything is played: what is wrong with all episodes is said before the first."""
+"""A test build of the scene, so that errors that affect all episodes are raised before the first one."""
 
 from collections.abc import Iterable
 from itertools import islice

@@ -1,4 +1,4 @@
-"""Asking about episodes: every stage is set up and looked at once, and nothing on it moves."""
+"""The loop of `probe-kit ask`: each episode is set up and rendered once, and nothing moves."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -84,4 +84,4 @@ class Asking:
     def _give_up(self, chair: _Chair, planned: PlannedEpisode, error: ProbeKitError) -> Failure:
         self._pool.give_back(chair.buffers)
         self._begin_next(chair)
-        return Failure(planned, f"{type(error).__name__}: {error}")
+        return Failure.from_error(planned, error)

@@ -1,4 +1,4 @@
-"""Combinations of settings that would be obeyed and mean nothing."""
+"""Checks for combinations of settings that would have no effect."""
 
 from typing import TYPE_CHECKING
 
@@ -38,8 +38,8 @@ def check_meaningless(settings: RunSettings) -> None:
     }
     if meaningless := [option for option, given in asked.items() if given]:
         raise UsageError(
-            f"{settings.model} is scripted: it has no network, so {', '.join(meaningless)} means nothing. Leave "
-            "it out, or choose a model with weights"
+            f"{', '.join(meaningless)} does not apply: {settings.model} is scripted and has no network. Remove "
+            "it, or choose a model with weights"
         )
 
 
@@ -51,8 +51,8 @@ def _check_acting(settings: ExtractSettings) -> None:
     }
     if meaningless := [option for option, given in acting.items() if given]:
         raise UsageError(
-            f"--no-act hears the first inference of every episode and moves nothing, so {', '.join(meaningless)} "
-            "means nothing. Leave it out"
+            f"{', '.join(meaningless)} does not apply with --no-act, which captures one inference per episode "
+            "and executes no action; remove it"
         )
 
 
@@ -61,8 +61,8 @@ def check_embodiment(settings: ExtractSettings, policy: "Policy") -> None:
     if not settings.capture_only and (reason := policy.embodiment_mismatch()) is not None:
         told = with_origin(reason, settings.model, policy.card.checkpoint)
         raise CheckpointError(
-            f"{told}. To capture what it thinks without acting, add --no-act: the first inference of every "
-            "episode is stored and probed as ever, and there is no success rate"
+            f"{told}. To capture activations without acting, add --no-act. Probing works as usual; there is no "
+            "success rate"
         )
 
 

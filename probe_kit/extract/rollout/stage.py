@@ -1,4 +1,4 @@
-"""A stage: one environment and the episode on it, driven one chunk of actions at a time."""
+"""A stage: one environment and its current episode, advanced by one chunk of actions at a time."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -120,7 +120,7 @@ class Stage:
             raise self._named(error) from None
 
     def dismiss(self) -> Answer:
-        """End the episode as it began: its model listened and does not act. There is no outcome."""
+        """End the episode without an action: its model was only captured. There is no outcome."""
         ends = None if self._first is None else (self._first,)
         return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, ends)
 

@@ -1,4 +1,4 @@
-"""Stages in processes of their own, so that simulation, drawing and inference overlap."""
+"""Stages in child processes, so that simulation, rendering and inference overlap."""
 
 from multiprocessing.connection import Connection
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from probe_kit._system.child_process import Child
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
+from probe_kit.extract.rollout.events import add_traceback
 from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageRequest
 
 
@@ -21,7 +22,7 @@ class ProcessStage:
         self._child.connection.send(self._settings)
 
     def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
-        """Send the question; the child works while this process goes on."""
+        """Send the request; the child works while this process continues."""
         try:
             self._child.connection.send(((method, arguments), then))
         except (BrokenPipeError, ConnectionResetError):
@@ -71,5 +72,6 @@ def _answered(stage: Stage, question: StageRequest) -> Answer | ProbeKitError:
     try:
         answer: Answer = getattr(stage, method)(*arguments)
     except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
+        add_traceback(error)
         return error
     return answer

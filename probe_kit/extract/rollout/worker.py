@@ -1,4 +1,4 @@
-"""A worker: plays the episodes it is given and commits them. The same code in this process and in others."""
+"""A worker: plays its episodes and commits them, in this process or in another."""
 
 import tempfile
 from collections import deque
@@ -94,7 +94,7 @@ class Worker:
             playing = EpisodeLoop(stages, controller, ring, next_episode, self._is_filmed)
         for played in playing:
             if isinstance(played, Failure):
-                yield Failed(played.planned.index, played.reason)
+                yield Failed(played.planned.index, played.reason, played.traceback)
             else:
                 self._pending.append(self._thread.submit(self._write, played))
             yield from self._written(wait=False)

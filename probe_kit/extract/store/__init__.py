@@ -1,1 +1,1 @@
-"""The run store: where a run lies, what its files are, how they are written, sealed, read and audited."""
+"""The run store: where runs are, their files, and how these are written, sealed, read and verified."""

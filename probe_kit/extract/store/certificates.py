@@ -1,4 +1,4 @@
-"""Certificates: what was loaded and checked, as the processes that played wrote it down.
+"""Certificates: what each process loaded and checked, recorded by that process.
 
 certificate.json               the first process's record, with its provenance
 certificates/<digits>.json     a record per process, named by its sha256

@@ -1,4 +1,4 @@
-"""Exporting: a run as one ordinary file, for people and tools that want one.
+"""Export of a run as one file, for tools that need one.
 
 Everything is written row by row, so that a run larger than memory can be exported; every row passes its checksum
 on the way, and the sha256 of the file is written beside it in the form `sha256sum --check` reads.

@@ -1,4 +1,4 @@
-"""The episodes of a run judged by an outcome rule, and what was done in them: tables made from trajectories."""
+"""Tables of a run's episodes by outcome rule and by behaviour, computed from stored trajectories."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass

@@ -1,4 +1,4 @@
-"""Provenance: on what device and with which versions a process plays, stored once and named by its commits.
+"""Provenance: device and library versions of a process, stored once and named in its commits.
 
     provenance/<first digits of its sha256>.json
 

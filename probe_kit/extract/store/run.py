@@ -1,4 +1,4 @@
-"""Reading a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
+"""Reading of a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
 
 import warnings
 from collections.abc import Iterator, Mapping
@@ -135,12 +135,12 @@ class Run:
 
     @property
     def random_weights(self) -> bool:
-        """Whether nobody trained the weights this run was made with."""
+        """Whether this run was made with random weights."""
         return bool(self.settings["random_weights"])
 
     @property
     def capture_only(self) -> bool:
-        """Whether its model was only heard and did not act: it has activations and no success rate."""
+        """Whether its model was captured and did not act: it has activations and no success rate."""
         return bool(self.settings.get("capture_only"))
 
     @property

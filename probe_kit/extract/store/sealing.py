@@ -1,4 +1,4 @@
-"""Sealing: pooled rows turned into one block per site and view, and roles into a column."""
+"""Sealing: turns pooled rows into one block per site and view, and roles into a column."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""First and last frame of an episode, small enough to keep them for every episode of a run.
+"""First and last frame of an episode, compressed to about 2 kB each.
 
 They illustrate: no number depends on them. The commit of their episode names them with their hash, because who
 looks at a report believes what it shows. All of them may be deleted, not single ones.

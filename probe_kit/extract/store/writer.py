@@ -1,4 +1,4 @@
-"""Writing a run: created once, then one committed episode at a time."""
+"""Writing of a run: created once, then one committed episode at a time."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -137,7 +137,7 @@ class RunWriter:
     def joined(self) -> Iterator[None]:
         """Work along while the body runs, in a process that the owner started, and may outlive it.
 
-        Nobody then takes what it is writing for a leftover. What the owner noted of failures stays.
+        No process then removes its drafts as leftovers. Failures that the owner recorded stay.
         """
         with self.location.held(lambda: None):
             yield
@@ -226,6 +226,6 @@ class RunWriter:
             write_certificate(self.root, certificate, self.provenance)
             self._certified = True
 
-    def give_up(self, number: int, reason: str) -> None:
-        """Record why episode `number` is not played."""
-        write_failure(self.root, number, reason)
+    def give_up(self, number: int, reason: str, traceback: str = "") -> None:
+        """Record why episode `number` is not played, with the traceback of its error."""
+        write_failure(self.root, number, reason, traceback)

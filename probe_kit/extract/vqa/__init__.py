@@ -1,1 +1,1 @@
-"""Asking a model a question in words: prompts, what they name, what the answers say, and what the logits say."""
+"""Questions in words to a model: prompts, phrases, parsing of answers, and option scores."""

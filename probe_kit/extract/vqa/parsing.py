@@ -1,4 +1,4 @@
-"""What an answer in words says: one of two sides, something else, or nothing that can be read.
+"""Parsing of a text answer: left, right, another statement, or unparsable.
 
 An answer that cannot be read is no wrong answer and is not left out: it is `oob`, with the rule that found it so.
 """

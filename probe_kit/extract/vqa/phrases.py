@@ -1,4 +1,4 @@
-"""What a question names: the object of an item, the one beside it, or one that neither picture shows.
+"""Phrases of a question: the correct object, the other one, or one that neither picture shows.
 
 Phrases come from the items themselves, never out of an instruction.
 """

@@ -1,4 +1,4 @@
-"""The two pictures of an episode side by side on grey: what a frame shows without perspective, arm and cube."""
+"""The two pictures of an episode side by side on grey, without perspective, arm or cube."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""What logits and answers make of an episode: a side, an outcome, and how much of a choice is its letter."""
+"""Scores of an answer from its text and its logits: a side, an outcome, and the option-letter bias."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

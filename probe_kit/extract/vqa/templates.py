@@ -1,4 +1,4 @@
-"""The prompts: what is asked about an object, as text with places for the object and the two sides.
+"""Prompt templates: text with placeholders for the object and the two sides.
 
 Places in a template: `the {object}` is the object with its article, if it has one, `{object}` without; `{A}` and
 `{B}` are the words for the two sides, in either order. A letter A in front of `{A}` and a letter B in front of
@@ -115,5 +115,5 @@ def find_template(name: str) -> Template:
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise UsageError(f"{path} is no UTF-8 text; write the prompt as plain text with {{object}}") from None
+        raise UsageError(f"{path} is not UTF-8 text; write the prompt as plain text with {{object}}") from None
     return Template(re.sub(r"[^\w-]+", "-", path.stem), text.rstrip("\n"))

@@ -1,1 +1,1 @@
-"""Crews: which episode is played next, and by whom: this process, several, or actors on a Ray cluster."""
+"""Scheduling of episodes on workers: this process, several processes, or actors on a Ray cluster."""

@@ -1,4 +1,4 @@
-"""A worker's first act, wherever it runs: load a model of its own and find the run."""
+"""Start of a worker: loads its own model and opens the run."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

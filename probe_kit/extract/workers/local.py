@@ -1,4 +1,4 @@
-"""Working in this process, with the model that is loaded."""
+"""A worker in this process, with the model that is already loaded."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Workers in processes of their own. Only episode numbers and outcomes travel between processes."""
+"""Workers in processes of their own. Only episode numbers and outcomes are sent between processes."""
 
 import os
 from collections.abc import Callable

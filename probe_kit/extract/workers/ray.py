@@ -76,7 +76,7 @@ class RayWorkers:
     """Actors on a cluster, as many as GPUs, or as `settings.workers` says. A context manager.
 
     Each holds a GPU, if there are any, and a core, so that nodes share them; an actor gets episodes once it has
-    loaded its model. One for which there is no room, since a node was lost, gets none and holds nobody up.
+    loaded its model. One without room, because a node was lost, gets none and delays no other.
     """
 
     def __init__(self, settings: RunSettings, run: str) -> None:

@@ -1,4 +1,4 @@
-"""The scheduler: which episode is played next, and which is given up. The same for every way of working."""
+"""The scheduler: which episode is played next, and which is given up. Used by all kinds of workers."""
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ TRIES = 2
 
 
 class Scheduler:
-    """Hands out episode numbers and hears what became of them.
+    """Assigns episodes to workers and records their events.
 
     An episode that failed, or was in the hands of a worker that died, is suspect: it is tried once more, by a
     worker that holds nothing else, so that it can take no other episode down with it. Then it is given up.
@@ -21,7 +21,7 @@ class Scheduler:
         self._held: dict[int, set[int]] = defaultdict(set)
         self._failures: Counter[int] = Counter()
         self.done: set[int] = set()
-        self.given_up: dict[int, str] = {}
+        self.given_up: dict[int, Failed] = {}
 
     @property
     def finished(self) -> bool:
@@ -52,7 +52,7 @@ class Scheduler:
         if self._failures[event.number] < TRIES:
             self._suspects.append(event.number)
         else:
-            self.given_up[event.number] = event.reason
+            self.given_up[event.number] = event
 
     def take_some(self, worker: int, count: int) -> list[int]:
         """Up to `count` episodes for `worker`."""

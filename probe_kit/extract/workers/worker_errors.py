@@ -1,4 +1,4 @@
-"""What a person hears of a worker that died, wherever it worked."""
+"""Warnings and errors about workers that ended unexpectedly."""
 
 import warnings
 

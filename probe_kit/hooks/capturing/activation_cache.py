@@ -1,4 +1,4 @@
-"""What a capture kept: activations by site, one by one or stacked."""
+"""The activations of a capture, by site, one by one or stacked."""
 
 from collections.abc import Iterator, Mapping
 from itertools import groupby

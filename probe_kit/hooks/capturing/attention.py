@@ -1,4 +1,4 @@
-"""The acting stream's attention on every token of the backbone. Descriptive; only an edit shows what is read.
+"""Attention of the acting stream to every token of the backbone; descriptive, no evidence of use.
 
 with attention(policy) as mass:
     policy.act([seen], [seed])
@@ -26,7 +26,7 @@ class AttentionMass:
     """Shares of attention, by (block of the backbone whose keys are read, iteration).
 
     by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's own
-    tokens. Not a cause: a token can be weighed and not be used, and an optional display is all that it serves.
+    tokens. Not causal: a token can receive attention without being used. Serves an optional display only.
     """
 
     by_head: dict[Read, NDArray[np.float32]] = field(default_factory=dict)
@@ -63,9 +63,9 @@ class AttentionMass:
 
 @contextmanager
 def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
-    """Note the attention of the acting stream while `policy` acts once; its actions stay the same, bit for bit.
+    """Record the attention of the acting stream while `policy` acts once; its actions stay bit-identical.
 
-    Raises UnsupportedInterventionError for a family that does not tell it, CaptureError if nothing was weighed.
+    Raises UnsupportedInterventionError for a family without attention recording, CaptureError if none occurred.
     """
     policy.interventions.check("attention", policy.card.family)
     found = AttentionMass()
@@ -73,7 +73,7 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
     def note(block: int, iteration: int, weights: Tensor) -> None:
         if (block, iteration) in found.by_head:
             raise CaptureError(
-                f"{policy.card.family} weighed block {block} twice at iteration {iteration}; act once per context"
+                f"{policy.card.family} recorded block {block} twice at iteration {iteration}; act once per context"
             )
         found.by_head[block, iteration] = weights.detach().float().mean(dim=2).cpu().numpy()
 

@@ -1,4 +1,4 @@
-"""Listening and writing: contexts that read chosen sites while a model runs, or replace them.
+"""Contexts that capture or replace the activations of chosen sites while a model runs.
 
 Both leave the model exactly as found, also when the body raises.
 """
@@ -33,7 +33,7 @@ _listening: WeakSet[Model] = WeakSet()
 
 @contextmanager
 def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[ActivationCache]:
-    """Listen to `sites` while the model runs once.
+    """Capture `sites` while the model runs once.
 
     reduce: what to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as a
     pooled view; it must return a new tensor. None keeps a copy.

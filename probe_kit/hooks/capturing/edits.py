@@ -1,4 +1,4 @@
-"""Edits as data: what is changed in a stream while a model runs, said so that a run can be named by it.
+"""Edits as data: what is changed in a stream while a model runs, hashable as part of a run's identity.
 
 move = Edit("add", (Site("backbone", 2),), roles=("language",), vector=vector_hash(direction), strength=2.0)
 with apply_edits(model, [move], seen, {move.vector: direction}) as edit_log:

@@ -1,4 +1,4 @@
-"""Finding the files of a checkpoint: a local folder, or a hub id that is downloaded first. Imports no torch."""
+"""The files of a checkpoint: in a local folder, or downloaded from the hub. Imports no torch."""
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
@@ -63,7 +63,7 @@ def _possible(folder: Path) -> Path:
 
 
 def _content(file: Path) -> Any:
-    """Raises ValueError for what is no JSON or YAML."""
+    """Raises ValueError for what is not JSON or YAML."""
     if file.suffix == ".json":
         return parse_json(file.read_bytes())
     import yaml

@@ -1,4 +1,4 @@
-"""What the code of a policy may leave behind in this process: nothing.
+"""Restores the process state that a policy's code changed, such as signal handlers and thread counts.
 
 A policy of a third party runs in the process that plays other episodes, and writes them. What it changes there by
 accident is put back after every call: random numbers, torch's default dtype, the working directory, environment

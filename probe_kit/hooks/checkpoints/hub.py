@@ -1,11 +1,11 @@
-"""Whether the hub can be reached, found out within seconds: its own client retries for long. Imports no torch."""
+"""A quick test whether the hub can be reached, because its client retries for minutes. Imports no torch."""
 
 from threading import Thread
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 PATIENCE = 5.0
-"""Seconds until a hub that says nothing counts as out of reach."""
+"""Seconds without a reply after which the hub counts as unreachable."""
 
 
 def unreachable() -> str:
@@ -36,4 +36,4 @@ def _ask(address: str) -> str:
 
 
 def _silence(address: str) -> str:
-    return f"{address} says nothing for {PATIENCE:g} s"
+    return f"{address} did not answer within {PATIENCE:g} s"

@@ -1,4 +1,4 @@
-"""Calling code of others: whatever it raises, even the end of the process, becomes a named error of ours.
+"""Calls of third-party code: every exception, even SystemExit, becomes an error of probe_kit.
 
 What is wrong with a checkpoint says whose it is and where it lies, wherever in the loading or acting it was found.
 """
@@ -57,7 +57,7 @@ def while_acting(model: str, place: str, limit: float | None = None) -> Iterator
                 raise
             raise PolicyFailedError(
                 f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error "
-                f"of probe_kit; mend it, or what it read from {place}. Then the same command continues"
+                f"of probe_kit; fix it, or what it read from {place}. Then run the same command to resume"
             ) from error
 
 

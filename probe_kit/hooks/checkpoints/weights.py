@@ -1,4 +1,4 @@
-"""Audited loading: every parameter comes from the file, and the file is named by its hash."""
+"""Audited loading: every parameter comes from the file, and the file is identified by its hash."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ RANDOM_MARK = "probe_kit.weights"
 
 @dataclass(frozen=True)
 class Weights:
-    """The tensors of a checkpoint as its files hold them; `random` says that nobody trained them."""
+    """The tensors of a checkpoint as its files hold them; `random`: the weights are untrained."""
 
     tensors: Mapping[str, Tensor]
     source: str

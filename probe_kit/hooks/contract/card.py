@@ -1,4 +1,4 @@
-"""The card of a loaded model: enough to say whose numbers these are. Imports no torch."""
+"""The card of a loaded model: family, checkpoint, weights hash, streams and settings. Imports no torch."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -26,11 +26,11 @@ class ModelCard:
     weights_seed: of a random twin; None for weights from a file.
     batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
     needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
-    chunk, execute: actions per inference and how many of them are carried out; 0 for a model that does not act.
+    chunk, execute: actions per inference and how many of them are executed; 0 for a model that does not act.
     ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
     newest weighing most; None carries out the head of the newest chunk.
     source: the family of the reader whose network this policy grew from, if it is one of ours. source_weights: of
-    that family, the weights; None where nobody can know them, as of a checkpoint that is not the family's own.
+    that family, the weights; None where they are unknown, as for a checkpoint that is not the family's own.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """
 

@@ -1,4 +1,4 @@
-"""Where a model acts, or looks, as long as nobody names a scene. Imports no environment: names and values only."""
+"""The scene in which a model acts if none is given. Imports no environment: names and values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

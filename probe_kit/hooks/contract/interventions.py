@@ -1,4 +1,4 @@
-"""What of the interventions a family supports: data, read before any weights are. Imports no torch."""
+"""Interventions that a family supports, declared as data and readable before loading. Imports no torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,10 +31,10 @@ class Interventions:
     prompt_kv: whether it keeps keys and values of the prompt that the acting stream reads, see `Model.prompt_kv`.
     first_affected_token: the first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where the
     prompt's own pass already chooses the first token.
-    attention: whether it tells how much attention the acting stream pays to every token of the prompt.
+    attention: whether it records the acting stream's attention to every token of the prompt.
     tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
-    readout: `chunk` where the first chunk says where the hand will go; `shadow` where an inference gives one
-    action in greedy bins, so that conditions are evaluated at every call of an unedited episode, never executed.
+    readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference gives
+    one action in discrete bins, so that conditions are evaluated at every call of an unedited episode, never executed.
     instead: for what is not supported, why and what to do.
     Raises UsageError for advice on a kind of intervention that does not exist.
     """
@@ -76,4 +76,4 @@ class Interventions:
 
 
 ALL_EDITS = Interventions()
-"""Of a family that says nothing: every policy can be followed, and edited at every site it has."""
+"""Default of a family: image swaps, and edits at every site."""

@@ -1,4 +1,4 @@
-"""The contract every model family fulfils: `Model`, and what it does: act (`Policy`), answer (`AnswerModel`)."""
+"""The contract of every model family: `Model`, which acts (`Policy`), answers (`AnswerModel`) or both."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -100,7 +100,7 @@ class HeadsTap(Tap):
 
 
 class Model(ABC):
-    """A network that can be captured: what capture, edits, verification and the store need.
+    """A network whose activations can be captured: what capture, edits, verification and the store need.
 
     streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
     prompt_kv: the keys and values of the prompt that the acting part reads, block by block, as a stream of the
@@ -218,7 +218,7 @@ class Policy(Model):
     flagged: NDArray[np.bool_] | None = None
 
     def embodiment_mismatch(self) -> str | None:
-        """Why its actions cannot move this arm; None if they can. Such a policy is captured all the same."""
+        """Why its actions cannot move this arm; None if they can. Its activations can be captured nevertheless."""
         return None
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
@@ -233,7 +233,7 @@ class Policy(Model):
         return self.act(seen, seeds)
 
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
-        """A context in which `note` is given what attention the acting stream pays; see `hooks.attention`.
+        """A context in which `note` receives the attention of the acting stream; see `hooks.attention`.
 
         note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
         the backbone's T tokens. No number of the inference may change. Raises UnsupportedInterventionError.
@@ -276,7 +276,7 @@ class Reading:
 
     option_logits: (B, options) float32, one column per option of the questions, in their order.
     option_mass: (B,) float32 share of the next token's probability that lies on the options together.
-    state: what `AnswerModel.speak` goes on from; nobody else looks into it.
+    state: from which `AnswerModel.speak` continues; opaque to all other code.
     """
 
     option_logits: NDArray[np.float32]

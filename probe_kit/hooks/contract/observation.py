@@ -1,4 +1,4 @@
-"""What a model is shown: the same object from the stage to the network. Imports no torch."""
+"""The observation of a model, from the stage to the network. Imports no torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

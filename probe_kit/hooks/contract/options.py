@@ -1,4 +1,4 @@
-"""Options that only some families have: declared by the family, given as `-M key=value`, checked before all."""
+"""Options of single families: declared by the family, given as `-M key=value`, checked before loading."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

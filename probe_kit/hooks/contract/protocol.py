@@ -1,4 +1,4 @@
-"""A published protocol as one family follows it: one row of a table, declared by the family. Imports no torch."""
+"""A published protocol for one family: one row of a table, declared by the family. Imports no torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from typing import Any, Literal
 class ProtocolRow:
     """What a protocol uses a family with.
 
-    execute: actions carried out per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
+    execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
     ones that only the protocol's own checkpoint needs. unmatched: what of the protocol cannot be done here.
     """
 

@@ -1,4 +1,4 @@
-"""Token roles: what each position of a stream is, and the pooled views made from them."""
+"""Token roles: the kind of each position of a stream, and the pooled views made from them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The state of an observation as checkpoints were given it: eight numbers or seven, openness measured or not."""
+"""State layouts of checkpoints: seven or eight numbers, with measured or commanded gripper opening."""
 
 import numpy as np
 from numpy.typing import NDArray

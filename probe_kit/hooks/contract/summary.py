@@ -1,4 +1,4 @@
-"""A loaded model in one line and as a notebook shows it."""
+"""A loaded model in one line and as a notebook table."""
 
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
@@ -39,11 +39,11 @@ def model_html(card: "ModelCard", streams: "Mapping[str, Stream]") -> str:
     """The card's facts as a table."""
     facts = {
         "checkpoint": card.checkpoint,
-        "weights": "RANDOM, nobody trained them" if card.random_weights else f"sha256 {card.weights_sha256[:12]}",
+        "weights": "RANDOM, untrained" if card.random_weights else f"sha256 {card.weights_sha256[:12]}",
         "parameters": parameters_text(card.parameters),
         "runs in": f"{card.dtype} on {card.device}" + ("" if card.exact else ", not exact"),
         "streams": streams_text(streams.values()),
-        "actions": f"{card.chunk} per inference, {card.execute} carried out" if card.chunk else "none",
+        "actions": f"{card.chunk} per inference, {card.execute} executed" if card.chunk else "none",
         "embodiment": card.embodiment,
         "notes": "; ".join(card.notes),
     }

@@ -1,1 +1,1 @@
-"""One folder per model family: where to listen, how to load, how to verify; beside them what several share."""
+"""One folder per model family: sites, loading and verification; `shared` holds code of several families."""

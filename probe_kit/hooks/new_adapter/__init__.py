@@ -1,6 +1,6 @@
-"""A package of one's own with an adapter that passes the contract from the first minute.
+"""`probe-kit new-adapter`: a package with an adapter that passes the contract tests from the start.
 
-The template's network is a small one with invented weights. Whoever fills in their own keeps the tests green step
+The template's network is small, with random weights. While an author fills in their own, the tests stay green step
 by step, instead of meeting all of the contract at once.
 """
 

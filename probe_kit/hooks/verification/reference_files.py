@@ -1,4 +1,4 @@
-"""What `probe-kit verify` needs, looked at before torch is imported."""
+"""Checks of the files that `probe-kit verify` needs, before torch is imported."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def check_reference(family: str, folder: Path) -> None:
         raise UsageError(f"{family} has no verifier; it cannot be verified this way")
     if not (folder / REFERENCE_FILE).is_file():
         raise UsageError(
-            f"{folder} is no golden reference: it has no {REFERENCE_FILE}. Give a folder that has one, and the "
+            f"{folder} is not a golden reference: it has no {REFERENCE_FILE}. Give a folder that has one, and the "
             f"recorded model in {CHECKPOINT_FOLDER}/"
         )
     found.check(str(folder / CHECKPOINT_FOLDER))

@@ -1,4 +1,4 @@
-"""`probe-kit verify`: the ordinary adapter against outputs recorded from a model's original implementation."""
+"""`probe-kit verify`: compares an adapter with outputs recorded from the original implementation."""
 
 import gzip
 from collections.abc import Callable, Mapping
@@ -111,7 +111,7 @@ def verify_reference(family: str, folder: Path) -> Verification:
     run = find_family(family).function("verifier")
     file = folder / "reference.npz"
     if not file.is_file():
-        raise UsageError(f"{folder} is no golden reference: it has no {file.name}")
+        raise UsageError(f"{folder} is not a golden reference: it has no {file.name}")
     recorded = _read_arrays(file)
     with while_loading(family, str(folder)):
         return Verification(family, str(folder), run(folder, recorded))

@@ -1,4 +1,4 @@
-"""Where the checkpoints lie that come with the package. Imports nothing heavy."""
+"""The folder of the checkpoints that come with the package. Imports nothing heavy."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The embedded reader: a PaliGemma of the size of pi0-tiny's backbone, as an ordinary transformers checkpoint.
+"""The embedded VLM: a PaliGemma of the size of pi0-tiny's backbone, as an ordinary transformers checkpoint.
 
 Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_vlm_tiny.py` makes them.
 """

@@ -1,4 +1,4 @@
-"""The words of the embedded reader: a word-level tokenizer of the embedded suite's grammar and of questions."""
+"""Word-level tokenizer of the embedded VLM: the grammar of the embedded suite and of questions."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""InternVL: transformers' own network, its tiles and its released sizes. Nothing here listens or answers."""
+"""InternVL: transformers' own network, its tiles and its released sizes. Contains no capture code."""
 
 from probe_kit.models.internvl.network import FILE_NAMES, build_internvl, full_size_internvl
 from probe_kit.models.internvl.pictures import TiledPictures

@@ -1,4 +1,4 @@
-"""Pictures as tiles: a grid of the nearest shape, and the whole picture once more where there are several."""
+"""Images as tiles: a grid of the nearest aspect ratio, plus the whole image if there are several tiles."""
 
 from dataclasses import dataclass
 from pathlib import Path

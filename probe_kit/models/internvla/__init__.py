@@ -1,7 +1,7 @@
 """InternVLA-M1: Qwen2.5-VL and DINOv2, a querying transformer, a guided diffusion head, in torch and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
-listens or acts.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
+Capture and actions are in its adapter in `probe_kit.hooks`.
 """
 
 from probe_kit.models.internvla.config import InternVLAConfig, find_config

@@ -1,4 +1,4 @@
-"""What the `config.yaml` of an InternVLA-M1 run says, and the configuration of the Qwen2.5-VL it was made of.
+"""The `config.yaml` of an InternVLA-M1 run, and the configuration of its Qwen2.5-VL.
 
 The run's file names parts of a fixed table (`dinov2_vits14`, `DiT-B`); sizes of other parts, as development
 checkpoints have them, stand in a file `dims.json` beside or above it, under the names of those checkpoints.
@@ -114,7 +114,7 @@ def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
                 values |= _read(file)
             return values, place
     raise CheckpointError(
-        f"{RUN_FILE} is missing in {folder} and in {folder.parent}; this is no InternVLA-M1 checkpoint. "
+        f"{RUN_FILE} is missing in {folder} and in {folder.parent}; this is not an InternVLA-M1 checkpoint. "
         "A release has it beside the folder checkpoints/"
     )
 

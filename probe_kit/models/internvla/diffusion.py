@@ -1,4 +1,4 @@
-"""The diffusion head: a transformer over condition and noisy actions, its guidance, and DDIM's way from noise.
+"""The diffusion head: a transformer over condition and noisy actions, with guidance and DDIM sampling.
 
 B batch, C conditions, A actions of a chunk, N denoising steps, D width.
 """

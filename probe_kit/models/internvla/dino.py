@@ -1,4 +1,4 @@
-"""DINOv2 as its authors built it: their parameter names, their way to stretch the learned positions.
+"""DINOv2 with its authors' parameter names and interpolation of learned positions.
 
 B batch, P patches, D width.
 """

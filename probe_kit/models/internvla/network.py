@@ -1,4 +1,4 @@
-"""The network: one pass of Qwen2.5-VL and of DINOv2, queries over both, and a guided way from noise to actions.
+"""The network: one pass of Qwen2.5-VL and DINOv2, queries over both, and a guided diffusion head.
 
 B batch, V views, P prompt positions, Q queries, A actions of a chunk.
 """

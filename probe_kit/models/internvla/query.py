@@ -1,4 +1,4 @@
-"""The querying transformer: learned queries read the vision-language model's hidden states, one state per layer.
+"""The querying transformer: learned queries attend to the vision-language model's hidden states, layer by layer.
 
 B batch, Q queries, S positions that are read, D width.
 """

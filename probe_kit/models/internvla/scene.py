@@ -1,4 +1,4 @@
-"""What the model is shown and told: the resized picture, DINOv2's copy of it, the text around the instruction."""
+"""The model's inputs: the resized image, DINOv2's copy of it, and the prompt around the instruction."""
 
 import cv2
 import numpy as np

@@ -75,7 +75,7 @@ class Pi0Size:
 
 
 def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu") -> PI0Policy:
-    """A `PI0Policy` in eval mode with weights nobody should use yet.
+    """A `PI0Policy` in eval mode with uninitialised weights.
 
     size: None for the released dimensions (Gemma 2B + 300M, SigLIP So400m).
     device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the

@@ -20,7 +20,7 @@ from probe_kit.models.scoped import replaced
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
-    """A `SmolVLAPolicy` in eval mode, float32, with weights nobody should use yet.
+    """A `SmolVLAPolicy` in eval mode, float32, with uninitialised weights.
 
     folder: the checkpoint; `vlm_model_name` may be a path relative to it, or a hub id. Only the VLM's
     configuration and tokenizer are read: its weights are part of the policy's own file.

@@ -1,7 +1,7 @@
 """Magma, in plain torch, timm and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
-listens or acts; its adapter in `probe_kit.hooks` does.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
+Capture and actions are in its adapter in `probe_kit.hooks`.
 """
 
 from probe_kit.models.magma.config import MagmaConfig, VisionConfig

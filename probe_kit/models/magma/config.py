@@ -1,4 +1,4 @@
-"""What the `config.json` of a Magma checkpoint says.
+"""The `config.json` of a Magma checkpoint.
 
 `text_config` is the language model's; where the file has none, its top level repeats the same fields.
 `vision_config` is a plain dictionary; what it leaves out is the trunk's own.

@@ -36,7 +36,7 @@ def greedy(logits: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What decoding put out: ids (B, N) int64, the logits (B, N, V) that chose them, and where to go on."""
+    """What decoding put out: ids (B, N) int64, the logits (B, N, V) that chose them, and the cache."""
 
     ids: Tensor
     logits: Tensor
@@ -109,7 +109,7 @@ class MagmaNetwork(nn.Module):
         )
 
     def read(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> "Decoding":
-        """One pass over the prompts, to go on from token by token."""
+        """One pass over the prompts, from which decoding continues token by token."""
         return Decoding(self.language_model, self.embed(prompts, pictures), self.prompt_kv)
 
     def decode(
@@ -131,7 +131,7 @@ class MagmaNetwork(nn.Module):
         return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), decoding)
 
     def unheard(self) -> Any:
-        """A second language model over the same weights: hooks hang on modules, so none of ours hears it run."""
+        """A second language model with the same weights and without hooks, so that nothing is captured."""
         with torch.device("meta"):
             twin = LlamaForCausalLM(self.config.text).requires_grad_(False)
         twin.load_state_dict(self.language_model.state_dict(keep_vars=True), strict=True, assign=True)
@@ -180,7 +180,7 @@ def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -
     """The network in eval mode.
 
     device: `meta` for a network whose parameters have names and shapes but no prompt_kv, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
+    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
     Raises CheckpointError if the parts do not fit together.
     """
     network = build_empty(lambda: MagmaNetwork(config), dtype, device)

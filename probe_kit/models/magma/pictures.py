@@ -1,4 +1,4 @@
-"""Pictures to crops, bit for bit as the original processor makes them.
+"""Images to crops, bit-identical to the original processor.
 
 Colours are normalised first; then the picture is stretched, aspect not kept, to the grid of square crops that
 shows most of its pixels, without antialiasing.

@@ -1,4 +1,4 @@
-"""What Magma is asked, in the frames of Llama 3's chat.
+"""Magma's prompts in the template of Llama 3's chat.
 
 The wording is that of the authors' evaluation client, microsoft/Magma at 0483f87,
 `tools/simplerenv-magma/simpler_env/policies/magma/magma_model.py`.

@@ -1,4 +1,4 @@
-"""The units of Magma's actions, which its checkpoint does not hold: the evaluation client has them in its code."""
+"""The units of Magma's actions, which the evaluation client holds in its code instead of the checkpoint."""
 
 import json
 from importlib.resources import files

@@ -1,4 +1,4 @@
-"""The vision tower: timm's ConvNeXt, read before its head, and the projector that makes its maps into tokens.
+"""The vision tower: timm's ConvNeXt before its head, and the projector from its maps to tokens.
 
 N pictures' crops, S side of a crop, (h, w) the map of a picture, D width of the language model.
 """

@@ -1,4 +1,4 @@
-"""Ovis2.5 in plain torch: its vision tower, its visual words, its pictures. Nothing here listens or answers."""
+"""Ovis2.5 in plain torch: vision tower, visual words, image processing. Contains no capture code."""
 
 from probe_kit.models.ovis2_5.config import OvisConfig, VisionConfig
 from probe_kit.models.ovis2_5.network import (

@@ -1,4 +1,4 @@
-"""What the `config.json` of an Ovis2.5 checkpoint says."""
+"""The `config.json` of an Ovis2.5 checkpoint."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

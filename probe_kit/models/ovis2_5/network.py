@@ -1,4 +1,4 @@
-"""The network: patches become distributions over visual words, words become embeddings among those of the text.
+"""The network: patches become distributions over visual words, whose embeddings join those of the text.
 
 B batch, T positions, N patches and W visual words of all pictures together, D width of the language model.
 """

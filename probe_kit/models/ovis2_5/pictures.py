@@ -1,4 +1,4 @@
-"""Pictures to patches, as Ovis2.5's own code prepares them."""
+"""Images to patches, as in Ovis2.5's own code."""
 
 from dataclasses import dataclass
 from pathlib import Path

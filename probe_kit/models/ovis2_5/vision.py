@@ -1,4 +1,4 @@
-"""The vision tower: patches of any grid, positions from an interpolated table and by rotation, full attention.
+"""The vision tower: patches of any grid, interpolated and rotary positions, full attention.
 
 N patches of all pictures together, D width. The patches of a visual word follow each other.
 """

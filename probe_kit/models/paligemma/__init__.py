@@ -1,4 +1,4 @@
-"""PaliGemma: transformers' own network, its pictures and its released size. Nothing here listens or answers."""
+"""PaliGemma: transformers' own network, its image processing and its released size. Contains no capture code."""
 
 from probe_kit.models.paligemma.network import FILE_NAMES, build_paligemma, full_size_paligemma
 from probe_kit.models.paligemma.pictures import SquarePictures

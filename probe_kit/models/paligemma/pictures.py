@@ -1,4 +1,4 @@
-"""Pictures as one square, as SigLIP's processor makes them."""
+"""Images resized to one square, as in SigLIP's processor."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Prismatic vision-language models and OpenVLA, in plain torch, timm and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
-listens or acts; `probe_kit.hooks.families.prismatic.adapter` and `probe_kit.hooks.families.openvla.adapter` do.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
+Capture and actions are in the adapters `prismatic` and `openvla` in `probe_kit.hooks.families`.
 """
 
 from probe_kit.models.prismatic.config import PrismaticConfig, TowerConfig

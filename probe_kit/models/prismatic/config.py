@@ -1,4 +1,4 @@
-"""What the `config.json` of a Prismatic or OpenVLA checkpoint says.
+"""The `config.json` of a Prismatic or OpenVLA checkpoint.
 
 The file names parts of a fixed table (Karamcheti et al. 2024, and OpenVLA's `PrismaticConfig`); explicit fields
 win over the table. The language model's part is short: what it leaves out is transformers' default, which has

@@ -1,4 +1,4 @@
-"""The network: vision towers, projector, language model; patches go between the first token and the rest.
+"""The network: vision towers, projector, language model; image patches follow the first token.
 
 B batch, P patches, T text tokens, S = P + T positions, D width of the language model, V its vocabulary.
 """
@@ -144,7 +144,7 @@ def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "
     """The network in eval mode.
 
     device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet.
+    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
     """
     network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
     # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.

@@ -1,4 +1,4 @@
-"""Pictures to pixel values, bit for bit as the original processor makes them, with PIL and numpy alone.
+"""Images to pixel values, bit-identical to the original processor, with PIL and numpy only.
 
 Channels 3k … 3k+2 are what tower k reads: the same pixels, resized to its side and normalised with its own means.
 """

@@ -1,4 +1,4 @@
-"""Pictures resized as tensors in bfloat16, as Act2Answer's evaluation of OpenVLA does; elsewhere PIL does it."""
+"""Images resized as bfloat16 tensors, as in Act2Answer's evaluation of OpenVLA."""
 
 import numpy as np
 import torch

@@ -1,6 +1,6 @@
-"""What the families built on Qwen's vision-language models share: pictures, prompts as batches, construction.
+"""Code that families on Qwen's vision-language models share: images, batches of prompts, construction.
 
-The networks themselves are transformers' own Qwen classes. Nothing here listens or acts.
+The networks themselves are transformers' own Qwen classes. Capture and actions are in `probe_kit.hooks`.
 """
 
 from probe_kit.models.building import build_empty, fill_rotary, without_precision

@@ -1,4 +1,4 @@
-"""Qwen's chat, as text: an image's slot and how many tokens stand in it."""
+"""Qwen's chat as text: the placeholder of an image and its number of tokens."""
 
 from collections.abc import Sequence
 

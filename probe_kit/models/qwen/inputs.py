@@ -1,4 +1,4 @@
-"""What a Qwen vision-language model reads: ids, mask, patches of pictures.
+"""Inputs of a Qwen vision-language model: ids, mask, image patches.
 
 B batch, P positions, N patches of all pictures together, I pictures.
 """

@@ -1,4 +1,4 @@
-"""Qwen2.5-VL and Qwen3-VL as they were released, built empty, on transformers' own classes."""
+"""Qwen2.5-VL and Qwen3-VL at their released sizes, built empty, on transformers' own classes."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Pictures to patches, as the processors of Qwen's models make them: the size depends on the picture's own."""
+"""Images to patches, as in the processors of Qwen's models; the size depends on the image's own."""
 
 import json
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class QwenPictures:
         file = folder / SETTINGS_FILE
         if not file.is_file():
             raise CheckpointError(
-                f"{file} is missing: without it nobody knows how large this checkpoint's pictures are. "
+                f"{file} is missing; it defines the size of this checkpoint's pictures. "
                 "It comes with the checkpoint, or with the vision-language model it was made of"
             )
         values = json.loads(file.read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
 """SpatialVLA in plain torch and transformers: SigLIP, ZoeDepth, a 3-D position, Gemma-2, actions as tokens.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
-listens or acts.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
+Capture and actions are in its adapter in `probe_kit.hooks`.
 """
 
 from probe_kit.models.spatialvla.actions import STEP_TOKENS, ActionBins, equal_mass_edges

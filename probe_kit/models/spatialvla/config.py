@@ -1,4 +1,4 @@
-"""What the `config.json` of a SpatialVLA checkpoint says.
+"""The `config.json` of a SpatialVLA checkpoint.
 
 The three networks inside are described as transformers describes them; what their parts leave out is transformers'
 default, as it was when the file was written.

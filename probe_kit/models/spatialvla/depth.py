@@ -1,4 +1,4 @@
-"""Depth: a metric map of every picture from ZoeDepth, at the resolution of the picture.
+"""Metric depth maps from ZoeDepth, at the resolution of the image.
 
 B pictures of side S.
 """

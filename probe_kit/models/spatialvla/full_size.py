@@ -1,4 +1,4 @@
-"""SpatialVLA-4B without memory, to compare names and shapes with the released files."""
+"""SpatialVLA-4B on the meta device, to compare names and shapes with the released files."""
 
 from typing import Any
 

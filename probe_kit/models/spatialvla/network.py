@@ -1,4 +1,4 @@
-"""The network: SigLIP, 3-D positions from ZoeDepth, a projection, Gemma-2 over picture, text and actions.
+"""The network: SigLIP, 3-D positions from ZoeDepth, a projection, Gemma-2 over image, text and actions.
 
 B batch, P patches, T prompt tokens with the picture's, D width of the language model, V its vocabulary.
 """
@@ -199,7 +199,7 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
     """The network in eval mode.
 
     device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with weights nobody should use yet. `embed_actions` comes after
+    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights. `embed_actions` comes after
     the weights. Raises WeightsError if a part of transformers has a constant that would stay without memory.
     """
     network = build_empty(lambda: SpatialVLANetwork(config), dtype, device)

@@ -1,4 +1,4 @@
-"""Pictures and cameras as the model takes them, bit for bit as the original processor makes them."""
+"""Images and camera intrinsics, bit-identical to the original processor."""
 
 import json
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ class PictureSettings:
                 f"{file} makes pictures of side {settings.side}; config.json expects {config.side}"
             )
         if settings.resampling not in {int(known) for known in Image.Resampling}:
-            raise CheckpointError(f"{file}: resample is {settings.resampling}, which PIL does not know")
+            raise CheckpointError(f"{file}: resample is {settings.resampling}, which PIL does not support")
         return settings
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Space: a depth map becomes points in the camera's frame, and the points of a patch become one vector.
+"""3-D positions: a depth map becomes points in the camera frame, and the points of a patch become one vector.
 
 B pictures, P patches, R points per patch and direction.
 """

@@ -1,7 +1,7 @@
 """Xiaomi-Robotics-R0: Qwen3-VL and a flow transformer that reads its keys and values, in torch and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Nothing here
-listens or acts.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
+Capture and actions are in its adapter in `probe_kit.hooks`.
 """
 
 from probe_kit.models.xiaomi.config import XiaomiConfig

@@ -1,4 +1,4 @@
-"""What the `config.json` of a Xiaomi-Robotics-R0 checkpoint says."""
+"""The `config.json` of a Xiaomi-Robotics-R0 checkpoint."""
 
 import json
 from collections.abc import Mapping

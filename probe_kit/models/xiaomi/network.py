@@ -1,4 +1,4 @@
-"""The network: one pass of Qwen3-VL over the prompt, then a few passes of the flow transformer over its cache.
+"""The network: one pass of Qwen3-VL over the prompt, then several passes of the flow transformer over its cache.
 
 B batch, P prompt positions, A actions of a chunk, T = 1 + states + A positions of the flow transformer.
 """

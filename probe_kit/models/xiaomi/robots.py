@@ -1,4 +1,4 @@
-"""The robots a checkpoint knows: the statistics of their actions, and how each sees its scene and itself."""
+"""The robots of a checkpoint: action statistics, and how each observes its scene and state."""
 
 import json
 from collections.abc import Callable, Mapping

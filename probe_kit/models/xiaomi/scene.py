@@ -1,4 +1,4 @@
-"""What the model is shown and told: the picture as its evaluation crops it, and the text around it."""
+"""The model's inputs: the image as its evaluation crops it, and the prompt."""
 
 import numpy as np
 from numpy.typing import NDArray

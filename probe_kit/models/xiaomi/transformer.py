@@ -1,4 +1,4 @@
-"""The flow transformer: reads the vision-language model's keys and values, puts out the velocity of the actions.
+"""The flow transformer: attends to the vision-language model's keys and values; its output is an action velocity.
 
 B batch, P prompt positions, T = 1 + states + actions own positions, D width, H heads of size E, K cached heads.
 """
@@ -110,7 +110,7 @@ class GatedMLP(nn.Module):
 
 
 class Gate(nn.Module):
-    """Scales what is added to the stream; a module, so that what is added can be captured."""
+    """Scales what is added to the stream; a module, so that hooks can capture what is added."""
 
     def forward(self, gate: Tensor, added: Tensor) -> Tensor:
         """(B, T, D) of gate (B, 1, D) and (B, T, D)."""

@@ -1,4 +1,4 @@
-"""What can be had without the task: can pictures alone, text alone or a fixed side find the correct picture?
+"""Leakage checks: can pictures alone, text alone or a fixed side identify the correct picture?
 
 Each baseline predicts the correct side of every episode (both layouts of every item), trained on other groups.
 Chance is one half. A category passes if no baseline is further above chance than the interval that a coin has over

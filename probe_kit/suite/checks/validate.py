@@ -1,4 +1,4 @@
-"""`validate_suite`: every rule, and on request the leakage gates, in one report."""
+"""`validate_suite`: all rules and, on request, the leakage checks, in one report."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass

@@ -1,4 +1,4 @@
-"""What a source yields before anything is paired: questions with their pictures, in one neutral form."""
+"""Candidates: questions with their pictures from any source, before pairing."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping

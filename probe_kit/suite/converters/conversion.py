@@ -94,12 +94,12 @@ def convert(
     emit_curation: Path | str | None = None,
     **options: Any,
 ) -> Suite:
-    """A suite made from the benchmark in `root`, written to `out` and read back.
+    """A suite made from the benchmark in `root`, written to `out` and loaded.
 
     n: most items per category. curation: a reviewed file; only what it accepts is emitted. emit_curation: where to
     write a file to review. options: fields of the source's options, such as `min_side` (see `SOURCES`).
     The same arguments give the same bytes. `stats.json` counts every stage beside the paper.
-    Sets in Act2Answer's own format (`act2answer`) are taken over question by question, whatever `seed` is.
+    Sets in Act2Answer's own format (`act2answer`) are converted question by question, whatever `seed` is.
     Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
     should be; `out` is then left as it was.
     """
@@ -109,7 +109,7 @@ def convert(
         raise UsageError(f"n is {n}; expected at least 1 item per category.")
     if source == ACT2ANSWER:
         if curation is not None or emit_curation is not None:
-            raise UsageError(f"{source} takes no curation: its questions are taken over as they are.")
+            raise UsageError(f"{source} takes no curation: its questions are converted unchanged.")
         return act2answer.convert_set(Path(root), Path(out), categories, n, options)
     kind, root, out = SOURCES[source], Path(root), Path(out)
     chosen = options_from(kind.options, options)

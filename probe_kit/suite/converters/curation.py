@@ -1,4 +1,4 @@
-"""The curation file: what a person accepts, rejects or rewords, as JSON lines or CSV, with a page to look at."""
+"""The curation file: a person's decisions (accept, reject, reword) as JSON lines or CSV, with a preview page."""
 
 import csv
 import html

@@ -1,4 +1,4 @@
-"""From accepted proposals to items with pictures: sampled, laid out left and right, and encoded."""
+"""From accepted proposals to items: sampling, assignment to left and right, and encoding of pictures."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Reading a source's tree: annotation files, and pictures that may lie in one of several places."""
+"""Reading of a source's folder: annotation files, and pictures in one of several places."""
 
 from collections.abc import Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Which pictures and which instructions may become items."""
+"""Filters of pictures and instructions that may become items."""
 
 import unicodedata
 from collections.abc import Callable

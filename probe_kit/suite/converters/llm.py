@@ -1,4 +1,4 @@
-"""Optional: a language model proposes a wording for a question that no rule matches. A person has to accept it."""
+"""Optional: a language model proposes a wording where no rule matches. A person must accept it."""
 
 import json
 import os

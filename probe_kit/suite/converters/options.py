@@ -1,4 +1,4 @@
-"""What can be chosen when a benchmark is converted: shared settings, and a few of each source."""
+"""Options of a conversion: shared settings, and some per source."""
 
 from dataclasses import dataclass, fields
 from difflib import get_close_matches

@@ -1,4 +1,4 @@
-"""From candidates to proposals: which two pictures lie side by side, and which of them is asked for."""
+"""From candidates to proposals: pairs of pictures, and which of the two is the target."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""From a benchmark's question to the phrase that names the right picture: an ordered table, first match wins."""
+"""Rewriting of a benchmark's question to a phrase that names the correct picture: an ordered rule table."""
 
 import re
 from collections.abc import Callable

@@ -1,1 +1,1 @@
-"""Suites of a user's own questions and pictures."""
+"""Suites from a user's own questions and pictures."""

@@ -1,4 +1,4 @@
-"""Suites of one's own questions in a table: instruction, correct picture, wrong picture, group.
+"""Suites from a table of questions: instruction, correct picture, wrong picture, group.
 
 instruction,correct,wrong,group,category
 Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
@@ -118,7 +118,7 @@ def _row(record: Mapping[str | None, str | None], line: int, table: Path, catego
     asked = cells.get("object") or _object_of(cells["instruction"])
     if asked is None or asked not in cells["instruction"]:
         raise UsageError(
-            f"{where}: what is asked for cannot be told from {cells['instruction']!r}. Write it as "
+            f"{where}: no target can be parsed from {cells['instruction']!r}. Write it as "
             "'Put the cube on the …', or name the words in a column `object`"
         )
     correct, wrong = (table.parent / cells[column] for column in ("correct", "wrong"))

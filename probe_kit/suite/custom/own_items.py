@@ -1,4 +1,4 @@
-"""Items made of files that a user brings: the picture as it is stored, and the record of the question."""
+"""Items from a user's files: the stored picture, and the record of the question."""
 
 import hashlib
 from collections.abc import Mapping

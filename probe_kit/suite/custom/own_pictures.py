@@ -1,4 +1,4 @@
-"""Suites of your own pictures: two pictures with a phrase each become two questions.
+"""Suites from a user's pictures: two pictures with a phrase each become two questions.
 
 pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg"))
 suite = suite_from_pictures("suites/mine", [pair, ...], name="mine", license="CC-BY-4.0", attribution="me")

@@ -1,4 +1,4 @@
-"""Couples of tiles: which concepts meet, which of them lies left, and how both look."""
+"""Couples of tiles: the two concepts, which one is left, and their appearance."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence

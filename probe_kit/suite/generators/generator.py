@@ -1,4 +1,4 @@
-"""What a category has to say to be drawn: its concepts, which two may meet, and a pair of tiles for them."""
+"""The interface of a category: its concepts, which two may meet, and a pair of tiles for them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Which concepts meet: every concept about equally often, and often enough beside its own kind."""
+"""Pairing of concepts: each occurs about equally often, and often enough with its own kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict

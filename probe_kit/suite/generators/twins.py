@@ -1,4 +1,4 @@
-"""From a couple of tiles to two items: the same pictures in the same places, asked for both ways.
+"""From a couple of tiles to two items: the same pictures in the same places, each the target once.
 
 Each concept is so the target once and the distractor once in the very same pictures. Neither the pictures alone
 nor the text alone can give the answer away; only both together do.

@@ -1,1 +1,1 @@
-"""The rules a suite must keep: E rules make it unusable, W rules say what to look at before trusting numbers."""
+"""Validation rules: E rules make a suite unusable, W rules are warnings."""

@@ -1,4 +1,4 @@
-"""What a rule found, and how findings are listed."""
+"""Findings of validation rules, and their listing."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

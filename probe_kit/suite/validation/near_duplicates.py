@@ -1,4 +1,4 @@
-"""What two pictures are compared by, to find those that are nearly the same."""
+"""Features by which near-duplicate pictures are found."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""E01 to E04: the lines of `metadata.jsonl` and the card, before they can become items."""
+"""E01 to E04: the lines of `metadata.jsonl` and the card, before items are made of them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
@@ -44,7 +44,7 @@ def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
     if not isinstance(record, dict):
         return error("E01", where, f"a JSON {type(record).__name__}; expected an object")
     if not _is_finite(record):
-        return error("E01", where, "a number in it is NaN or infinite, or too large to be told from that")
+        return error("E01", where, "a number in it is NaN, infinite or beyond float range")
     return record
 
 

@@ -1,4 +1,4 @@
-"""E05 to E15: what every item and the suite as a whole must keep.
+"""E05 to E15: rules for every item and for the suite as a whole.
 
 Every rule has the same shape, a Suite in and findings out. Those in `LOADING_RULES` run each time a suite is
 opened; they are fast, because pictures are hashed but not decoded. `DECODING_RULES` run in `validate_suite`.

@@ -1,4 +1,4 @@
-"""W01 to W04 and W06 to W09: true things about a suite that one should know before trusting its numbers."""
+"""W01 to W04 and W06 to W09: properties of a suite that can bias its numbers."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,1 +1,1 @@
-"""Controls: what probes read where no answer can be known."""
+"""Controls: accuracies that probes must exceed."""

@@ -1,4 +1,4 @@
-"""Features that never saw the model: what layout, instruction and pictures alone give away."""
+"""Baselines without a model: features of layout, instruction and pictures alone."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Fitting the controls of probe results: what can be wrong with them is found before anything is fitted."""
+"""Fitting of controls for probe results, with all checks before the first fit."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -69,7 +69,7 @@ def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError
 
 
 def add_baselines(results: ProbeResults, run: RunReader, prepared: PreparedControls) -> ProbeResults:
-    """`results` with these baselines for every category; all sites are held against binding if it is one."""
+    """`results` with these baselines for every category; with `binding`, every site is compared with it."""
     controls = results.controls
     for name, features in prepared.features.items():
         controls = controls.with_baselines(_baseline_scores(results, run, name, features))
@@ -141,7 +141,7 @@ def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[st
 
 
 def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
-    """`results` held against the same probes of a twin. Raises UsageError if the twin saw other episodes."""
+    """`results` compared with the same probes of a twin. Raises UsageError if the twin saw other episodes."""
     scores = [
         score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
     ]

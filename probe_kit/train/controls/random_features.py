@@ -1,4 +1,4 @@
-"""The control `binding`: what an untrained conjunction of pictures and words gives for free.
+"""The control `binding`: accuracy of an untrained conjunction of picture and word features.
 
 Concepts recur in other groups of pictures, so a probe can itself learn which pixels answer which word, as soon as
 its features hold products of both. Any random nonlinear layer does. The control is such a layer, as wide as the
@@ -56,9 +56,9 @@ class RandomFeatureInputs:
 def random_feature_scores(
     results: ProbeResults, run: RunReader, inputs: RandomFeatureInputs
 ) -> tuple[list[BaselineScore], list[ControlComparison]]:
-    """The control's accuracy per category, as wide as the backbone, and every site held against it.
+    """The control's accuracy per category, as wide as the backbone, and every site compared with it.
 
-    A site is held against layers of its own stream's width, on the same folds.
+    A site is compared with layers of its own stream's width, on the same folds.
     """
     scores, found = [], []
     for category in results.settings.categories:

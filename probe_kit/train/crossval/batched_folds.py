@@ -1,4 +1,4 @@
-"""The probes of a small study, all folds at once: there the calls take the time, not the multiplications."""
+"""Probes of a small study, with all folds in one batch, because calls and not products take the time."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

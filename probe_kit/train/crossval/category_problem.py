@@ -1,4 +1,4 @@
-"""The probing problem of a category: which episodes, which labels, which folds, which relabellings."""
+"""The probing problem of a category: episodes, labels, folds, label permutations."""
 
 import warnings
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Nested cross-validation of a site with many samples: training sets, relabellings and C in shared products.
+"""Nested cross-validation of a site with many samples: training sets, permutations and C share products.
 
 Every C starts from nothing: with the one before as a start, problems took nearly as many products, which were a
 seventh as wide and so half as fast.

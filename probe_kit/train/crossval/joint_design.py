@@ -1,4 +1,4 @@
-"""What the training sets of one site's probes have in common, made once for all of them."""
+"""The design matrix that the training sets of one site's probes share."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

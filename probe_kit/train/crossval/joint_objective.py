@@ -1,4 +1,4 @@
-"""Logistic probes on several training sets of one site, in products that all of them share."""
+"""Logistic objectives of several training sets of one site, evaluated in shared products."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What out-of-fold decision values are worth: accuracy and its companions, and an interval."""
+"""Metrics of out-of-fold decision values: accuracy, AUC and others, with an interval."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Nested, grouped cross-validation: the folds, the grid of C, and what an outer fold's probes are."""
+"""Nested, grouped cross-validation: the folds, the grid of C, and the probes of an outer fold."""
 
 from dataclasses import dataclass
 

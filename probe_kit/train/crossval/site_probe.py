@@ -1,4 +1,4 @@
-"""One site's probe: nested, grouped cross-validation for the real labels and every relabelling at once."""
+"""One site's probe: nested, grouped cross-validation for the labels and all their permutations at once."""
 
 from dataclasses import dataclass
 

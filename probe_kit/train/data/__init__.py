@@ -1,1 +1,1 @@
-"""What probes are fitted on: samples and labels of a run."""
+"""Inputs of probes: samples and labels of a run."""

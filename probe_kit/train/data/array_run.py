@@ -1,4 +1,4 @@
-"""A run made of arrays you already have."""
+"""A run made of arrays."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""A run as it was at one captured inference: the episodes that got that far, and what was captured then."""
+"""A run restricted to one captured inference, with the episodes that reached it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a probe is asked to read: the correct side, the chosen side, or a shuffled control."""
+"""Labels of probes: the correct side, the chosen side, or a shuffled control."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""What probes and retention need from a run: nothing but this."""
+"""The protocol of a run: what probes and retention need from it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol

@@ -1,4 +1,4 @@
-"""The suite that a run was extracted from: in a folder, or the embedded one, which can be drawn again."""
+"""The suite of a run: from a folder, or drawn again if it is the embedded one."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping

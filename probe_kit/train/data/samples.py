@@ -1,4 +1,4 @@
-"""What a probe learns from: one sample per episode (pooled views), or one per token."""
+"""Samples of a probe: one per episode (pooled views), or one per token."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

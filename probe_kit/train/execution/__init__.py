@@ -1,1 +1,1 @@
-"""Where probes are fitted: this process, processes, or a Ray cluster."""
+"""Execution of probe fits: in this process, in several, or on a Ray cluster."""

@@ -1,4 +1,4 @@
-"""Probing many columns of features: in this process, in several, or on a Ray cluster."""
+"""Fits of many feature columns: in this process, in several, or on a Ray cluster."""
 
 from collections.abc import Iterator
 from typing import Any

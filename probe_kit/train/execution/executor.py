@@ -1,4 +1,4 @@
-"""What every crew that probes columns side by side has in common."""
+"""Base class of the executors that fit columns in parallel."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

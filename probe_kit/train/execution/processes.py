@@ -1,4 +1,4 @@
-"""Probing in processes on this machine."""
+"""Probe fits in processes on this machine."""
 
 from collections import deque
 from collections.abc import Sequence

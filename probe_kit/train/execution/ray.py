@@ -1,4 +1,4 @@
-"""Probing on a Ray cluster."""
+"""Probe fits on a Ray cluster."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -1,4 +1,4 @@
-"""Probes of one run at several captured inferences, as far as they were fitted alike."""
+"""Probe results of one run at several captured inferences."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What probes are held against: baselines that never see the model, and a twin that was never trained."""
+"""Scores of the controls that probes are compared with: baselines, and an untrained network."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -78,7 +78,7 @@ def has_signal(beats: Beats) -> bool:
 
 @dataclass(frozen=True)
 class Controls:
-    """What was controlled so far. excess: every site held against binding and twin."""
+    """Scores of the controls so far. excess: every site compared with binding and twin."""
 
     baselines: tuple[BaselineScore, ...] = ()
     twin: tuple[TwinScore, ...] = ()

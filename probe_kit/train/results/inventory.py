@@ -1,4 +1,4 @@
-"""What a run holds: `probe-kit run show`."""
+"""The content of a run: `probe-kit run show`."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class StoredProbes:
     """One set of probe results, or what is known of a set written by another version.
 
     created: when they were fitted. controls: baselines and, last, `twin: NAME`. state: `used` if `retention` reads
-    them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others by now,
+    them by default, `other` if it does so for their key, `other episodes` if the run has others by now,
     `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
     run is in its items' own words.
     """

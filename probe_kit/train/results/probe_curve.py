@@ -1,4 +1,4 @@
-"""The probes of one category in one view: everything that later statistics need, without refitting."""
+"""The probes of one category in one view, with all that later statistics need."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Where in a site's raw features the answer lies: the probes' own weights, for steering."""
+"""Probe directions in a site's raw features, for steering."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

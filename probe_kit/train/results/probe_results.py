@@ -30,7 +30,7 @@ class ProbeResults:
     """Probes of one run under one set of settings.
 
     curves: one per (category, view). directions: the probes' weights per (category, view, site). controls: what
-    the probes are held against, as far as that was asked for.
+    the probes are compared with, as far as requested.
     created: when they were fitted (UTC, ISO 8601); not part of the key. stamp: hash of the commits they were
     fitted to, empty for arrays in memory.
     """

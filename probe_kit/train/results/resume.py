@@ -1,4 +1,4 @@
-"""What an interrupted sweep left: probes of single sites, from which the same command continues."""
+"""Checkpoints of an interrupted sweep: probes of single sites, from which the same command resumes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Where probe results live: `RUN/probes/<key>/`, complete or not there.
+"""Storage of probe results: `RUN/probes/<key>/`, either complete or absent.
 
 Results are there when their settings are, which are written last, with the hashes of all else; see `bundles`.
 """
@@ -37,7 +37,7 @@ DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
 def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = True) -> None:
     """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
 
-    asked: whether somebody asked for these probes, which `load_results` then prefers to all older ones, rather
+    asked: whether a user requested these probes, which `load_results` then prefers to all older ones, rather
     than needing them in passing, as the twin of another run.
     """
     location = locate(run)
@@ -93,7 +93,7 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
     The newest are of the first captured inference; those of later ones are read by their key.
 
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
-    they were fitted then or read back. Results of another format, written by another version of probe_kit, are
+    they were fitted then or loaded. Results of another format, written by another version of probe_kit, are
     passed over. Raises NoProbesError if there are none, UsageError for a key that is not there, and
     RunDamagedError if any results of the run were changed, lost their settings, or are of other activations.
     """
@@ -200,7 +200,7 @@ def settings_of(bundle: Bundle) -> ProbeSettings:
 
 
 def read_controls(bundle: Bundle) -> Controls:
-    """What results were held against so far. Raises RunDamagedError."""
+    """The controls that results were compared with so far. Raises RunDamagedError."""
     if not bundle.has(CONTROLS):
         return Controls()
     try:

@@ -1,4 +1,4 @@
-"""Probe results in one line and as a notebook shows them."""
+"""Probe results in one line and as a notebook table."""
 
 from typing import TYPE_CHECKING
 

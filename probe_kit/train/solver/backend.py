@@ -1,4 +1,4 @@
-"""Arrays of numpy or torch: the linear algebra is written once, in the names that both share."""
+"""Linear algebra for numpy arrays and torch tensors, written once in the names that both share."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""Conjugate gradients for many problems on the same samples, one column each: every product is one of matrices."""
+"""Conjugate gradients for many problems on the same samples, one column each, as matrix–matrix products."""
 
 from dataclasses import dataclass
 

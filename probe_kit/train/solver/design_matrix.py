@@ -1,4 +1,4 @@
-"""Training samples as the solver needs them: products with them, never all their entries."""
+"""Training samples as the solver needs them: products with them, without a full copy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

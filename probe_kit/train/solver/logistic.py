@@ -1,4 +1,4 @@
-"""Many L2-regularised logistic regressions on the same samples, solved exactly and at once.
+"""Exact solver of many L2-regularised logistic regressions on the same samples.
 
 The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
 Samples come in principal coordinates (`features.Coordinates`), whose columns are nearly orthogonal: there the

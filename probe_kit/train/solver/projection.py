@@ -1,4 +1,4 @@
-"""From raw features to the few coordinates in which a probe is solved; numpy arrays or torch tensors."""
+"""Projection of raw features to the few coordinates in which a probe is solved; numpy or torch."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Rows of a matrix that is too large to be copied: chosen without copying, visited a block at a time."""
+"""Rows of a matrix that is too large to copy: selected in place and read in blocks."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

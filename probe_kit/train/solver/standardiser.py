@@ -1,4 +1,4 @@
-"""Features brought to mean 0 and deviation 1, by what training samples say; numpy arrays or torch tensors."""
+"""Standardisation of features by the mean and deviation of training samples; numpy or torch."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """A policy written by others costs its own episodes, by name, whatever its code does."""
 
+import json
+import pickle
 import sys
 from pathlib import Path
 from typing import Any
@@ -8,8 +10,9 @@ import numpy as np
 import pytest
 
 from probe_kit.env import SceneSpec
-from probe_kit.errors import CheckpointError, EpisodesFailedError, PolicyFailedError
+from probe_kit.errors import ActionError, CheckpointError, EpisodesFailedError, PolicyFailedError
 from probe_kit.extract import ExtractSettings, extract_run, open_run
+from probe_kit.extract.rollout.events import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.family import Family
 from probe_kit.suite import Suite, build_suite
@@ -74,6 +77,36 @@ def test_what_a_policy_does_wrong_gives_its_episodes_up_by_name(
     assert len(open_run(tmp_path / "run", allow_partial=True).episodes) == 1
 
 
+def test_a_failure_is_stored_with_the_traceback_of_the_policys_own_code(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    act, calls = Pi0.act, iter(range(1000))
+    monkeypatch.setattr(
+        Pi0, "act", lambda *args: (fall if next(calls) >= CALLS_BEFORE else lambda a: act(*a))(args)
+    )
+    with pytest.raises(EpisodesFailedError) as caught:
+        extract_run(settings(suite), tmp_path / "run")
+    files = sorted((tmp_path / "run" / "failed").iterdir())
+    assert len(files) == 3
+    for file, note in zip(files, caught.value.__notes__, strict=True):
+        assert str(file) in note
+        record = json.loads(file.read_text(encoding="utf-8"))
+        assert "in fall\n" in record["traceback"]
+        assert record["traceback"].rstrip().endswith(record["reason"].split(": ", 1)[1])
+        assert record["reason"] in open_run(tmp_path / "run", allow_partial=True).failed.values()
+
+
+def test_an_error_of_another_process_keeps_the_traceback_of_that_process() -> None:
+    try:
+        raise ActionError("out of bounds")
+    except ActionError as error:
+        add_traceback(error)
+        received = pickle.loads(pickle.dumps(error))
+    assert received.__traceback__ is None
+    assert "test_foreign_policies.py" in traceback_of(received)
+    assert len(traceback_of(ActionError("x" * 100_000))) == LONGEST_TRACEBACK
+
+
 def exiting_loader(*_: Any) -> Any:
     sys.exit(0)
 
@@ -109,5 +142,5 @@ def test_a_family_that_is_wrong_about_itself_breaks_no_list(monkeypatch: pytest.
     known = {**registry.known_families(), "mine": broken}
     monkeypatch.setattr(registry, "known_families", lambda: known)
     rows = {row["model"]: row["ready"] for row in _model_rows(None)}
-    assert "cannot be told" in rows["mine"]
+    assert "unknown: " in rows["mine"]
     assert rows["pi0-tiny"] == "yes"

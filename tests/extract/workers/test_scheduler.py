@@ -23,7 +23,7 @@ def test_a_suspect_is_tried_once_more_and_alone() -> None:
     assert scheduler.take(0) == 0
     assert scheduler.take(0) is None, "nothing beside a suspect"
     scheduler.record(0, Failed(0, "broke again"))
-    assert scheduler.given_up == {0: "broke again"}
+    assert scheduler.given_up == {0: Failed(0, "broke again")}
     assert scheduler.finished
 
 

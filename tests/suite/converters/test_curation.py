@@ -124,11 +124,11 @@ def test_a_review_is_not_written_over(name: str, compbench_root: Path, tmp_path:
     path = tmp_path / name
     for _ in range(2):  # nobody has looked so far
         convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
-    reviewed = path.read_text().replace("pending", "accept", 1)
-    path.write_text(reviewed)
+    reviewed = path.read_text(encoding="utf-8").replace("pending", "accept", 1)
+    path.write_text(reviewed, encoding="utf-8")
     with pytest.raises(SuiteError, match=r"holds the review of 1 pairs.*--curation"):
         convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
-    assert path.read_text() == reviewed
+    assert path.read_text(encoding="utf-8") == reviewed
 
 
 def test_a_missing_curation_file_is_named(compbench_root: Path, tmp_path: Path) -> None:

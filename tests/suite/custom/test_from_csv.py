@@ -95,7 +95,7 @@ def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(
         ("instruction,correct,wrong,colour", "x,y,z,c", "expected instruction, correct, wrong"),
         ("instruction,correct,wrong", "Put the cube on the lime,,green.png", "line 2 has no correct"),
         ("instruction,correct,wrong", "Put it on a lime, please,green.png,red.png", "line 2 has more fields"),
-        ("instruction,correct,wrong", "Banana!,yellow.png,green.png", "line 2: what is asked for cannot be told"),
+        ("instruction,correct,wrong", "Banana!,yellow.png,green.png", "line 2: no target can be parsed"),
         ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,mean", "'mean' cannot name"),
         ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,A/B", "'A/B' cannot name"),
         ("instruction,correct,wrong", "", "no line below"),

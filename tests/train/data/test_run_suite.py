@@ -195,7 +195,7 @@ def test_a_cache_that_cannot_be_written_is_named_as_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = run_on(build_suite(tmp_path / "suite", ["color"], 12), tmp_path / "run")
-    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "file").write_text("in the way", encoding="utf-8")
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match=f"{BINDING_LEFT_OUT}.*PROBE_KIT_CACHE"):
         train_probes(run, permutations=1)

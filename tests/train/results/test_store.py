@@ -115,13 +115,13 @@ def test_probes_of_before_times_had_a_record_are_read_and_ranked(planted_run: Pl
     run = planted_run()
     old, new = train_probes(run, permutations=1), train_probes(run, permutations=2)
     folder = run.path / "probes" / old.key
-    head = json.loads((folder / "settings.json").read_text())
+    head = json.loads((folder / "settings.json").read_text(encoding="utf-8"))
     write_record(folder / "settings.json", {**head, "created": "2020-01-01", "asked": "2999-01-01"})
     (folder / "times.json").unlink()
     assert (load_results(run).key, load_results(run).created) == (old.key, "2020-01-01")
     train_probes(run, permutations=1, controls=("position",))
     assert load_results(run).created == "2020-01-01"
-    assert not {"created", "asked"} & {*json.loads((folder / "settings.json").read_text())}
+    assert not {"created", "asked"} & {*json.loads((folder / "settings.json").read_text(encoding="utf-8"))}
     assert load_results(run, new.key).key == new.key
 
 

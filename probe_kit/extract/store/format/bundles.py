@@ -1,4 +1,4 @@
-"""Bundles: results that are stored with a run, a folder each, complete or not there.
+"""Bundles: results stored with a run, one folder each, either complete or absent.
 
     <home>/<key>/settings.json    the head, a record written last: what it is, whose, and the sums of its files
     <home>/<key>/times.json       a record of when it was made, which no other hash covers
@@ -35,7 +35,7 @@ _TIMES = ("created", "asked")
 class Bundle:
     """One bundle, its head checked; files are checked when they are read.
 
-    head: what whoever stored it says. times: by name, when what happened to it (UTC, ISO 8601). files: by the name
+    head: settings of the producer. times: times of its events by name (UTC, ISO 8601). files: by the name
     asked for, the name that counts now and the sum of it.
     """
 
@@ -106,7 +106,7 @@ class Bundle:
         try:
             content = parse_json(self.read(name))
         except ValueError as error:
-            raise self.damaged(name, f"is no JSON ({error})") from error
+            raise self.damaged(name, f"is not JSON ({error})") from error
         if not isinstance(content, dict):
             raise self.damaged(name, f"holds a {type(content).__name__}, not an object")
         return content
@@ -193,7 +193,7 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
         raise RunDamagedError(f"{name} has no name, length and hash of {wrong[0]!r}. {advice}")
     files = {one: (actual, Sum(*known)) for one, (actual, *known) in stored.items()}
     if strange := sorted(actual for actual, _ in files.values() if "/" in actual or actual in ("", ".", "..")):
-        raise RunDamagedError(f"{name} names {strange[0]!r}, which is no file beside it. {advice}")
+        raise RunDamagedError(f"{name} names {strange[0]!r}, which is not a file in the same folder. {advice}")
     return Bundle(location, home, key, head, times, files)
 
 

@@ -1,4 +1,4 @@
-"""A store that gives nothing out unchecked: every object, or the part of one that is read, against its sum."""
+"""A store that checks every object, or each part that is read, against its hash."""
 
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping, Sequence
 from itertools import count
@@ -88,7 +88,7 @@ class CheckedStore(WrapperStore[Store]):
     async def get_ranges(
         self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
     ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
-        """Parts of one object, fetched as the store below thinks best."""
+        """Parts of one object, fetched in the way of the store below."""
         if key not in self._indexes and any(isinstance(one, RangeByteRequest) for one in byte_ranges):
             await self._read_index(key, prototype)
         async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):

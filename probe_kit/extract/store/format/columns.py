@@ -1,4 +1,4 @@
-"""The column store, read: one pooled vector of every episode, as probes ask for it.
+"""Reading of the column store: one pooled vector per episode, as probes need it.
 
 A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal`
 writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
@@ -154,7 +154,7 @@ def _check_lost(
         raise RunDamagedError(
             f"{root.location}/{commit_key(lost[0])} is missing: {name} was made of {len(numbers)} episodes, of "
             f"which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to redo "
-            f"them; to go on without, delete {SEALED} and {COLUMNS}"
+            f"them; to continue without them, delete {SEALED} and {COLUMNS}"
         )
     if not absent and stamp_of({number: commits[number] for number in numbers}) != seal["stamp"]:
         raise RunDamagedError(f"{name} was made of other commits than the run has. {advice}")

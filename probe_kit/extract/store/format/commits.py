@@ -1,4 +1,4 @@
-"""Commits: the small record that makes an episode count, written last and exactly once."""
+"""Commits: the record that makes an episode count, written last and exactly once."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -51,7 +51,7 @@ def commit_key(number: int) -> str:
 def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
     """Number, key and content of the objects `<eight digits>.json` in `folder`.
 
-    Other names are nobody's, such as those that file managers give to copies.
+    Other names are ignored, such as those that file managers give to copies.
     """
     for name, raw in location.read_all(folder, ".json").items():
         if found := _NUMBERED.fullmatch(name):
@@ -186,7 +186,7 @@ def _check_pictures(commit: Commit, name: str, advice: str) -> None:
 
 
 def picture_problems(location: Location, commits: Mapping[int, Commit]) -> Iterator[str]:
-    """Pictures that are missing or have another size. Whoever wants none may delete a whole folder of them."""
+    """Pictures that are missing or have another size. A user may delete the whole folder of pictures."""
     there = {
         f"{folder}/{name}": size
         for folder in ILLUSTRATIONS
@@ -230,11 +230,20 @@ def wrong_size(sizes: Mapping[str, int], key: str, length: int) -> str | None:
     return None if sizes[key] == length else f"has {sizes[key]} bytes; its commit says {length} bytes"
 
 
-def write_failure(root: Root, number: int, reason: str) -> None:
-    """Record why an episode was given up."""
+def write_failure(root: Root, number: int, reason: str, traceback: str = "") -> None:
+    """Record why an episode was given up. traceback: of its error, empty if its process died."""
     failure = {"run": root.identity, "episode": number, "episode_id": root.planned[number]["episode_id"]}
-    readable = reason.encode(errors="backslashreplace").decode()  # names of files may hold what is no character
-    create_once(root.location, f"{FAILED}/{number:08d}.json", {**failure, "reason": readable})
+    for name, text in (
+        ("reason", reason),
+        ("traceback", traceback),
+    ):  # names of files may hold what is no character
+        failure[name] = text.encode(errors="backslashreplace").decode()
+    create_once(root.location, failure_key(number), failure)
+
+
+def failure_key(number: int) -> str:
+    """Where the failure of episode `number` is stored in its run."""
+    return f"{FAILED}/{number:08d}.json"
 
 
 def read_failures(root: Root) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Hashes: what binds every object of a run to its place.
+"""Hashes that bind every object of a run to its place.
 
     run.json ── plan.json, zarr.json of every array
        └── commits ── the objects of their episode, their provenance
@@ -7,7 +7,7 @@
 `run.json` hashes the plan and the metadata; a commit hashes its objects and says whose it is; what is derived says
 from which commits. A record is JSON that carries the hash of all its other bytes, so that any change is seen.
 Every content has one spelling: a record in other bytes than `as_record` writes is damaged, whatever its hash says.
-Hashes find accidents, whatever they look like. They stop nobody who computes them anew: see `docs/storage.md`.
+Hashes detect accidents. They are no protection against an attacker who recomputes them: see `docs/storage.md`.
 """
 
 import json

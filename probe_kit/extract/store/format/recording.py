@@ -1,4 +1,4 @@
-"""A store that remembers the sum of everything that is written through it."""
+"""A store that records the hash of everything written through it."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Pieces of work that is not finished: arrays that know whose they are, from which the same command continues."""
+"""Partial results of unfinished work: arrays with the key of their owner, from which the same command resumes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The root of a run: `run.json`, and what it vouches for.
+"""The root of a run: `run.json`, and the objects whose hashes it holds.
 
 It carries settings and streams, the hashes of the plan and of every array's metadata, and its own hash, which is
 the run's identity: commits name it, so that none counts in another run.

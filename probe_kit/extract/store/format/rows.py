@@ -1,4 +1,4 @@
-"""Reading the row store: what was captured in one episode, and tokens by role."""
+"""Reading of the row store: the activations of one episode, and tokens by role."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

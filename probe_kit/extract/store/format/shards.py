@@ -1,4 +1,4 @@
-"""Where the inner chunks of a shard lie: what Zarr's index at the end of every shard says."""
+"""Positions of the inner chunks of a shard, from the index that Zarr writes at the end of every shard."""
 
 import numpy as np
 

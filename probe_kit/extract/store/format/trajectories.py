@@ -1,4 +1,4 @@
-"""Trajectories in a run: one array beside the streams, one chunk per episode, named by the episode's commit.
+"""Trajectories in a run: one array beside the streams, one chunk per episode, named in the episode's commit.
 
     data.zarr/trajectory   float32 (episode, frame, channel); frames behind the end of an episode are not numbers
 

@@ -1,4 +1,4 @@
-"""Verifying a run: everything that the root and the commits promise is compared with what is stored."""
+"""Verification of a run: everything that the root and the commits list is compared with what is stored."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Audit:
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
     deep: whether every byte was read, not only sizes. strays: objects that belong to no part of the run and that
-    nothing reads, such as copies that somebody made.
+    nothing reads, such as copies made by hand.
     """
 
     path: str

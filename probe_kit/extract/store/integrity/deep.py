@@ -1,4 +1,4 @@
-"""The deep half of verifying a run: every byte against its hash, and the columns against the rows."""
+"""Deep verification of a run: every byte against its hash, and the columns against the rows."""
 
 import os
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Objects in a run that nothing reads: everything that the root does not lead to."""
+"""Orphaned objects of a run: those that the root does not lead to."""
 
 from collections.abc import Iterator, Mapping
 
@@ -12,7 +12,7 @@ from probe_kit.extract.store.format.root import Root
 
 
 def stray_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None, stamp: str) -> list[str]:
-    """Keys of all objects that no hash covers; pictures that nobody promised are neither read nor told."""
+    """Keys of all objects that no hash covers, without pictures that no commit names."""
     known = set(known_keys(root, commits, columns, stamp))
     return [key for key in root.location.keys("") if key not in known and not _expected(key)]
 

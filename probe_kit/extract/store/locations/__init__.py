@@ -1,1 +1,1 @@
-"""Where a run lies: a folder, or a prefix in an object store."""
+"""Locations of runs: folders and prefixes in object stores."""

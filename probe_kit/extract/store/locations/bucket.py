@@ -225,9 +225,8 @@ class Bucket(Location):
         for key, length in lengths.items():
             if (found := there.get(key, 0)) != length:
                 raise StoreError(
-                    f"{self} took {length:,} bytes of {key}, said that all was well, and holds {found:,}. "
-                    "Nothing was committed that needs it. See what is wrong with the store; then the same command "
-                    "continues"
+                    f"{self} confirmed {length:,} bytes of {key} and holds {found:,}. No commit depends on "
+                    "it. Check the store, then run the same command to resume"
                 )
 
     def _lengths(self, keys: Iterable[str]) -> dict[str, int]:
@@ -323,12 +322,12 @@ class Bucket(Location):
 
     @contextmanager
     def one_at_a_time(self) -> Iterator[None]:
-        """Nobody waits: whoever is second writes the same bytes once more."""
+        """No lock: a second process writes the same bytes once more."""
         yield
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - nothing lies aside in an object store
-        """Nobody waits: files of other content have other names, and the last head counts."""
+        """No lock: files of other content have other names, and the last head counts."""
         yield
 
     def derived(self, folder: str, stamp: str) -> str:
@@ -337,7 +336,7 @@ class Bucket(Location):
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """In its final place, which nobody reads before its stamp is written, and as if nothing were there.
+        """In its final place, which is not read before its stamp is written, and as if nothing were there.
 
         Two processes that build it at once write the same bytes, and neither removes what the other wrote.
         """

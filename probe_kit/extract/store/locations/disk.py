@@ -1,4 +1,4 @@
-"""Disk space: a run that cannot fit is refused before it begins."""
+"""Disk space: a run that cannot fit is refused before it starts."""
 
 from collections.abc import Mapping
 

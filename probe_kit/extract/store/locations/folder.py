@@ -1,4 +1,4 @@
-"""A folder on this machine, or on a file system it shares, as the location of a run."""
+"""A folder on this machine, or on a shared file system, as the location of a run."""
 
 import errno
 import fcntl
@@ -178,7 +178,7 @@ class Folder(Location):
     def held(self, clear: Callable[[], None]) -> Iterator[None]:
         """Every process that works holds a shared lock, so only one that finds itself alone may clear.
 
-        What looks like a leftover could be another's work in progress. Whoever is alone at the end clears what
+        An apparent leftover may be another process's work. The last process to finish removes what
         others left that were killed meanwhile.
         """
         with (self._path / RUN_FILE).open("rb") as file:
@@ -219,7 +219,7 @@ class Folder(Location):
 
     @contextmanager
     def one_at_a_time(self) -> Iterator[None]:
-        """By locks; that of the run as well, so that nobody takes the work for a leftover."""
+        """By locks; also that of the run, so that no process removes the work as a leftover."""
         with (self._path / RUN_FILE).open("rb") as run, (self._path / PLAN_FILE).open("rb") as turn:
             fcntl.flock(run, fcntl.LOCK_SH)
             fcntl.flock(turn, fcntl.LOCK_EX)
@@ -229,7 +229,7 @@ class Folder(Location):
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
-        """By a lock on the folder itself, so whatever lies aside there is nobody's any more."""
+        """By a lock on the folder itself, so that drafts in it have no owner any more."""
         path = self._path / folder
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""Finding the location of a run from what the user called it."""
+"""The location of a run, from the path or URL that the user gave."""
 
 from pathlib import Path
 

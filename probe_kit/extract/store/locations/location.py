@@ -1,8 +1,8 @@
-"""A location: where a run lies, a folder here or a prefix in an object store, and the few things a run asks of it.
+"""A location: the folder or object-store prefix of a run, and the operations that a run needs.
 
-Everything in a run is an object with a key such as `commits/00000003.json`. Whoever reads or writes one goes
-through its location; what folders and object stores do differently (locks, renaming, free space) is decided
-in `folder` and `bucket`, and nowhere else.
+Everything in a run is an object with a key such as `commits/00000003.json`. All reads and writes of objects go
+through its location; differences between folders and object stores (locks, renaming, free space) are handled
+in `folder` and `bucket` only.
 """
 
 from abc import ABC, abstractmethod
@@ -39,7 +39,7 @@ class Location(ABC):
 
     @abstractmethod
     def beside(self, name: str) -> Path:
-        """Where a file made from the run goes unless told otherwise."""
+        """Default path of a file that is made from the run."""
 
     @abstractmethod
     def free_bytes(self) -> int | None:
@@ -148,7 +148,7 @@ class Location(ABC):
 
     @abstractmethod
     def held(self, clear: Callable[[], None]) -> AbstractContextManager[None]:
-        """Hold the run while the body runs. Whoever begins alone calls `clear` and removes leftovers first."""
+        """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers."""
 
     @abstractmethod
     def one_at_a_time(self) -> AbstractContextManager[None]:

@@ -1,4 +1,4 @@
-"""What stands between Zarr and an object store."""
+"""The object-store client beneath Zarr: retries, time limits and errors."""
 
 import asyncio
 import time

@@ -1,4 +1,4 @@
-"""A run in one line and as a notebook shows it; and which runs a folder that is none holds."""
+"""A run in one line and as a notebook table; and the runs that a folder contains."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -34,7 +34,7 @@ class Summarised(Protocol):
 
     @property
     def random_weights(self) -> bool:
-        """Whether nobody trained them."""
+        """Whether the weights are random."""
 
     @property
     def suite(self) -> str:

@@ -12,10 +12,10 @@ _BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "bridge": _BLOCK, "expert": QUANTITIES, "expert_unconditional": QUANTITIES},
     instead={
-        "kv": "its queries read hidden states of the backbone and DINOv2's features, no keys and values. What "
-        "acts reads one thing only, the end of the bridge: exchange the last `bridge` site for the whole, and "
-        "backbone sites for what passes through the language model",
-        "attention": "its expert attends to the queries' findings only, not to the backbone. Exchange backbone "
+        "kv": "its queries read hidden states of the backbone and DINOv2's features, no keys and values. The "
+        "acting head reads only the end of the bridge: patch the last `bridge` site for the whole, and backbone "
+        "sites for what passes through the language model",
+        "attention": "its expert attends to the queries only, not to the backbone. Patch backbone "
         "sites of one role instead",
         "tiles": f"{MERGED}Exchange all of `image`",
     },

@@ -137,7 +137,7 @@ class InternVLA(QwenVLA):
         )
 
     def _units_or_reason(self) -> ActionUnits | str:
-        """The statistics, or why there are none: a checkpoint without them can be captured, and cannot act."""
+        """The statistics, or why there are none: a checkpoint without them can be captured and cannot act."""
         try:
             return self.units
         except CheckpointError as error:

@@ -1,4 +1,4 @@
-"""Finding the parts of an InternVLA-M1 checkpoint, which lie apart, and reading them without running anything.
+"""The files of an InternVLA-M1 checkpoint, which are in several places, read without executing code.
 
 A release is a run's folder: `config.yaml`, `dataset_statistics.json`, and the weights as
 `checkpoints/steps_<n>_pytorch_model.pt`. Configuration and tokenizer of the vision-language model lie elsewhere.

@@ -1,4 +1,4 @@
-"""One folder of safetensors instead of a pickled file, its run's folder and a vision-language model's.
+"""Conversion of a pickled InternVLA-M1 checkpoint to one folder of safetensors.
 
     python -m probe_kit.hooks.families.internvla.convert RUN OUT
 

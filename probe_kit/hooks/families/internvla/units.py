@@ -1,4 +1,4 @@
-"""InternVLA-M1's actions: from the head's numbers to the units of a data set."""
+"""InternVLA-M1's actions: from the head's output to the units of a data set."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

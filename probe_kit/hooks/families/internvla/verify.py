@@ -1,4 +1,4 @@
-"""What InternVLA-M1 can be compared in, under the names of its golden references.
+"""Quantities in which InternVLA-M1 is compared with its golden references.
 
 B batch, V views, P prompt positions, L backbone layers, S DDIM steps, C conditions, A actions of a chunk.
 """

@@ -1,4 +1,4 @@
-"""The adapter for Magma: its chat, its actions as tokens, its answers in text.
+"""The adapter for Magma: chat template, actions as tokens, answers in text.
 
 Sequence: beginning, system and user turn with the picture's tokens in place of one placeholder, the header of the
 assistant's turn. Seven tokens follow, one per dimension, then the end of the turn; iteration k of the stream

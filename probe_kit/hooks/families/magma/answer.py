@@ -1,4 +1,4 @@
-"""An answer in text, as far as it has been spoken."""
+"""A text answer of Magma, decoded token by token."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from probe_kit.models.magma import Decoded, greedy
 
 
 class Answer:
-    """The tokens of an answer so far, one (B,) tensor each, and where to go on."""
+    """The tokens of an answer so far, one (B,) tensor each, and the state from which decoding continues."""
 
     def __init__(self, decoded: Decoded) -> None:
         self.ids: list[Tensor] = list(decoded.ids.unbind(dim=1))

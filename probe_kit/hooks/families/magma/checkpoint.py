@@ -1,4 +1,4 @@
-"""Loading Magma checkpoints: every weight from the file, the layer scales above all, and random twins."""
+"""Loading of Magma checkpoints, with every layer scale from the file, and of random weights."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Magma's chat as ids, from the checkpoint's own `tokenizer.json`, and which of them are the question."""
+"""Magma's chat as token ids, from the checkpoint's `tokenizer.json`, with the positions of the question."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class TokenPrompt:
 
 @dataclass(frozen=True)
 class ChatText:
-    """Speaks with Magma: frames, picture placeholder, question.
+    """Magma's chat template: header tokens, image placeholder, question.
 
     user_first: the user's turn stands before the system's, as Act2Answer's release has it.
     """
@@ -145,7 +145,7 @@ class ChatText:
         before, behind = (self.prompt(question, text, pictured).ids for text in (begun, begun + option))
         if len(behind) == len(before) or behind[: len(before)] != before:
             raise UsageError(
-                f"the option {option!r} melts into the end of the prompt: {list(behind[len(before) - 2 :])} "
+                f"the option {option!r} merges with the end of the prompt: {list(behind[len(before) - 2 :])} "
                 f"instead of {list(before[-2:])} and more. Give it as it stands behind the prompt"
             )
         return int(behind[len(before)])

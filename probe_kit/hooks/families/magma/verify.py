@@ -1,4 +1,4 @@
-"""What Magma can be compared in, under the names of its golden references.
+"""Quantities in which Magma is compared with its golden references.
 
 B batch, S positions, L blocks, N output tokens. References come without a tokenizer; `action_config.json` beside
 the checkpoint holds what the original processor and evaluation client know.

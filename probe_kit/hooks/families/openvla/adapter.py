@@ -1,4 +1,4 @@
-"""The adapter for OpenVLA: its prompt, its actions as tokens, the units of the data it was trained on.
+"""The adapter for OpenVLA: prompt, actions as tokens, units of its training data.
 
 Sequence: beginning, 256 patches, "In: What action should the robot take to …?\nOut:" and one empty token. Seven
 greedy tokens follow, one per dimension; iteration k of the stream `action` is the position that chooses the k-th.

@@ -1,4 +1,4 @@
-"""What OpenVLA can be compared in beyond its vision-language model: its prompt and its actions."""
+"""Quantities in which OpenVLA is compared with its golden references, beyond those of Prismatic."""
 
 from functools import partial
 from pathlib import Path

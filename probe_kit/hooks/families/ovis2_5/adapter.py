@@ -1,4 +1,4 @@
-"""The adapter for Ovis2.5: Qwen's chat without a system turn, the answer begun with an empty thought."""
+"""The adapter for Ovis2.5: Qwen's chat without a system turn, and an empty thought before the answer."""
 
 from collections.abc import Mapping
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""PaliGemma, on transformers' own network, and the embedded reader, which is one at 0.61 million parameters."""
+"""PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
 
 from probe_kit.hooks.contract.default_scene import RELEASED
 from probe_kit.hooks.contract.options import Option

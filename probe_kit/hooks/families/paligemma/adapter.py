@@ -1,4 +1,4 @@
-"""The adapter for PaliGemma: picture, beginning of sequence, question, newline. The prompt attends both ways."""
+"""The adapter for PaliGemma: image, beginning of sequence, question, newline, with bidirectional attention."""
 
 from collections.abc import Mapping
 from dataclasses import replace

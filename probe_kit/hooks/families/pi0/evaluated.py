@@ -1,4 +1,4 @@
-"""pi0 as its evaluation feeds it: the settings of older files, units, pictures and states that no file decides."""
+"""pi0's evaluation: settings of older files, units, pictures and states that no checkpoint file contains."""
 
 import json
 import tempfile

@@ -1,4 +1,4 @@
-"""`config.json` of pi0 as lerobot wrote it in early 2025, brought to what lerobot 0.6 reads.
+"""`config.json` of pi0 as lerobot wrote it in early 2025, converted to what lerobot 0.6 reads.
 
 That lerobot kept statistics among the weights or left them to the evaluation; it padded pictures on the left and
 top.
@@ -30,14 +30,14 @@ def current_config(
 
     known: fields that lerobot reads today. source: where the config lies, for messages. unread: fields that are
     left out because the caller says that they change nothing.
-    Raises CheckpointError for a setting that is no longer carried out, and for a field that nobody knows: it may
+    Raises CheckpointError for a setting that is no longer supported, and for an unknown field: it may
     change the numbers.
     """
     wrong = {name: config[name] for name, value in _FIXED.items() if config.get(name, value) != value}
     if wrong:
         raise CheckpointError(
             f"{source} asks for {', '.join(f'{name}={value}' for name, value in wrong.items())}, which changes "
-            "states and actions and is not carried out here; use a checkpoint without it"
+            "states and actions and is not supported; use a checkpoint without it"
         )
     dropped = {*_WITHOUT_EFFECT, *_FIXED, *unread}
     found = {_RENAMED.get(name, name): value for name, value in config.items() if name not in dropped}
@@ -45,7 +45,7 @@ def current_config(
         del found["image_resolution"]  # pictures as they are given; they are given at today's default
     if unknown := sorted(set(found) - {*known, "type"}):
         raise CheckpointError(
-            f"{source} has settings that nobody here knows: {', '.join(unknown)}. If they change nothing that a "
+            f"{source} has unknown settings: {', '.join(unknown)}. If they change nothing that a "
             f"picture, a state or an action depends on, accept them with -M unread={','.join(unknown)}"
         )
     return found

@@ -1,4 +1,4 @@
-"""What pi0 can be compared in: see `lerobot_verify`."""
+"""Quantities in which pi0 is compared with its golden references: see `shared.lerobot.verify`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Loading Prismatic and OpenVLA checkpoints: plain folders, LoRA adapters on top of one, random twins."""
+"""Loading of Prismatic and OpenVLA checkpoints: plain folders, LoRA adapters, random weights."""
 
 import json
 from collections.abc import Mapping

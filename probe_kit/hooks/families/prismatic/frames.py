@@ -1,4 +1,4 @@
-"""What Prismatic models were trained to find around a question: by language model, as prismatic-vlms frames it.
+"""Prompt templates of Prismatic models, by language model, as in prismatic-vlms.
 
 Without the space behind it, which the original strips from every prompt before it is read.
 """

@@ -1,4 +1,4 @@
-"""LoRA adapters: read, checked against the network, merged into its weights through peft."""
+"""LoRA adapters: read, checked against the network, and merged into its weights by peft."""
 
 import json
 from dataclasses import dataclass

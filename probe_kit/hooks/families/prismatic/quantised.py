@@ -1,4 +1,4 @@
-"""Running the language model in 8 or 4 bits through bitsandbytes: for GPUs too small, and never exact."""
+"""The language model in 8 or 4 bits through bitsandbytes: for small GPUs; numbers are not exact."""
 
 from typing import TYPE_CHECKING, Any
 

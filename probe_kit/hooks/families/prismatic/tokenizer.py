@@ -1,4 +1,4 @@
-"""Text to ids, from the checkpoint's own `tokenizer.json`.
+"""Text to ids with the checkpoint's `tokenizer.json`.
 
 Read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own, while the
 released models were trained with what the file says.
@@ -44,7 +44,7 @@ def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
     before, whole = tokenizer.encode(prompt), tokenizer.encode(prompt + answer)
     if whole[: len(before)] != before or len(whole) == len(before):
         raise UsageError(
-            f"the answer {answer!r} melts into the end of the prompt: {whole[len(before) - 2 :]} instead of "
+            f"the answer {answer!r} merges with the end of the prompt: {whole[len(before) - 2 :]} instead of "
             f"{before[len(before) - 2 :]} and more. Give the option as it stands behind the prompt, such as ' A'"
         )
     return whole[len(before)]

@@ -1,4 +1,4 @@
-"""What Prismatic models can be compared in, under the names of their golden references.
+"""Quantities in which Prismatic models are compared with their golden references.
 
 B batch, P patches, T text tokens, S = P + T positions, L blocks, N output tokens.
 """

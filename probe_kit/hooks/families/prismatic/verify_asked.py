@@ -1,4 +1,4 @@
-"""What Prismatic can be compared in when it was recorded answering questions.
+"""Quantities in which Prismatic is compared with references recorded from answers to questions.
 
 B rows, T text tokens, P patches, L blocks, D width. Recorded rows were read alone and are padded in front; ids are
 recorded without the picture's positions and padded behind.

@@ -1,4 +1,4 @@
-"""How families tell the weights of their attention without changing a number of the inference."""
+"""Recording of attention weights without changing a number of the inference."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager

@@ -1,4 +1,4 @@
-"""What families of one kind support of the interventions. Imports no torch."""
+"""Interventions that families of one kind support. Imports no torch."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ TOKENS = Interventions(
 )
 """One decoder reads the prompt and puts out tokens; the prompt's own pass chooses the first of them."""
 
-MERGED = "it merges patches on their way to the backbone, and which of them end in which token is not told here. "
+MERGED = "it merges patches on their way to the backbone, and does not report which token they become. "
 """Why a family does not say what tile a token is of."""
 MAPS = replace(
     TOKENS,

@@ -1,4 +1,4 @@
-"""What verifiers of native families share: outputs of modules beyond the sites, and tapes as arrays."""
+"""Outputs of modules beyond the sites, and captures as arrays, for the verification of native families."""
 
 from contextlib import ExitStack
 from typing import Any

@@ -1,4 +1,4 @@
-"""Filling a native network that holds a Qwen vision-language model: from files, or as a seeded random twin."""
+"""Loading of native networks that contain a Qwen vision-language model: from files or seeded random weights."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the families share whose acting part reads keys and values of the prompt: see `Model.prompt_kv`."""
+"""Keys and values of the prompt, for families whose acting part reads them: see `Model.prompt_kv`."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from probe_kit.models.prompt_kv import PromptKV
 
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
-"""Where the last token of the prompt already acts: its keys and values are not the backbone's."""
+"""Models whose last prompt token belongs to the acting stream: its keys and values are not the backbone's."""
 
 
 def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:

@@ -1,4 +1,4 @@
-"""How output tokens are chosen: the likeliest, or drawn as evaluations draw them, but from our seeds."""
+"""Choice of output tokens: greedy, or sampled as evaluations do but with fixed seeds."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""Units that an evaluation's statistics file gives: quantiles p01 and p99 of states and actions, as INT-ACT's."""
+"""Units from an evaluation's statistics file: quantiles p01 and p99 of states and actions, as in INT-ACT."""
 
 import hashlib
 import json
@@ -70,7 +70,7 @@ class StatisticsFile:
         try:
             values = json.loads(content)
         except ValueError as error:
-            raise CheckpointError(f"the statistics {name} are no JSON ({error})") from error
+            raise CheckpointError(f"the statistics {name} are not JSON ({error})") from error
         if not isinstance(values, dict):
             raise CheckpointError(f"the statistics {name} are a {type(values).__name__}; expected an object")
         return cls(name, hashlib.sha256(content).hexdigest(), values)

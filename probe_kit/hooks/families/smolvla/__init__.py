@@ -14,7 +14,7 @@ FAMILIES = (
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
         notes=(
             "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
-            "be captured (--no-act); to act here it needs a fine-tune for end-effector deltas"
+            "be captured without acting (--no-act); to act it needs a fine-tune for end-effector deltas"
         ),
         verifier="probe_kit.hooks.families.smolvla.verify:verify_smolvla",
         config_types=("smolvla",),

@@ -1,4 +1,4 @@
-"""What SmolVLA can be compared in: see `lerobot_verify`."""
+"""Quantities in which SmolVLA is compared with its golden references: see `shared.lerobot.verify`."""
 
 from pathlib import Path
 

@@ -25,7 +25,7 @@ FAMILIES = (
             Option("lowercase", bool, "Instruction in lower case, as in training.", "true"),
             Option("camera", str, "scene, or a data set of the checkpoint whose camera is taken for it.", "scene"),
             Option(
-                "iterations", str, "Tokens captured: of a step (3) or of the chunk.", "step", ("step", "chunk")
+                "iterations", str, "Captured tokens: of a step (3) or of the chunk.", "step", ("step", "chunk")
             ),
             Option("constrained", bool, "Decode every token within its slot; not the original's way.", "false"),
             Option("ensemble", bool, "Average the plans of overlapping chunks, the newest most.", "false"),

@@ -1,7 +1,7 @@
 """The adapter for SpatialVLA: packing, streams, taps, roles, cameras, actions.
 
-Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack serves two streams, told
-apart by position: `backbone` is the prompt without the new line, `action` the positions whose logits choose an
+Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack has two streams,
+by position: `backbone` is the prompt without the new line, `action` the positions whose logits choose an
 action token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
 """
 
@@ -59,7 +59,7 @@ _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 class SpatialVLA(Policy):
     """A loaded SpatialVLA.
 
-    steps: greedy tokens per inference. heard: how many of them the stream `action` has.
+    steps: greedy tokens per inference. heard: how many of them the stream `action` captures.
     """
 
     family: ClassVar[str] = "spatialvla"
@@ -336,7 +336,7 @@ def load_spatialvla(
     unnorm_key: data set whose units the actions get; default bridge_orig/1.0.0, or the only one there is. prompt:
     `bare`, `question` or a template with {instruction}. lowercase: the instruction as in training. camera: `scene`
     for the observation's intrinsics, or a data set of the checkpoint whose camera is taken for the scene's.
-    iterations: listen to the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
+    iterations: capture the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
     within its slot, which the original does not. ensemble: average the plans of overlapping chunks. tokenizer:
     folder of another tokenizer, or `bytes`.
     Raises UsageError, and what `load_checkpoint` raises.

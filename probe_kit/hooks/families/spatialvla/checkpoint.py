@@ -1,4 +1,4 @@
-"""Loading SpatialVLA checkpoints: the released ones, their fine-tunes in the same layout, random twins."""
+"""Loading of SpatialVLA checkpoints: released ones, fine-tunes in the same layout, random weights."""
 
 import json
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What SpatialVLA is told: places for the picture, the instruction as it was trained with it, a new line."""
+"""SpatialVLA's prompt: image placeholders, the instruction as in training, a new line."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,6 +67,6 @@ class Speech:
             )
         if ids[-1:] != self.tokenizer.encode(_END)[-1:]:
             raise InstructionError(
-                f"the end of {text!r} melts into the new line behind it; leave out white space there"
+                f"the end of {text!r} merges with the new line behind it; leave out white space there"
             )
         return [self.config.image_token] * self.config.patches + ids

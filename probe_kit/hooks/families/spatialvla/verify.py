@@ -1,4 +1,4 @@
-"""What SpatialVLA can be compared in, under the names of its golden reference.
+"""Quantities in which SpatialVLA is compared with its golden reference.
 
 B batch, P patches, T prompt tokens with the picture's, L blocks, N output tokens.
 """

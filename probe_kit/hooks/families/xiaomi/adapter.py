@@ -134,7 +134,7 @@ class Xiaomi(QwenVLA):
     # -- the robot ---------------------------------------------------------------------------------------
 
     def _units_or_reason(self) -> ActionUnits | str:
-        """The statistics, or why there are none: a checkpoint without them can be captured, and cannot act."""
+        """The statistics, or why there are none: a checkpoint without them can be captured and cannot act."""
         if self._robot is not None:
             return self.units
         try:

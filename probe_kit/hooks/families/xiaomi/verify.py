@@ -1,4 +1,4 @@
-"""What Xiaomi-Robotics-R0 can be compared in, under the names of its golden references.
+"""Quantities in which Xiaomi-Robotics-R0 is compared with its golden references.
 
 B batch, P prompt positions, L backbone layers, T expert positions, S Euler steps.
 """

@@ -1,4 +1,4 @@
-"""Sets in Act2Answer's own format: `pairs.json`, `model_db.json` and a GLB per tile, taken over as they are."""
+"""Converter of sets in Act2Answer's format: `pairs.json`, `model_db.json` and a GLB per tile."""
 
 import re
 import warnings
@@ -55,7 +55,7 @@ def convert_set(
     if options.tile_yaw not in YAWS:
         raise UsageError(f"tile_yaw is {options.tile_yaw}; expected one of {', '.join(map(str, YAWS))} degrees")
     if not root.is_dir():
-        raise UsageError(f"{SOURCE}: {root} is no folder. {REMEDY}")
+        raise UsageError(f"{SOURCE}: {root} is not a folder. {REMEDY}")
     category = _category(root, categories)
     check_foreign_folder(out)
     pairs = read_pairs(root)

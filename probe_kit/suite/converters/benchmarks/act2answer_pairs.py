@@ -1,4 +1,4 @@
-"""The questions of a set in Act2Answer's own format: `pairs.json`, and what its release would misread there."""
+"""The questions of a set in Act2Answer's format: `pairs.json`, with checks of what its release would misread."""
 
 from dataclasses import dataclass
 from operator import attrgetter

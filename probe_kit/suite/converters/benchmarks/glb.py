@@ -1,4 +1,4 @@
-"""A tile of Act2Answer as a viewer sees it: the texture of what faces up, turned as its mesh says."""
+"""A tile of Act2Answer as the camera sees it: the texture of its upper face, rotated as the mesh requires."""
 
 import struct
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ _UNREADABLE = (
 
 @dataclass(frozen=True)
 class Tile:
-    """picture: RGB on white, as seen by somebody in front of the tile. size: its x, y and z extent in metres."""
+    """picture: RGB on white, as seen from in front of the tile. size: its x, y and z extent in metres."""
 
     picture: Image.Image
     size: tuple[float, float, float]
@@ -57,7 +57,7 @@ def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
         scene = trimesh.load_scene(path, process=False)
         meshes = list(_meshes(scene))
     except _UNREADABLE as problem:
-        raise SuiteError(f"{path} is no binary glTF ({problem!r}). Check out the assets again.") from problem
+        raise SuiteError(f"{path} is not a binary glTF ({problem!r}). Check out the assets again.") from problem
     if not meshes:
         raise SuiteError(f"{path} holds no mesh. Check out the assets again.")
     every = np.concatenate([points for points, _ in meshes])

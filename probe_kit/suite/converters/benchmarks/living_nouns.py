@@ -1,4 +1,4 @@
-"""Animals and plants that an OK-VQA answer may name, by kind, and what COCO calls those it can box."""
+"""Animals and plants that an OK-VQA answer may name, by kind, with their COCO classes."""
 
 _SINGLE_WORDS = {
     "dog breed": "labrador poodle beagle collie dachshund bulldog pug terrier husky chihuahua dalmatian corgi "

@@ -1,4 +1,4 @@
-"""MMBench: named people, for Celebrity. Real faces: made only on request."""
+"""MMBench: named people, for Celebrity. It shows real faces, so it is converted only on request."""
 
 import base64
 import binascii
@@ -110,7 +110,9 @@ def _candidate(
         raise SuiteError(f"{SOURCE}: {where}: no answer. TEST files are scored on a server; use {_FILES[0]}.")
     name = (row.get(answer) or "").strip()
     if answer not in "ABCD" or not name:
-        raise SuiteError(f"{SOURCE}: {where}: answer is {answer!r}, which is no option. Download the file again.")
+        raise SuiteError(
+            f"{SOURCE}: {where}: answer is {answer!r}, which is not an option. Download the file again."
+        )
     wording = rewrite(row["question"], name, options_are_names=True)
     if wording is None or wording.rule_id != "R10":
         reading.reasons["not an identity question"] += 1

@@ -132,7 +132,7 @@ def _repaint(board: Path, color: str) -> Image.Image:
 def upright_board(path: Path) -> Image.Image:
     """The art of one board. Textures are stored with rows and columns exchanged: as such, STOP reads backwards.
 
-    Raises SuiteError if the file is no binary glTF with one embedded picture.
+    Raises SuiteError if the file is not a binary glTF with one embedded picture.
     """
     texture = _texture(path).transpose(Image.Transpose.TRANSPOSE)
     if texture.has_transparency_data:
@@ -163,7 +163,7 @@ def _texture(path: Path) -> Image.Image:
             return image
     except _UNREADABLE as problem:
         raise SuiteError(
-            f"{SOURCE}: {path} is no glTF with an embedded picture ({problem!r}). Check out the assets again."
+            f"{SOURCE}: {path} is not a glTF with an embedded picture ({problem!r}). Check out the assets again."
         ) from problem
 
 

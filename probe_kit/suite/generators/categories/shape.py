@@ -1,4 +1,4 @@
-"""Shape: "triangle" against another outline that cannot be mistaken for it."""
+"""Shape: "triangle" against another, clearly different outline."""
 
 from itertools import combinations
 

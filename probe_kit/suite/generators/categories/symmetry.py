@@ -1,4 +1,4 @@
-"""Symmetry: "symmetric shape" against an asymmetric one of the same make, and the other way round.
+"""Symmetry: "symmetric shape" against an asymmetric one of the same kind, and vice versa.
 
 Both are polygons around an axis, with as many corners and as much area on either side of it; in the asymmetric
 one the half widths of one side have changed places. Measured on its pixels, each is clearly what it is called.

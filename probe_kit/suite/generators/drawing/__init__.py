@@ -1,1 +1,1 @@
-"""What the embedded categories draw."""
+"""Drawings of the embedded categories."""

@@ -1,4 +1,4 @@
-"""Ready-made art: small pictures rendered once by `scripts/build_suite_art.py` and shipped with their licences.
+"""Icons: small pictures rendered once by `scripts/build_suite_art.py` and shipped with their licences.
 
 `suite/art/` holds two sheets of 128 px cells, `fluent.png` in colour and `material.png` as grey masks, and
 `index.json` with the icon names in the order of the cells. `suite/art/NOTICE.md` says where they come from.

@@ -1,4 +1,4 @@
-"""A tile to draw on: plain coordinates, drawn three times too large and shrunk once.
+"""A canvas for tiles in plain coordinates, drawn at three times the size and reduced once.
 
 Drawings use *drawing units*: x to the right, y down, and everything inside the disk of radius 1.
 A `Placement` maps them to *tile units*: the tile spans -1 to 1 on both axes.

@@ -1,4 +1,4 @@
-"""What Living World shows: animals and plants by kind, and things that are not alive, each with its icon."""
+"""Concepts of Living World: animals and plants by kind, and lifeless things, each with its icon."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""A schematic face: what it feels is in its brows, lids and mouth, and in nothing else."""
+"""A schematic face whose emotion is drawn in brows, lids and mouth only."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Twelve small things to count, drawn from scratch to stay legible at a fifth of a tile."""
+"""Twelve small objects to count, legible at a fifth of a tile."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Things with one property that comes in degrees, each drawn at a level from 0 to 1."""
+"""Objects with one gradable property, each drawn at a level from 0 to 1."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Fifteen outlines as polygons of equal area, so that ink says nothing about which one it is."""
+"""Fifteen outlines as polygons of equal area, so that the area of ink does not identify the outline."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What Public Info shows: pictograms of services and of what is forbidden, each with its icon."""
+"""Concepts of Public Info: pictograms of services and prohibitions, each with its icon."""
 
 from dataclasses import dataclass
 

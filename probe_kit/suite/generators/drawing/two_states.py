@@ -1,4 +1,4 @@
-"""Things that are in one of two states, each drawn in either."""
+"""Objects with two states, each drawn in either."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

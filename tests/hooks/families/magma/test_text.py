@@ -75,7 +75,7 @@ def test_an_option_is_its_first_token_behind_the_prompt(folder: Path) -> None:
     spoken = text(folder)
     assert spoken.decode([spoken.option("A or B?", "", "B")]) == "B"
     assert spoken.option("A or B?", "", "Bad") == spoken.option("A or B?", "", "B")
-    with pytest.raises(UsageError, match="melts into the end of the prompt"):
+    with pytest.raises(UsageError, match="merges with the end of the prompt"):
         spoken.option("A or B?", "", "")
 
 

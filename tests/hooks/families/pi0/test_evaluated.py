@@ -139,7 +139,7 @@ def test_shipped_statistics_are_those_of_the_bridge_data() -> None:
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        ("{", "are no JSON"),
+        ("{", "are not JSON"),
         ("[]", "are a list"),
         ("{}", "as none; this checkpoint needs 7"),
         ('{"action": {"p01": [0], "p99": [1]}, "proprio": {"p01": [0], "p99": [1]}}', r"\(1,\) and \(1,\)"),

@@ -60,7 +60,7 @@ def test_an_instruction_cannot_smuggle_in_pictures_or_actions(tmp_path: Path, te
 
 
 def test_a_new_line_that_melts_into_the_one_behind_it_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InstructionError, match="melts into the new line"):
+    with pytest.raises(InstructionError, match="merges with the new line"):
         speech(tmp_path).prompt("put the cube on the star\n")
 
 

@@ -99,6 +99,6 @@ def test_tiles_that_show_no_single_picture_are_refused(
 def test_files_that_are_no_tiles_are_named(tmp_path: Path) -> None:
     broken = tmp_path / "broken.glb"
     broken.write_bytes(write_tile(tmp_path / "tile.glb", art(6)).read_bytes()[:900])
-    for path, complaint in ((broken, "is no binary glTF"), (tmp_path / "absent.glb", "not found")):
+    for path, complaint in ((broken, "is not a binary glTF"), (tmp_path / "absent.glb", "not found")):
         with pytest.raises(SuiteError, match=complaint):
             read_tile(path)

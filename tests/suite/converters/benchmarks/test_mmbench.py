@@ -46,7 +46,7 @@ def test_two_names_for_one_picture_never_meet_and_share_a_group(mmbench_root: Pa
     [
         ("\tcategory\t", "\tkind\t", "lacks category"),
         ("\tA\tcelebrity", "\t\tcelebrity", "row with index 0 .*: no answer"),
-        ("\tA\tcelebrity", "\tC\tcelebrity", "answer is 'C', which is no option"),
+        ("\tA\tcelebrity", "\tC\tcelebrity", "answer is 'C', which is not an option"),
         ("B\tcelebrity_recognition\t0\t", "B\tcelebrity_recognition\t77\t", "its picture is in row '77'"),
         ("\n0\t", "\nzero\t", "row 2 of .*: index is 'zero'"),
     ],

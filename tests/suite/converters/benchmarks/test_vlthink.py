@@ -85,7 +85,7 @@ def test_real_signs_of_the_laundry_are_made_on_request(real: Path, tmp_path: Pat
 def test_a_board_that_is_no_gltf_is_named(vlthink_root: Path, tmp_path: Path) -> None:
     (path,) = vlthink_root.rglob("*noentry/textured.glb")
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(SuiteError, match=r"noentry.textured\.glb is no glTF with an embedded picture"):
+    with pytest.raises(SuiteError, match=r"noentry.textured\.glb is not a glTF with an embedded picture"):
         convert("vl-think", vlthink_root, tmp_path / "suite", categories=["traffic"])
     assert not (tmp_path / "suite").exists()
 

@@ -1,1 +1,1 @@
-"""What lerobot's flow policies share."""
+"""Code that lerobot's flow policies share."""

@@ -1,4 +1,4 @@
-"""What an evaluation does around a checkpoint: picture, state, statistics that no file decides."""
+"""Evaluation settings that no checkpoint file contains: image size, state layout, statistics."""
 
 from dataclasses import dataclass
 from typing import Literal

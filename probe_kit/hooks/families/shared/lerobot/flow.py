@@ -1,4 +1,4 @@
-"""What the adapters of lerobot's flow-matching policies share: loading, batches, noise, units, taps.
+"""Base adapter of lerobot's flow-matching policies: loading, batches, noise, units, taps.
 
 Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
 """
@@ -102,7 +102,7 @@ class LerobotFlow(Policy):
     @classmethod
     @abstractmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
-        """The network with weights nobody should use yet."""
+        """The network with uninitialised weights."""
 
     @classmethod
     @abstractmethod
@@ -126,7 +126,7 @@ class LerobotFlow(Policy):
     @property
     @abstractmethod
     def masked_cameras(self) -> int:
-        """Cameras without a picture that take positions all the same, masked, behind the shown ones."""
+        """Cameras without a picture that still occupy positions, masked, after the shown ones."""
 
     @property
     @abstractmethod

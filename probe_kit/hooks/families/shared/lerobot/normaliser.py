@@ -1,4 +1,4 @@
-"""Normalisation with the statistics of a lerobot checkpoint: in processor files or, until 2025, in its weights."""
+"""Normalisation with the statistics of a lerobot checkpoint, from processor files or, until 2025, weights."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -156,7 +156,7 @@ def from_buffers(
     missing = [name for name in names if name not in buffers]
     unfilled = [name for name in names if name in buffers and not np.isfinite(buffers[name]).all()]
     if missing or unfilled:
-        what = f"lack {', '.join(missing)}" if missing else f"hold {', '.join(unfilled)} that nobody filled"
+        what = f"lack {', '.join(missing)}" if missing else f"hold {', '.join(unfilled)} without values"
         raise CheckpointError(
             f"{source} has no policy_preprocessor.json and its weights {what}: its {feature} has no physical "
             "unit. Take the statistics of the data set it was trained on"

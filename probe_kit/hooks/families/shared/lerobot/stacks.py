@@ -1,4 +1,4 @@
-"""The transformer stacks of lerobot's flow policies, and where their sites are read."""
+"""The transformer stacks of lerobot's flow policies, and the modules of their sites."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

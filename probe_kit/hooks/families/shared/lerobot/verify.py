@@ -1,4 +1,4 @@
-"""What pi0 and SmolVLA can be compared in, under the names of their golden references.
+"""Quantities in which pi0 and SmolVLA are compared with their golden references.
 
 B batch, C cameras including empty ones, L layers, S flow-matching steps.
 """

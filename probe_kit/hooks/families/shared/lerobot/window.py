@@ -1,4 +1,4 @@
-"""The part of a picture a policy looks at: lerobot's crop-and-resize step, read from a checkpoint; other ways."""
+"""The image region that a policy sees: lerobot's crop-and-resize step, read from a checkpoint."""
 
 import json
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""What models on Qwen's vision-language models share."""
+"""Code that models on Qwen's vision-language models share."""

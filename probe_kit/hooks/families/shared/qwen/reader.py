@@ -1,4 +1,4 @@
-"""What the readers on Qwen's vision-language models share: pictures as patches, positions, taps."""
+"""Base adapter of Qwen's vision-language models: images as patches, positions, taps."""
 
 from functools import cached_property
 from typing import Any, ClassVar

@@ -1,4 +1,4 @@
-"""Text to ids with a Qwen checkpoint's own `tokenizer.json`, read as it is by the `tokenizers` library."""
+"""Text to ids with a Qwen checkpoint's `tokenizer.json`, read by the `tokenizers` library."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""What the adapters of policies on Qwen's vision-language models share: prompts, pictures, the backbone's taps."""
+"""Base adapter of policies on Qwen's vision-language models: prompts, images, the backbone's taps."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
 class QwenVLA(Policy):
     """A policy whose backbone is one of transformers' Qwen vision-language models.
 
-    Subclasses say what the model is shown and told, and what follows the backbone.
+    Subclasses define the model's inputs, and what follows the backbone.
     """
 
     fast_pictures: ClassVar[bool]

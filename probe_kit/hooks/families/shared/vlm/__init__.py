@@ -1,1 +1,1 @@
-"""What vision-language models that answer in text share."""
+"""Code that vision-language models with text answers share."""

@@ -1,6 +1,6 @@
-"""What the adapters of vision-language models that answer in text share: packing, reading, speaking, taps, roles.
+"""Base adapter of vision-language models with text answers: packing, prefill, decoding, taps, roles.
 
-One stack serves two streams, told apart by position: `backbone` is the prompt without its last position, `answer`
+One stack has two streams, distinguished by position: `backbone` is the prompt without its last position, `answer`
 the last one, whose logits choose the first token of the answer. Padding stands in front of every row.
 """
 

@@ -1,4 +1,4 @@
-"""A prompt that was read, and what is said behind it token by token.
+"""Token-by-token decoding after the prefill of a prompt.
 
 B batch, T positions of the prompts, V vocabulary.
 """

@@ -1,4 +1,4 @@
-"""Loading a vision-language model from a folder or hub id: configuration, renamed weights, random twin."""
+"""Loading of a vision-language model: configuration, renamed weights, random weights."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Questions to ids: the fixed strings that a vision-language model was trained with around them.
+"""Prompts to ids, with the template strings that a vision-language model was trained with.
 
 Read by the `tokenizers` library from the checkpoint's own `tokenizer.json`; no template is rendered.
 """
@@ -55,7 +55,7 @@ class TokenPrompt:
 
 @dataclass(frozen=True)
 class FramedText:
-    """Speaks with a model. folder: of the tokenizer. vocabulary: ids the model has. ends: of an answer."""
+    """A model's tokenizer. folder: of its files. vocabulary: ids the model has. ends: end tokens of an answer."""
 
     folder: Path
     frame: Frame
@@ -148,7 +148,7 @@ class FramedText:
         before, whole = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
         if whole[: len(before)] != before or len(whole) == len(before):
             raise UsageError(
-                f"the option {option!r} melts into the end of the prompt: {whole[len(before) - 2 :]} instead of "
+                f"the option {option!r} merges with the end of the prompt: {whole[len(before) - 2 :]} instead of "
                 f"{before[len(before) - 2 :]} and more. Give it as it stands behind the prompt"
             )
         return int(whole[len(before)])
@@ -172,10 +172,10 @@ def _ends(folder: Path, config: Any) -> frozenset[int]:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    """A file's values; none without it. Raises CheckpointError for one that is no JSON."""
+    """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
     if not file.is_file():
         return {}
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
     except ValueError as error:
-        raise CheckpointError(f"{file} is no JSON ({error}); download the checkpoint again") from error
+        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error

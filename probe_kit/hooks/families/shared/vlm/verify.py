@@ -1,4 +1,4 @@
-"""What vision-language models can be compared in, under the names of their golden references.
+"""Quantities in which vision-language models are compared with their golden references.
 
 B rows, T positions, L blocks, D width, V vocabulary. The questions stand in `dims.json` beside the reference, as
 whole prompts; the adapter is given what stands between their frames.

@@ -55,7 +55,7 @@ def test_an_option_is_the_token_behind_the_prompt(tmp_path: Path) -> None:
     prompt = text.prompt("Why?")
     assert text.option(prompt, "A") == text.prompt("Why?", "A").ids[-1]
     assert text.option(prompt, "Apple") == text.option(prompt, "A")
-    with pytest.raises(UsageError, match="melts"):
+    with pytest.raises(UsageError, match="merges with"):
         text.option(prompt, "")
 
 

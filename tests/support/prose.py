@@ -1,0 +1,77 @@
+"""Finds the text that users read: strings and docstrings of modules, and pages of documentation."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+type Kind = Literal["docstring", "summary", "help", "string", "page"]
+
+
+class Prose(NamedTuple):
+    """One text. place: `file:line` of its first line. kind: a `summary` is the first paragraph of a module."""
+
+    place: str
+    text: str
+    kind: Kind
+
+
+def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
+    """Docstrings of the module and of its public names, help texts, and every other string with a space in it."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    docstrings: dict[ast.Constant, bool] = {}
+    _collect_docstrings(tree, docstrings, public=True)
+    helps = {
+        keyword.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == "help"
+    }
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
+            continue
+        place = f"{name}:{node.lineno}"
+        if docstrings.get(node):
+            yield Prose(place, node.value, "docstring")
+        elif node not in docstrings and " " in node.value.strip():
+            yield Prose(place, node.value, "help" if node in helps else "string")
+    if summary := ast.get_docstring(tree):
+        yield Prose(f"{name}:1", summary.split("\n\n")[0], "summary")
+
+
+def prose_of_page(path: Path, name: str) -> Iterator[Prose]:
+    """Paragraphs, list items and table rows of a Markdown page, without code blocks."""
+    text = re.sub(
+        r"^```.*?^```",
+        lambda block: "\n" * block[0].count("\n"),
+        path.read_text(encoding="utf-8"),
+        flags=re.MULTILINE | re.DOTALL,
+    )
+    line = 1
+    for block in re.split(r"(\n{2,}|\n(?=[-*|] ))", text):
+        if block.strip():
+            yield Prose(f"{name}:{line}", block, "page")
+        line += block.count("\n")
+
+
+def without_code(text: str) -> str:
+    """The text with every `code` span, URL and file name replaced by one word."""
+    return re.sub(r"`[^`]*`|https?://\S+|\]\([^)]*\)|[\w./-]+\.\w+", "code", text)
+
+
+def sentences(text: str) -> list[str]:
+    """The sentences of a text; a colon or semicolon ends none."""
+    return [found for found in re.split(r"(?<=[.!?])\s+", " ".join(text.split())) if found]
+
+
+def _collect_docstrings(node: ast.AST, docstrings: dict[ast.Constant, bool], public: bool) -> None:
+    """Every string that is a statement, and whether it belongs to a public name."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
+            docstrings[child.value] = public
+        elif isinstance(child, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            _collect_docstrings(child, docstrings, public and not child.name.startswith("_"))
+        else:
+            _collect_docstrings(child, docstrings, public)
