@@ -12,6 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from probe_kit._terminal.options import Format
 from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
 from probe_kit.env.spec import PRESETS
@@ -21,8 +22,10 @@ from probe_kit.extract.run_layout import AskTokens, Codec, ExportFormat, FrameCh
 from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
 from probe_kit.extract.store.export import WRITERS
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
+from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
+from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.scene_names import ArmName, Rendering, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
@@ -32,7 +35,7 @@ from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, In
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
 MOST_LINES = 100
-LONG = {"intervene", "retention"}
+LONG = {"retention"}
 """Commands whose options are not yet declared by `probe_kit._terminal.options`."""
 
 CLOSED: dict[tuple[str, str], Collection[object]] = {
@@ -56,6 +59,9 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("train", "--folds"): FOLD_UNITS,
     ("train", "--incomplete"): INCOMPLETE,
     ("train", "--controls"): BASELINES,
+    ("intervene", "--kind"): KINDS,
+    ("intervene", "--readout"): get_args(Readout),
+    ("intervene", "--format"): get_args(get_args(Format)[0]),
     ("export", "--format"): WRITERS,
     ("suite build", "--suite-version"): SUITE_VERSIONS,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
@@ -65,6 +71,7 @@ REQUIRED = {
     "extract": ["--model", "pi0-tiny"],
     "ask": ["--model", "vlm-tiny"],
     "train": ["RUN"],
+    "intervene": ["RUN"],
     "export": ["RUN"],
     "suite build": ["FOLDER"],
     "suite convert": ["--root", "ROOT", "--out", "OUT"],

@@ -1,18 +1,16 @@
 """`probe-kit intervene`."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Any
 
-import typer
 import typer.core
 from rich.console import Console
 from rich.panel import Panel
 from rich.text import Text
 
-from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say, split
-from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.interventions import Readout
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say
+from probe_kit.intervene import command_options as own
 from probe_kit.intervene.kinds.registry import KINDS, intervention_of
 
 if TYPE_CHECKING:
@@ -20,22 +18,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.replay.conditions import Intervention
     from probe_kit.intervene.replay.session import ReplaySource
     from probe_kit.intervene.results.results import InterventionResult
-
-INSIDE = "Inside the network (what they mean to a kind is said below)"
-if TYPE_CHECKING:
-    type KindName = str
-    type ReadoutName = str
-else:  # the choices in help
-    KindName = StrEnum("KindName", {name: name for name in KINDS})
-    ReadoutName = StrEnum("ReadoutName", {name: name for name in get_args(Readout)})
-
-
-class Style(StrEnum):
-    """Format of the output."""
-
-    TABLE = "table"
-    JSON = "json"
-    CSV = "csv"
 
 
 class KindHelp(typer.core.TyperCommand):
@@ -52,89 +34,47 @@ class KindHelp(typer.core.TyperCommand):
 
 
 def intervene(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    kind: Annotated[KindName, typer.Option(help="What is changed; see below.")] = "image-swap",
-    categories: Annotated[str | None, typer.Option(help="Comma-separated; default all of the run.")] = None,
-    items: Annotated[int | None, typer.Option(help="Items per category, the first ones; default all.")] = None,
-    sites: Annotated[
-        str | None,
-        typer.Option(
-            help="Comma-separated: backbone.*, backbone.02, expert.03@0-4, kv.*.", rich_help_panel=INSIDE
-        ),
-    ] = None,
-    roles: Annotated[
-        str | None,
-        typer.Option(
-            help="Comma-separated: all, image, image.left, image.right, language, state, action.",
-            rich_help_panel=INSIDE,
-        ),
-    ] = None,
-    direction: Annotated[
-        str | None,
-        typer.Option(
-            help="none, mean-difference, probe, mean-difference:K, leace, inlp:K.", rich_help_panel=INSIDE
-        ),
-    ] = None,
-    controls: Annotated[
-        int | None,
-        typer.Option(help="Matched random directions.", min=0, max=100, rich_help_panel=INSIDE),
-    ] = None,
-    coefficients: Annotated[
-        str | None,
-        typer.Option(help="Comma-separated, in half class-mean differences.", rich_help_panel=INSIDE),
-    ] = None,
-    target_side: Annotated[
-        str | None, typer.Option(help="wrong, correct, left or right.", rich_help_panel=INSIDE)
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of controls and folds of directions.", rich_help_panel=INSIDE)] = 0,
-    readout: Annotated[
-        ReadoutName,
-        typer.Option(
-            help="first-chunk: what the first inference would do. per-step: what every inference of the unedited "
-            "episode would (teacher-forced), for policies whose inference is one action.",
-        ),
-    ] = "first-chunk",
-    suite: Annotated[
-        Path | None, typer.Option(help="Folder of the run's suite; default the embedded one.")
-    ] = None,
-    checkpoint: Annotated[
-        str | None, typer.Option(help="Folder or hub id the run's policy came from; default the family's.")
-    ] = None,
-    model_option: Annotated[
-        list[str] | None, typer.Option("--model-option", "-M", help="NAME=VALUE, as given to extract; may repeat.")
-    ] = None,
-    weights_seed: Annotated[int, typer.Option(help="Of random weights, as given to extract.")] = 0,
-    scene_file: Annotated[
-        list[str] | None,
-        typer.Option(help="background=FILE or arm_urdf=FILE, if the scene was made with one; may repeat."),
-    ] = None,
-    wording: Annotated[
-        str | None, typer.Option(help="Of a run with several wordings: the one to replay; default its first.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 …")] = "cpu",
-    style: Annotated[Style, typer.Option("--format", help="Of the output.")] = Style.TABLE,
-    partial: Annotated[bool, typer.Option("--partial", help="Accept a run that is not finished.")] = False,
+    run: common.RunFolder,
+    kind: own.KindName = "image-swap",
+    categories: common.Categories = None,
+    items: common.Items = None,
+    sites: own.Sites = None,
+    roles: own.Roles = None,
+    direction: own.Direction = None,
+    controls: own.Controls = None,
+    coefficients: own.Coefficients = None,
+    target_side: own.TargetSide = None,
+    seed: common.Seed = 0,
+    readout: own.ReadoutName = "first-chunk",
+    suite: common.SuiteFolder = None,
+    checkpoint: common.Checkpoint = None,
+    model_options: common.ModelOptions = None,
+    weights_seed: common.WeightsSeed = 0,
+    scene_files: own.SceneFiles = None,
+    wording: common.Wording = None,
+    device: common.Device = "cpu",
+    style: common.Format = "table",
+    partial: common.Partial = False,
 ) -> None:
-    """Test whether what can be read is also used: change what the policy sees or computes, and nothing else.
+    """Test whether decodable information is used: change one input or activation and measure the action.
 
-    Replays the first inference of every episode, or with --kind closed-loop all of
-    it, and stores the result in the run, where `retention` reads it. The same
-    command resumes an interrupted intervention and loads a stored one.
+    Replays the first inference of every episode, or all of them with --kind closed-loop. The result is stored in
+    the run, and `retention` reads it. The same command resumes an interrupted intervention and loads a stored one.
     """
     from probe_kit.extract import open_run
     from probe_kit.hooks.contract.options import read_pairs
     from probe_kit.intervene import ReplaySource
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    common = {"categories": split(categories), "items": items, "readout": str(readout)}
-    inside = {
-        "sites": split(sites), "roles": split(roles), "direction": direction, "controls": controls,
-        "coefficients": _numbers(coefficients), "target_side": target_side, "seed": seed or None,
+    of_every_kind = {"categories": categories, "items": items, "readout": readout}
+    inside: dict[str, Any] = {
+        "sites": sites, "roles": roles, "direction": direction, "controls": controls,
+        "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
     }  # fmt: skip
     given = {name: value for name, value in inside.items() if value is not None}
-    intervention = intervention_of(str(kind), opened, common, given)
-    files = {name: Path(str(place)) for name, place in read_pairs(scene_file or []).items()}
-    source = ReplaySource(suite, checkpoint, read_pairs(model_option or []), weights_seed, device, files)
+    intervention = intervention_of(kind, opened, of_every_kind, given)
+    files = {name: Path(str(place)) for name, place in read_pairs(scene_files or []).items()}
+    source = ReplaySource(suite, checkpoint, read_pairs(model_options or []), weights_seed, device, files)
     result = _run(opened, intervention, source)
     _show(result, style)
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", result.key, run))
@@ -159,17 +99,10 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     return result
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
-    try:
-        return None if text is None else tuple(map(float, split(text) or ()))
-    except ValueError:
-        raise UsageError(f"--coefficients is {text!r}; expected numbers such as 1,2,4") from None
-
-
-def _show(result: "InterventionResult", style: Style) -> None:
-    if style == Style.JSON:
+def _show(result: "InterventionResult", style: common.Format) -> None:
+    if style == "json":
         print_json_text(result.to_json())
-    elif style == Style.CSV:
+    elif style == "csv":
         print_text(result.to_csv())
     else:
         out.print(result.to_rich())
