@@ -34,7 +34,7 @@ class Interventions:
     attention: whether it records the acting stream's attention to every token of the prompt.
     tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
     readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference gives
-    one action in discrete bins. Conditions are then evaluated at every call of an unedited episode, never executed.
+    one action in discrete bins. Conditions are then evaluated at every call of an unedited episode, not executed.
     instead: for what is not supported, why and what to do.
     Raises UsageError for advice on a kind of intervention that does not exist.
     """
