@@ -69,7 +69,6 @@ def serve(connection: Connection) -> None:
 def _answered(stage: Stage, question: StageRequest) -> Answer | ProbeKitError:
     method, arguments = question
     try:
-        answer: Answer = getattr(stage, method)(*arguments)
+        return stage.timed(method, arguments)
     except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
         return error
-    return answer
