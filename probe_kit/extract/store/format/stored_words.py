@@ -24,10 +24,10 @@ class Words:
 
 
 STORED_WORDS: Mapping[RecordKind, Words] = {
-    "settings": Words(),
+    "settings": Words(keys={"listen": "capture_only"}),
     "stream": Words(),
     "plan": Words(),
-    "outcome": Words(),
+    "outcome": Words(values={"outcome": {"listened": "capture_only"}}),
     "probes": Words(),
     "intervention": Words(),
 }
