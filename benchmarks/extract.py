@@ -59,7 +59,7 @@ def synthetic(plan: Plan, stream: StoredStream, number: int, with_tokens: bool) 
         bits = activations(draw, (*stream.lead, stream.tokens, stream.width)).view(np.uint32) >> 16
         buffers.tokens[stream.name][0][..., : stream.tokens, :] = bits
     buffers.roles.append({stream.name: [("image.main", 0, 768), ("language", 768, stream.tokens)]})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
+    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=[0])
 
 
 def bench_codecs(suite: Suite, folder: Path, width: int) -> None:

@@ -87,7 +87,8 @@ def episode(planned: PlannedEpisode, played: dict[str, list[Played]], knows: boo
             values[..., stream.layers // 2 :, :, 0] += 1.5 if correct == "left" else -1.5
         pooled[stream.name] = values
     roles = [{"backbone": [("language", 0, 816)], "expert": [("action", 0, 51)]}]
-    return EpisodeRecord(planned, outcome, {"pooled": pooled, "tokens": {}}, roles, one.trajectory), one
+    arrays = {"pooled": pooled, "tokens": {}}
+    return EpisodeRecord(planned, outcome, arrays, roles, one.trajectory, control_steps=[0]), one
 
 
 def planned_run(suite: Suite, episodes: int) -> Plan:

@@ -64,7 +64,9 @@ def episode(plan: Plan, number: int) -> Rollout:
         buffers.tokens[stream.name][0][..., : stream.tokens, :] = bits
         spans[stream.name] = [("language", 0, stream.tokens)]
     buffers.roles.append(spans)
-    return Rollout(plan.episodes[number], {"outcome": "oob", "side_placed": "none"}, buffers, [])
+    return Rollout(
+        plan.episodes[number], {"outcome": "oob", "side_placed": "none"}, buffers, [], control_steps=[0]
+    )
 
 
 def settings(codec: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.extract.store.export import export_run
     from probe_kit.extract.store.integrity.audit import Audit, verify_run
+    from probe_kit.extract.store.label import label_run
     from probe_kit.extract.store.locations.locate import locate
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.extract.store.run import Run, open_run
@@ -26,6 +27,7 @@ __all__ = [
     "ask_run",
     "export_run",
     "extract_run",
+    "label_run",
     "locate",
     "open_run",
     "prepare",
@@ -50,6 +52,7 @@ __getattr__, __dir__ = lazy_names(
         "locate": "store.locations.locate",
         "Run": "store.run",
         "open_run": "store.run",
+        "label_run": "store.label",
         "seal": "store.sealing",
         "Audit": "store.integrity.audit",
         "verify_run": "store.integrity.audit",

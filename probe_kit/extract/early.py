@@ -59,7 +59,9 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     with location.in_words():
         if not location.exists(RUN_FILE):
             return
-        stored: dict[str, Any] = read_root(location).card["settings"]
+        root = read_root(location)
+        root.check_continuable()
+        stored = root.settings
     known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
     check_other_settings({name: stored[name] for name in known}, known, str(location))
 

@@ -12,8 +12,9 @@ from probe_kit.extract.needs import space_needed
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_reader
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.format.commits import failure_key
+from probe_kit.extract.store.label import label_run
 from probe_kit.extract.store.locations.disk import check_if_full
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -56,6 +57,8 @@ class Extraction(Prepared):
             writer = self.writer(location)
             with writer.owned():
                 self._check_exclusive(writer)
+                if self.settings.label is not None:
+                    label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
                 if remaining:
                     writer.begin(self.settings.allow_mixed)

@@ -24,7 +24,7 @@ class PlannedEpisode:
     policy_seed: int
 
     def to_json(self) -> dict[str, Any]:
-        """As stored in `plan.json`."""
+        """The planned episode as flat columns."""
         item, wording = self.episode.item, self.episode.wording
         return {
             "episode": self.index,
@@ -56,6 +56,16 @@ class Plan:
     streams: tuple[StoredStream, ...]
     bytes: int
     skipped: dict[Wording, int] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As stored in `plan.json`: the episodes, each with its item's content hash, and the suite's parent."""
+        # Of the items themselves: an episode in another wording holds its item with that wording as instruction.
+        content = {item.item_id: item.content_sha256 for item in self.suite.items}
+        rows = [
+            {**planned.to_json(), "item_content_sha256": content[planned.episode.item.item_id]}
+            for planned in self.episodes
+        ]
+        return {"episodes": rows, "suite_parent": self.suite.parent}
 
     @property
     def wordings(self) -> dict[str, Any] | None:

@@ -45,7 +45,6 @@ class Prepared:
         suite = self.plan.suite
         return {
             **self.settings.choices(),
-            "label": run_label(self.settings),
             **self.card,
             "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
             "categories": list(suite.categories),
@@ -65,7 +64,7 @@ class Prepared:
 
         Raises SettingsMismatchError if other settings are there.
         """
-        return RunWriter(location, self.plan, self.identity(), self.provenance())
+        return RunWriter(location, self.plan, self.identity(), self.provenance(), run_label(self.settings))
 
     def default_name(self) -> str:
         """Folder name that repeats for the same settings, so that the same command finds its run again."""

@@ -53,6 +53,18 @@ def seal_run(run: RunFolder) -> None:
     out.print("sealed" if seal(run) else "nothing to do")
 
 
+@app.command("label")
+def label(
+    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
+    text: Annotated[str, typer.Argument(help="What tables and figures call the run from now on.")],
+) -> None:
+    """Give a run another label; its numbers, hashes and probes stay as they are."""
+    from probe_kit.extract import label_run
+
+    label_run(run, text)
+    out.print(f"{run}: {text}", markup=False, highlight=False, soft_wrap=True)
+
+
 def export(
     run: RunFolder,
     style: Annotated[ExportFormat, typer.Option("--format", help="Format of the file.")],

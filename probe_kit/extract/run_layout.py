@@ -2,8 +2,10 @@
 
 RUN/
   run.json           the root: settings, streams, hashes of the plan and of all metadata, and its own
-  plan.json          the episodes in order
+  label.json         what tables call the run; may be changed, see `label`
+  plan.json          the episodes in order, each with its item's content hash, and the suite's parent
   commits/<n>.json   one per finished episode, written last: hashes of its objects, and its own
+  times/<n>.json     seconds that an episode took, which no other hash covers, see `seconds`
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
   data.zarr/         <stream>/pooled and, with --tokens all, <stream>/tokens
@@ -25,10 +27,13 @@ import numpy as np
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
-SCHEMA_VERSION = 3
-"""The only one that is read: in runs of former ones no hash bound everything to the root."""
+SCHEMA_VERSION = 4
+"""The one that is written."""
+READABLE_SCHEMAS = (3, SCHEMA_VERSION)
+"""Those that are read. In runs of former ones no hash bound everything to the root."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
+LABEL_FILE, TIMES = "label.json", "times"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 INTERVENTIONS = "interventions"

@@ -75,7 +75,8 @@ class RunSettings:
     checkpoint: folder or hub id; None for the family's default.
     weights_seed: of a random twin's weights.
     options: what only some families have, such as `unnorm_key`; what they lead to is in the model's card.
-    label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`.
+    label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`. It is
+    no part of the run's identity.
     suite: suite folder; None for the embedded suite.
     categories: slugs; None for all of the suite. items: items per category; None for all.
     scene: by default the model's own, see `Family.home`.
@@ -129,10 +130,8 @@ class RunSettings:
         for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
             self._check_at_least(name, bound)
         self._check_limit()
-        if self.label is not None and not (self.label.isprintable() and 0 < len(self.label) <= LONGEST_LABEL):
-            raise UsageError(
-                f"label is {self.label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters"
-            )
+        if self.label is not None:
+            check_label(self.label)
 
     @classmethod
     def from_options(
@@ -372,6 +371,12 @@ class AskSettings(RunSettings):
             *(["side by side"] if self.picture == "side-by-side" else []),
             *([f"asks for the {self.query}"] if self.query != "target" else []),
         ]
+
+
+def check_label(label: str) -> None:
+    """Raise UsageError unless tables can call a run so."""
+    if not (label.isprintable() and 0 < len(label) <= LONGEST_LABEL):
+        raise UsageError(f"label is {label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters")
 
 
 def run_label(settings: RunSettings) -> str:

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
         sensitivity,
         success_rate,
     )
+    from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.compare.differences import Difference
+    from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.retention.displays import (
         CallCurveDisplay,
         FinalPositionsDisplay,
@@ -63,9 +65,11 @@ __all__ = [
     "chance_margin",
     "event_calls",
     "layer_curve",
+    "match_runs",
     "measure_retention",
     "normalised_score",
     "retention",
+    "scored",
     "sensitivity",
     "success_rate",
 ]
@@ -74,6 +78,8 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "scored": "behaviour.vlm_answers",
+        "match_runs": "compare.known_used",
         "CallCurveDisplay": "displays",
         "event_calls": "estimators.by_call",
         "Difference": "compare.differences",

@@ -7,7 +7,7 @@ from itertools import product
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.known_used import KnownUsed, correct_joins, join
+from probe_kit.retention.compare.known_used import KnownUsed, correct_joins, match_runs
 from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
@@ -33,7 +33,7 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     for reader, policy in product(asked, acted):
         own = by_rule(policy, table.rule, table.last_steps)
         try:
-            found.append(join(reader, own, table.results.get(str(policy.location))))
+            found.append(match_runs(reader, own, table.results.get(str(policy.location))))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
     return Joins(tuple(correct_joins(found)), tuple(refused))

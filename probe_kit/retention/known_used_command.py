@@ -38,7 +38,7 @@ def join(
     from probe_kit.extract import open_run
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.columns.known_used_table import rich_join
-    from probe_kit.retention.compare.known_used import join as join_runs
+    from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.train import load_results
 
     reader = scored(open_run(asked), score, with_side_words)
@@ -50,7 +50,7 @@ def join(
             raise UsageError(f"--view {view}: {acted} has no probes. Run `probe-kit train {acted}`") from None
         results = None
     check_file(figures)
-    joined = join_runs(reader, policy, results, view)
+    joined = match_runs(reader, policy, results, view)
     if as_json:
         print_json(joined.to_json())
     else:

@@ -4,9 +4,26 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from probe_kit.hashing import sha256_json
+
 Side = Literal["left", "right"]
 Layout = Literal["original", "swapped"]
 LAYOUTS: tuple[Layout, Layout] = ("original", "swapped")
+# What makes two items, and so two suites, the same: what is asked, what is seen, and what belongs together. File
+# names, encoders and licences may differ.
+_CONTENT = (
+    "item_id",
+    "category",
+    "instruction",
+    "object_phrase",
+    "object_article",
+    "correct_side",
+    "left_pixels_sha256",
+    "right_pixels_sha256",
+    "target_concept",
+    "distractor_concept",
+    "group_id",
+)
 
 
 def other_side(side: Side) -> Side:
@@ -59,6 +76,16 @@ class Item:
     side_word: bool = False
     wordings: dict[str, str] = field(default_factory=dict)
     folder: Path = field(default=Path(), compare=False)
+
+    @property
+    def content(self) -> dict[str, str]:
+        """The fields that make this item the same in two suites, by name."""
+        return {name: getattr(self, name) for name in _CONTENT}
+
+    @property
+    def content_sha256(self) -> str:
+        """Hex sha256 of `content`: items with equal hashes ask and show the same."""
+        return sha256_json(self.content)
 
     def file_name(self, side: Side) -> str:
         """Name, relative to `folder`, of the picture that lies on `side` in the original layout."""

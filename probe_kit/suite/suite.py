@@ -12,28 +12,11 @@ from probe_kit.hashing import canonical_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories, in_order
 from probe_kit.suite.items import LAYOUTS, Episode, Item
 
-# What makes two suites the same one: what is asked, what is seen, and what belongs together. File names,
-# encoders and licences may differ.
-_HASHED_FIELDS = (
-    "item_id",
-    "category",
-    "instruction",
-    "object_phrase",
-    "object_article",
-    "correct_side",
-    "left_pixels_sha256",
-    "right_pixels_sha256",
-    "target_concept",
-    "distractor_concept",
-    "group_id",
-)
-
 
 def content_sha256(items: Iterable[Item]) -> str:
     """Hex sha256 over the meaning of the items, whatever their order."""
     ordered = sorted(items, key=lambda item: item.item_id)
-    lines = (canonical_json({name: getattr(item, name) for name in _HASHED_FIELDS}) for item in ordered)
-    return sha256_text("\n".join(lines))
+    return sha256_text("\n".join(canonical_json(item.content) for item in ordered))
 
 
 def count_by_category(items: Iterable[Item]) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -186,7 +187,7 @@ def _settings(
     if not run.streams:
         raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
     return ProbeSettings(
-        model=run.label,
+        model=_settled_name(run),
         random_weights=run.random_weights,
         weights=run.weights_sha256,
         suite=run.suite,
@@ -204,6 +205,12 @@ def _settings(
     )
 
 
+def _settled_name(run: RunReader) -> str:
+    """What never changes of a run's name: a label may. In schema 3 it could not, and keys were made with it."""
+    settings: Mapping[str, Any] = getattr(run, "settings", {})
+    return str(settings.get("label", run.model))
+
+
 def _fit(sweep: _Sweep) -> ProbeResults:
     probes = _probe_all(sweep)
     curves = {
@@ -216,7 +223,8 @@ def _fit(sweep: _Sweep) -> ProbeResults:
         for (view, site), found in probes.items()
         for category, probe in found.items()
     }
-    return ProbeResults(sweep.settings, curves, directions, stamp=stamp_of_run(sweep.run))
+    stamp, label = stamp_of_run(sweep.run), sweep.run.label
+    return ProbeResults(sweep.settings, curves, directions, stamp=stamp, label=label)
 
 
 def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:

@@ -25,7 +25,7 @@ from tests.support.reading import readings
 from tests.support.representations import WAYS, carrying, rewritten
 
 Edit = Callable[[dict[str, Any]], object]
-COMMIT, CERTIFIED = "commits/00000004.json", "certificates/*.json"
+COMMIT, CERTIFIED, TIMES = "commits/00000004.json", "certificates/*.json", "times/00000004.json"
 PROBES, INTERVENTION = "probes/*/settings.json", "interventions/*/settings.json"
 
 
@@ -56,6 +56,7 @@ CHANGES: list[tuple[str, str, Edit]] = [
     ("run.json", "more calls", settings(captured_calls=2)),
     ("run.json", "another suite", lambda card: card["settings"]["suite"].update(identity="other@1#0")),
     ("run.json", "an older schema", part("schema_version", 2)),
+    ("run.json", "the schema before", part("schema_version", 3)),
     ("run.json", "no hash of the plan", lambda card: card["objects"].pop("plan.json")),
     ("run.json", "no hashes", lambda card: card["objects"].clear()),
     ("run.json", "another hash of the settings", part("settings_sha256", "0" * 64)),
@@ -73,6 +74,17 @@ CHANGES: list[tuple[str, str, Edit]] = [
     (COMMIT, "a picture elsewhere", part("pictures", {"run.json": [1, "0" * 64]})),
     (COMMIT, "a picture outside", part("pictures", {"frames/../run.json": [1, "0" * 64]})),
     (COMMIT, "other instruction ids", part("instruction_ids", [7])),
+    (COMMIT, "no control steps", without("control_steps")),
+    (COMMIT, "a control step behind the end", part("control_steps", [0, 99])),
+    (COMMIT, "control steps in another order", part("control_steps", [1, 0])),
+    (COMMIT, "fewer inferences than were captured", part("control_steps", [])),
+    ("label.json", "the same", same),
+    ("label.json", "another run", part("run", "0" * 64)),
+    ("label.json", "no text", part("label", 7)),
+    (TIMES, "the same", same),
+    (TIMES, "another run", part("run", "0" * 64)),
+    (TIMES, "another episode", part("episode", 5)),
+    (TIMES, "less than no time", part("inference", -1.0)),
     ("sealed/*.json", "the same", same),
     ("sealed/*.json", "another stamp", part("stamp", "0" * 64)),
     ("sealed/*.json", "another run", part("run", "0" * 64)),
@@ -135,7 +147,7 @@ def changed(run: Path, pattern: str, edit: Edit) -> tuple[Path, dict[str, Any], 
 
 def test_there_are_changes_of_every_kind_of_record() -> None:
     assert len(CHANGES) > 50
-    assert len({pattern for pattern, _, _ in CHANGES}) == 11
+    assert len({pattern for pattern, _, _ in CHANGES}) == 13
     assert len(WAYS) > 12
 
 
@@ -191,8 +203,8 @@ def test_a_changed_record_with_its_own_hash_computed_anew_is_named(
     assert problems
 
 
-@pytest.mark.parametrize("pattern", ["run.json", COMMIT, "sealed/*.json", "certificate.json", CERTIFIED,
-                                     "provenance/*.json", "failed/*.json"])  # fmt: skip
+@pytest.mark.parametrize("pattern", ["run.json", COMMIT, "label.json", TIMES, "sealed/*.json", "certificate.json",
+                                     CERTIFIED, "provenance/*.json", "failed/*.json"])  # fmt: skip
 @pytest.mark.parametrize("way", ["leading space", "indented by json.dump", "two hashes"])
 def test_a_run_with_a_record_in_other_bytes_does_not_open(run: Path, pattern: str, way: str) -> None:
     path, content, kept = changed(run, pattern, same)

@@ -44,7 +44,7 @@ def rollout(plan: Plan, number: int) -> Rollout:
         buffers.pooled[stream.name][:] = draw.normal(size=buffers.pooled[stream.name].shape)
         buffers.tokens[stream.name][:] = draw.integers(0, 1 << 16, buffers.tokens[stream.name].shape)
     buffers.roles.append({stream.name: [("language", 0, stream.tokens)] for stream in STREAMS})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
+    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles)))
 
 
 def extract(run: str, plan: Plan) -> None:

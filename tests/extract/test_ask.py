@@ -69,7 +69,7 @@ def files(run: Path) -> dict[str, str]:
     return {
         str(path.relative_to(run)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(run.rglob("*"))
-        if path.is_file() and path.parent.name != "certificates"
+        if path.is_file() and path.parent.name not in ("certificates", "times")
     }
 
 

@@ -56,7 +56,8 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
             buffers.tokens["backbone"][call] = 0x3F80 + call
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
-        writer.write(Rollout(planned, outcome, buffers, []).record)
+        steps = range(len(buffers.roles))
+        writer.write(Rollout(planned, outcome, buffers, [], control_steps=steps).record)
     return open_run(writer.location)
 
 
@@ -182,7 +183,8 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
             buffers.pooled["backbone"][call] = draw.normal(size=(2, 3, 8))
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
-        writer.write(Rollout(planned, outcome, buffers, []).record)
+        steps = range(len(buffers.roles))
+        writer.write(Rollout(planned, outcome, buffers, [], control_steps=steps).record)
     seal(writer.location)
     return open_run(writer.location)
 

@@ -74,7 +74,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     suite: Suite, whole: Path, tmp_path: Path
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
-    aside = ("commits", "failed", "certificates", "provenance", "sealed", "frames", "videos")
+    aside = ("commits", "times", "failed", "certificates", "provenance", "sealed", "frames", "videos")
     data = ("data.zarr/backbone/pooled/c/0/x.partial", "columns.zarrx.tmp/zarr.json")
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(exist_ok=True)

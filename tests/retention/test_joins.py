@@ -7,7 +7,7 @@ import numpy as np
 from probe_kit.retention import retention
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.columns.known_used_table import join_tables
-from probe_kit.retention.compare.known_used import join
+from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.displays import KnownUsedDisplay, gallery
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report import report_html
@@ -23,7 +23,7 @@ def pair(folder: Path) -> tuple[object, SaidRun]:
 
 def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
     reader, policy = pair(tmp_path)
-    joined = join(reader, policy)  # type: ignore[arg-type]
+    joined = match_runs(reader, policy)  # type: ignore[arg-type]
     display = KnownUsedDisplay.from_join(joined).plot()
     assert display.counts == {"color": {"1-1": 1, "1-0": 1, "0-1": 1, "0-0": 1}}
     axes = display.ax_

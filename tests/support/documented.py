@@ -14,6 +14,8 @@ PAGES = [
 ]
 SHELLS = ("bash", "console", "sh")
 NOT_COMMANDS = {
+    ("docs/architecture.md", "suite ──► env"): "a diagram",
+    ("docs/architecture.md", "extract ──► RUN"): "a diagram",
     ("docs/causal.md", "RUN/interventions/<key>/"): "a tree of files",
     ("docs/concepts.md", "suite ──► env ──► extract"): "a diagram",
     ("docs/storage.md", "RUN/"): "a tree of files",

@@ -175,7 +175,9 @@ def foreign(stored: Stored, draw: Random) -> Fault | None:
 
 def foreign_folder(stored: Stored, draw: Random) -> Fault | None:
     """A whole folder of another run over ours."""
-    top = draw.choice(["commits", "data.zarr", "columns.zarr", "probes", "sealed", "certificates", "provenance"])
+    top = draw.choice(
+        ["commits", "data.zarr", "columns.zarr", "probes", "sealed", "certificates", "provenance", "times"]
+    )
     change = {
         stored.run / path.relative_to(stored.other): path.read_bytes()
         for path in sorted((stored.other / top).rglob("*"))

@@ -18,6 +18,7 @@ from uuid import uuid4
 
 from probe_kit.extract import verify_run
 from probe_kit.extract.run_layout import CERTIFICATES, COMMITS, INTERVENTIONS, PROBES
+from probe_kit.extract.run_layout import TIMES as TIMES_OF_EPISODES
 from probe_kit.extract.store.format.bundles import HEAD, PARTIAL
 
 LONGEST_S = 900
@@ -224,11 +225,13 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def run_files(run: Path) -> dict[str, bytes]:
-    """Every object of a run: without certificates of processes, and results without the times in their heads."""
+    """Every object of a run: without certificates of processes and seconds of episodes, and results without the
+    times in their heads.
+    """
     return {
         key: _timeless(content) if key.startswith((PROBES, INTERVENTIONS)) and key.endswith(HEAD) else content
         for key, content in files_of(run).items()
-        if not key.startswith(f"{CERTIFICATES}/")
+        if not key.startswith((f"{CERTIFICATES}/", f"{TIMES_OF_EPISODES}/"))
     }
 
 

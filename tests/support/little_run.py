@@ -14,6 +14,7 @@ from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.seconds import Seconds
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hashing import derive_seed
@@ -87,7 +88,8 @@ def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:
     roles = [{"backbone": [("language", 0, 130)], "expert": [("action", 0, 3)]}]
     trajectory = draw.normal(size=(STEPS + 1, len(CHANNELS))).astype(np.float32)
     pictures = {thumbnail_key(number): as_thumbnail(still(seed, number))} if number < PICTURED else {}
-    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number), pictures)
+    seconds = Seconds(0.25 + number, 0.5)
+    return EpisodeRecord(planned, outcome, arrays, roles, trajectory, (1, 2, number), pictures, (0, 1), seconds)
 
 
 def still(seed: int, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -21,6 +21,8 @@ def rehash(run: Path) -> None:
     objects = [run / "plan.json", *sorted((run / "data.zarr").rglob("zarr.json"))]
     root["objects"] = {path.relative_to(run).as_posix(): _sum(path, "").to_json() for path in objects}
     identity = _write(run / "run.json", root)
+    for path in [run / "label.json", *sorted((run / "times").glob("*.json"))]:
+        _write(path, {**_content(path), "run": identity})
     for path in sorted((run / "commits").glob("*.json")):
         commit = _content(path)
         commit["objects"] = {

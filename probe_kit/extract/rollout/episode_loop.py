@@ -1,7 +1,8 @@
 """The episode loop: two groups of stages alternate; one simulates while the policy infers for the other."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
+from probe_kit.extract.store.seconds import Seconds
 from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
 from probe_kit.hooks.contract.observation import Observation
@@ -23,7 +25,8 @@ class Rollout:
     """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for.
 
     trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
-    as its instruction, None if it reads none or cannot say.
+    as its instruction, None if it reads none or cannot say. control_steps: of every inference, how many actions of
+    the episode came before it.
     """
 
     planned: PlannedEpisode
@@ -33,6 +36,8 @@ class Rollout:
     ends: Ends | None = None
     trajectory: NDArray[np.float32] | None = None
     instruction_ids: Sequence[int] | None = None
+    control_steps: Sequence[int] = ()
+    seconds: Seconds = field(default_factory=Seconds)
 
     @property
     def record(self) -> EpisodeRecord:
@@ -40,8 +45,9 @@ class Rollout:
         buffers = self.buffers
         arrays: dict[str, dict[str, NDArray[Any]]] = {"pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}}
         return EpisodeRecord(
-            self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids
-        )
+            self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids,
+            control_steps=self.control_steps, seconds=self.seconds,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,18 +77,31 @@ class EpisodeSlot:
         self.following: PlannedEpisode | None = None
         self.ahead = False
         self.seen: Observation | None = None
-        self.calls = 0
+        self.control_steps: list[int] = []
+        self.steps = 0
+        self.seconds = 0.0
         self.flagged: int | None = None
         self.instruction_ids: Sequence[int] | None = None
         self.past: list[NDArray[np.float32]] = []
 
     def start(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
         """Take an episode up; begin: the question that begins it, None if the stage does so already."""
-        self.planned, self.buffers, self.seen, self.calls = planned, buffers, None, 0
+        self.planned, self.buffers, self.seen = planned, buffers, None
+        self.control_steps, self.steps, self.seconds = [], 0, 0.0
         self.flagged, self.instruction_ids, self.past = None, None, []
         self.ahead = begin is None
         if begin is not None:
             self.stage.ask(begin[0], *begin[1])
+
+    @property
+    def calls(self) -> int:
+        """Inferences of the episode so far."""
+        return len(self.control_steps)
+
+    def count_inference(self, seconds: float) -> None:
+        """Note an inference about what is seen. seconds: that it took."""
+        self.control_steps.append(self.steps)
+        self.seconds += seconds
 
     def turn(self) -> Turn:
         """The inference that is due."""
@@ -93,7 +112,7 @@ class EpisodeSlot:
     def advance(self, actions: NDArray[np.float32], flagged: bool | None, then: StageRequest | None) -> None:
         """Execute actions. flagged: whether their inference put out no valid action; None if unknown."""
         self.seen = None
-        self.calls += 1
+        self.steps += len(actions)
         if flagged is not None:
             self.flagged = (self.flagged or 0) + flagged
         self.stage.ask("advance", actions, then=then)
@@ -101,7 +120,6 @@ class EpisodeSlot:
     def end_without_acting(self, then: StageRequest | None) -> None:
         """End the episode after its capture, before anything moves."""
         self.seen = None
-        self.calls += 1
         self.stage.ask("dismiss", then=then)
 
     @property
@@ -181,7 +199,7 @@ class EpisodeLoop:
                     outcome = {**answer.outcome, **slot.counts}
                     yield Rollout(
                         slot.planned, outcome, slot.buffers, answer.frames, answer.ends, answer.trajectory,
-                        slot.instruction_ids,
+                        slot.instruction_ids, slot.control_steps, Seconds(slot.seconds, answer.seconds),
                     )  # fmt: skip
                     self._begin_next(slot, ended=True)
             if not any(slot.seen or (slot.planned and slot.ahead) for slot in group):
@@ -193,7 +211,9 @@ class EpisodeLoop:
             return
         try:
             turns = [slot.turn() for slot in due]
+            started = perf_counter()
             chunks = self._controller.act(turns)
+            seconds = (perf_counter() - started) / len(turns)
             for slot, turn in zip(due, turns, strict=True):
                 if turn.call == 0:
                     slot.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
@@ -203,6 +223,7 @@ class EpisodeLoop:
             return
         flags = self._controller.flagged
         for row, (slot, actions) in enumerate(zip(due, chunks, strict=True)):
+            slot.count_inference(seconds)
             if self._controller.capture_only:
                 slot.end_without_acting(self._then(slot))
             else:

@@ -1,6 +1,7 @@
 """The loop of `probe-kit ask`: each episode is set up and rendered once, and nothing moves."""
 
 from collections.abc import Callable, Iterator, Sequence
+from time import perf_counter
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
@@ -8,6 +9,7 @@ from probe_kit.extract.rollout.answer_controller import AnswerController, AskTur
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
+from probe_kit.extract.store.seconds import Seconds
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 
@@ -72,13 +74,18 @@ class Asking:
         try:
             controller = self._controller
             with while_acting(controller.identity["model"], controller.reader.card.checkpoint, controller.limit):
+                started = perf_counter()
                 outcomes = controller.ask([turn for _, turn, _ in due])
+                seconds = (perf_counter() - started) / len(due)
         except EPISODE_ERRORS as error:
             for chair, turn, _ in due:
                 yield self._give_up(chair, turn.planned, error)
             return
         for (chair, turn, seen), outcome in zip(due, outcomes, strict=True):
-            yield Rollout(turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.ends)
+            yield Rollout(
+                turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.ends,
+                control_steps=[0], seconds=Seconds(seconds, seen.seconds),
+            )  # fmt: skip
             self._begin_next(chair)
 
     def _give_up(self, chair: _Chair, planned: PlannedEpisode, error: ProbeKitError) -> Failure:

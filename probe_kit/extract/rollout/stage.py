@@ -1,8 +1,9 @@
 """A stage: one environment and its current episode, advanced by one chunk of actions at a time."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
+from time import perf_counter
 from typing import Any, Protocol
 
 import numpy as np
@@ -44,25 +45,32 @@ EPISODE_ERRORS = (
 class Ending:
     """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails.
 
-    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`.
+    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`. seconds: that the stage worked on the
+    episode, by the wall clock.
     """
 
     outcome: dict[str, Any]
     frames: list[NDArray[np.uint8]]
     ends: Ends | None = None
     trajectory: NDArray[np.float32] | None = None
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The first frame of an episode in which nothing moves. facts: what the run records of it."""
+    """The first frame of an episode in which nothing moves. facts: what the run records of it.
+
+    seconds: that the stage worked on it, by the wall clock.
+    """
 
     observation: Observation
     facts: dict[str, Any]
     ends: Ends | None = None
+    seconds: float = 0.0
 
 
 Answer = Observation | Ending | Seen
+_BEGINNINGS = ("begin", "look")
 
 
 class Stage:
@@ -75,6 +83,16 @@ class Stage:
     def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
         self.script, self._keep_ends = script, keep_ends
         self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
+        self._seconds = 0.0
+
+    def timed(self, method: str, arguments: tuple[Any, ...]) -> Answer:
+        """Call one of the methods below; what ends an episode says how many seconds all of its calls took."""
+        if method in _BEGINNINGS:
+            self._seconds = 0.0
+        started = perf_counter()
+        answer: Answer = getattr(self, method)(*arguments)
+        self._seconds += perf_counter() - started
+        return answer if isinstance(answer, Observation) else replace(answer, seconds=self._seconds)
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
         """Set up an episode. Errors carry a note naming it."""
@@ -222,7 +240,7 @@ class LocalStage:
     def answer(self) -> Answer:
         """Do the work."""
         method, arguments = self._question
-        answer: Answer = getattr(self._stage, method)(*arguments)
+        answer = self._stage.timed(method, arguments)
         if self._then is not None and isinstance(answer, Ending):
             self._question, self._then = self._then, None
         return answer

@@ -70,8 +70,7 @@ def serve(connection: Connection) -> None:
 def _answered(stage: Stage, question: StageRequest) -> Answer | ProbeKitError:
     method, arguments = question
     try:
-        answer: Answer = getattr(stage, method)(*arguments)
+        return stage.timed(method, arguments)
     except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
         add_traceback(error)
         return error
-    return answer

@@ -20,7 +20,7 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract.run_layout import DATA, PROVENANCE, TRAJECTORY, StoredStream
+from probe_kit.extract.run_layout import DATA, PROVENANCE, SCHEMA_VERSION, TRAJECTORY, StoredStream
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.checking import CheckedStore
@@ -37,11 +37,13 @@ from probe_kit.extract.store.format.hashes import Sum
 from probe_kit.extract.store.format.root import RESTORE, read_root
 from probe_kit.extract.store.format.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.format.trajectories import Trajectories, has_trajectories, names_trajectory
+from probe_kit.extract.store.label import read_label
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import run_html, run_text
 from probe_kit.extract.store.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.extract.store.provenance import Provenance, differences, read_provenances
+from probe_kit.extract.store.seconds import Seconds, read_seconds
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import resolve_view
 
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
 
 _OUTCOME = ("outcome", "side_placed")
 """What every outcome says, and so a table of no episodes too."""
+_SECONDS = ("seconds_inference", "seconds_simulation")
 
 
 class NotSealedWarning(UserWarning):
@@ -92,17 +95,17 @@ class Run:
         self.location, self.wording = location, wording
         self.root = read_root(location)
         self.root.check()
-        card = self.root.card
-        self.settings: dict[str, Any] = card["settings"]
-        self.settings_sha256: str = card["settings_sha256"]
+        self.settings: dict[str, Any] = self.root.settings
+        self.settings_sha256: str = self.root.card["settings_sha256"]
         self._streams = self.root.streams
 
     def check_records(self) -> None:
         """Raise RunDamagedError if a record of the run is not what was written, or names a commit that is gone.
 
-        Of commits, provenance, certificates, seal and failures; results stored with the run are checked when read.
+        Of label, commits, seconds, provenance, certificates, seal and failures; results stored with the run are
+        checked when read.
         """
-        _ = self.failed, self.provenances, self.columns
+        _ = self.label, self._seconds, self.failed, self.provenances, self.columns
         if self._commits:
             read_certificate(self.root)
 
@@ -122,10 +125,13 @@ class Run:
         """The model's name, as given to `probe-kit extract`."""
         return str(self.settings["model"])
 
-    @property
+    @cached_property
     def label(self) -> str:
-        """What tables and legends call the run: the model and what sets it apart, or as it was named."""
-        return str(self.settings.get("label", self.model))
+        """What tables and legends call the run: the model and what sets it apart, or as it was named.
+
+        It may be changed, see `label_run`. Raises RunDamagedError if its record is missing or was changed.
+        """
+        return read_label(self.root)
 
     @property
     def weights_sha256(self) -> str | None:
@@ -147,6 +153,26 @@ class Run:
     def suite(self) -> str:
         """Identity of the suite that was run, `name@version#hash`."""
         return str(self.settings["suite"]["identity"])
+
+    @property
+    def suite_parent(self) -> str | None:
+        """Content hash of the suite that `suite` was selected from.
+
+        None for a whole suite, and in runs of schema 3, which do not say it.
+        """
+        return self.root.suite_parent
+
+    @cached_property
+    def items(self) -> pd.DataFrame:
+        """One row per planned item, played or not: `item_id`, `category`, `group_id`, `pair_id`, `content_sha256`.
+
+        Items of two runs are the same where `item_id` and `content_sha256` are equal. The hash is that of
+        `suite.Item.content_sha256`, None in runs of schema 3. Two wordings of an item are one row.
+        """
+        names = {name: name for name in ("item_id", "category", "group_id", "pair_id")}
+        names["item_content_sha256"] = "content_sha256"
+        rows = {one["item_id"]: [one.get(name) for name in names] for one in self.root.plan}
+        return pd.DataFrame(list(rows.values()), columns=list(names.values()))
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
@@ -259,10 +285,46 @@ class Run:
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
-        """One row per committed episode: the plan's columns, then the outcome's."""
+        """One row per committed episode: the plan's columns, then the outcome's, then how long it took.
+
+        `seconds_inference` and `seconds_simulation` are wall-clock seconds: of the model's calls (of a call for
+        several observations its share), and of setting up, simulating and drawing. NaN in runs of schema 3, and
+        where the folder `times` was deleted. They differ between runs of one identity.
+        """
         plan = self.root.planned
-        rows = [{**plan[number], **self._commits[number]["outcome"]} for number in self._numbers]
-        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME])
+        rows = [
+            {**plan[number], **self._commits[number]["outcome"], **self._seconds_columns(number)}
+            for number in self._numbers
+        ]
+        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME, *_SECONDS])
+
+    @cached_property
+    def _seconds(self) -> dict[int, Seconds]:
+        return read_seconds(self.root, self._commits)
+
+    def _seconds_columns(self, number: int) -> dict[str, float]:
+        seconds = self._seconds[number]
+        return dict(zip(_SECONDS, (seconds.inference, seconds.simulation), strict=True))
+
+    @cached_property
+    def control_steps(self) -> NDArray[np.int64]:
+        """(E, N) int64: the control step at which each inference of an episode was made, -1 behind its last one.
+
+        A control step is one executed action; an inference at step 4 saw the state after four actions. N: most
+        inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
+        nothing moves (`ask`, or without acting) has one inference, at step 0.
+        Raises UsageError for a run of schema 3, which does not hold them.
+        """
+        if self.root.schema < SCHEMA_VERSION:
+            raise UsageError(
+                f"{self.location} has schema {self.root.schema}, which does not hold the control steps of "
+                "inferences. Extract it again to have them"
+            )
+        stored = [commit["control_steps"] for commit in self.commits()]
+        steps = np.full((len(stored), max((len(own) for own in stored), default=0)), -1, np.int64)
+        for row, own in enumerate(stored):
+            steps[row, : len(own)] = own
+        return steps
 
     # -- trajectories ----------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.extract.plan import Plan, PlannedEpisode
-from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, PLAN_FILE, RUN_FILE, SCHEMA_VERSION
+from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, LABEL_FILE, PLAN_FILE, RUN_FILE
 from probe_kit.extract.settings import check_other_plan, check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import create_arrays
@@ -28,10 +28,11 @@ from probe_kit.extract.store.format.commits import (
     write_commit,
     write_failure,
 )
-from probe_kit.extract.store.format.hashes import Sum, as_json, as_record
+from probe_kit.extract.store.format.hashes import Sum, as_json, as_record, record_hash
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.format.root import Root, new_root, read_root
 from probe_kit.extract.store.format.trajectories import create_trajectories, has_trajectories, write_trajectory
+from probe_kit.extract.store.label import label_record
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import (
     Provenance,
@@ -41,6 +42,7 @@ from probe_kit.extract.store.provenance import (
     provenance_here,
     read_provenances,
 )
+from probe_kit.extract.store.seconds import Seconds, write_seconds
 from probe_kit.hashing import canonical_json
 
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
@@ -55,6 +57,8 @@ class EpisodeRecord:
     arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
     roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
     instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run.
+    control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
+    episode took, which no hash of the run covers.
     """
 
     planned: PlannedEpisode
@@ -64,23 +68,28 @@ class EpisodeRecord:
     trajectory: NDArray[np.float32] | None = None
     instruction_ids: Sequence[int] | None = None
     pictures: Mapping[str, bytes] = field(default_factory=dict)
+    control_steps: Sequence[int] = ()
+    seconds: Seconds = field(default_factory=Seconds)
 
 
 class RunWriter:
     """Creates a run or continues the one that is there; any number of processes may do so at once.
 
-    provenance: of this process, by default of one that computes on the CPU.
+    provenance: of this process, by default of one that computes on the CPU. label: what tables call a run that
+    begins here, by default the model's name; one that is there keeps its own, see `label_run`.
     Raises SettingsMismatchError if the location holds a run with other settings or another plan, or anything
     else, and RunDamagedError if what it holds was changed.
     """
 
     def __init__(
-        self, location: Location, plan: Plan, settings: dict[str, Any], provenance: Provenance | None = None
-    ) -> None:
+        self, location: Location, plan: Plan, settings: dict[str, Any], provenance: Provenance | None = None,
+        label: str | None = None,
+    ) -> None:  # fmt: skip
         self.location, self.plan = location, plan
         self.provenance = provenance or provenance_here()
         self._begun = self._certified = False
         self.settings = json.loads(canonical_json(settings))
+        self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
             location.found(self._beginning(), last=RUN_FILE)
         self.root = self._continued()
@@ -102,20 +111,20 @@ class RunWriter:
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
         objects = {
-            PLAN_FILE: as_json({"episodes": [e.to_json() for e in self.plan.episodes]}),
+            PLAN_FILE: as_json(self.plan.to_json()),
             **{f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()},
         }
         streams = [stream.to_json() for stream in self.plan.streams]
-        return {**objects, RUN_FILE: new_root(self.settings, streams, objects)}
+        root = new_root(self.settings, streams, objects)
+        return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}
 
     def _continued(self) -> Root:
         """The root of the run that is there, which must be the one that would be begun here."""
         root = read_root(self.location)
-        asked = {"schema_version": SCHEMA_VERSION, **self.settings}
-        there = {"schema_version": root.card["schema_version"], **root.card["settings"]}
-        check_other_settings(there, asked, str(self.location))
+        root.check_continuable()
+        check_other_settings(root.settings, self.settings, str(self.location))
         root.check()
-        check_other_plan(root.plan, [episode.to_json() for episode in self.plan.episodes], str(self.location))
+        check_other_plan(root.plan, self.plan.to_json()["episodes"], str(self.location))
         return root
 
     @cached_property
@@ -174,6 +183,7 @@ class RunWriter:
         self._say_who_plays()  # before any commit names it
         self.write_certificate({})
         commit = self._write_objects(episode)
+        write_seconds(self.root, number, episode.seconds)
         if not write_commit(self.location, number, commit):
             self._settle(episode, commit)
 
@@ -216,6 +226,7 @@ class RunWriter:
             "roles": episode.roles,
             "provenance": name_of(self.provenance),
             **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
+            "control_steps": [int(step) for step in episode.control_steps],
             "objects": {key: one.to_json() for key, one in store.sums.items()},
             "pictures": {key: one.to_json() for key, one in pictures.items()},
         }

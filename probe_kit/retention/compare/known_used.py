@@ -130,7 +130,7 @@ class KnownUsed:
         )
 
 
-def join(
+def match_runs(
     asked: RunReader,
     acted: RunReader,
     results: ProbeResults | None = None,

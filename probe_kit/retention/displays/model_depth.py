@@ -154,7 +154,7 @@ def _draw_fractions(axes: "Axes", last: int) -> None:
 
 
 def _name(results: ProbeResults) -> str:
-    return full_name(results.settings.model, results.settings.random_weights)
+    return full_name(results.label, results.settings.random_weights)
 
 
 def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations, name: str) -> ModelCurve:

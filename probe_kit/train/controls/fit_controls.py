@@ -171,7 +171,7 @@ def _twin_scores(
     other = twin.curves[place]
     if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
         raise UsageError(
-            f"category {place[0]!r}: the twin {twin.settings.model!r} has {other.labels.size} episodes, this run "
+            f"category {place[0]!r}: the twin {twin.label!r} has {other.labels.size} episodes, this run "
             f"{curve.labels.size}, and they are not the same. Extract both from the same suite."
         )
     pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
@@ -192,5 +192,5 @@ def _twin_scores(
             twin_accuracy=float(there[:, column].mean()),
             difference=float((here - there)[:, column].mean()),
             ci=(float(low[column]), float(high[column])),
-            twin=twin.settings.model + (" (random weights)" if twin.settings.random_weights else ""),
+            twin=twin.label + (" (random weights)" if twin.settings.random_weights else ""),
         )

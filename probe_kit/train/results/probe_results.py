@@ -32,7 +32,8 @@ class ProbeResults:
     curves: one per (category, view). directions: the probes' weights per (category, view, site). controls: what
     the probes are compared with, as far as requested.
     created: when they were fitted (UTC, ISO 8601); not part of the key. stamp: hash of the commits they were
-    fitted to, empty for arrays in memory.
+    fitted to, empty for arrays in memory. label: what tables call the run, by default its model; not part of the
+    key either.
     """
 
     settings: ProbeSettings
@@ -41,12 +42,16 @@ class ProbeResults:
     controls: Controls = field(default_factory=Controls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
     stamp: str = ""
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.settings.model)
 
     def __repr__(self) -> str:
-        return results_text(self.settings)
+        return results_text(self.settings, self.label)
 
     def _repr_html_(self) -> str:
-        return results_html(self.settings, self.scores)
+        return results_html(self.settings, self.label, self.scores)
 
     @property
     def key(self) -> str:

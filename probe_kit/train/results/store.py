@@ -18,6 +18,7 @@ from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
+from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
@@ -191,7 +192,7 @@ def read_probes(run: Location) -> dict[str, Bundle]:
 
 def settings_of(bundle: Bundle) -> ProbeSettings:
     """The settings of results of this version's format. Raises RunDamagedError."""
-    stored = bundle.head["settings"]
+    stored = in_current_words(bundle.head["settings"], "probes")
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
         return ProbeSettings(**{**stored, **lists})
@@ -227,6 +228,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
         read_controls(bundle),
         bundle.times.get("created", ""),
         _stamp(bundle),
+        run.label,
     )
 
 

@@ -10,21 +10,21 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def results_text(settings: ProbeSettings) -> str:
+def results_text(settings: ProbeSettings, label: str) -> str:
     """One line: what was probed, with how many relabellings, and the key."""
     random = ", RANDOM WEIGHTS" if settings.random_weights else ""
     return (
-        f"<ProbeResults {settings.key} of {settings.model}{random}: {', '.join(settings.categories)}; "
+        f"<ProbeResults {settings.key} of {label}{random}: {', '.join(settings.categories)}; "
         f"views {', '.join(settings.views)}; target {settings.target}; call {settings.call}; "
         f"{settings.permutations} relabellings>"
     )
 
 
-def results_html(settings: ProbeSettings, scores: "pd.DataFrame") -> str:
+def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:
     """The best site of every category, view and stream."""
     random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
     title = (
-        f"Probes of {settings.model}{random}, target {settings.target}, call {settings.call}: the best site of "
+        f"Probes of {label}{random}, target {settings.target}, call {settings.call}: the best site of "
         "each stream, + as many others that tie"
     )
     columns = ("category", "view", "stream", *SITE_HEADINGS, "n")

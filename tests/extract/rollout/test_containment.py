@@ -28,6 +28,7 @@ from probe_kit.hooks.checkpoints.containment import contained
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
+from tests.support.episode_tables import without_seconds
 
 ACT = Pi0.act
 PROVED = 2
@@ -62,7 +63,9 @@ def numbers(run: Run) -> dict[str, str]:
     }
     assert all(values.values())
     found = {name: [sha256(array.tobytes()).hexdigest() for array in arrays] for name, arrays in values.items()}
-    return {name: str(digests) for name, digests in found.items()} | {"episodes": run.episodes.to_csv()}
+    return {name: str(digests) for name, digests in found.items()} | {
+        "episodes": without_seconds(run.episodes).to_csv()
+    }
 
 
 def misbehave(monkeypatch: pytest.MonkeyPatch, spoil: Callable[[list[Observation], Any], Any]) -> None:

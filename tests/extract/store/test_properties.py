@@ -55,7 +55,7 @@ def rollout(plan: Plan, number: int, calls: int) -> Rollout:
             0, 0x7F00, (*shape, stream.tokens, stream.width)
         )
         buffers.roles.append({"backbone": [("language", 0, stream.tokens)]})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [])
+    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles)))
 
 
 def assert_reads_as_written(run: Run, plan: Plan, written: list[int], calls: int) -> None:

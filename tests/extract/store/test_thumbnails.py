@@ -12,6 +12,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.extract.store.thumbnails import HEIGHT, read_thumbnail
 from probe_kit.suite import build_suite
+from tests.support.episode_tables import without_seconds
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
 ) -> None:
     bare = extract_run(replace(settings, frames="none"), tmp_path / "bare")
     assert bare.settings_sha256 == run.settings_sha256
-    assert bare.episodes.equals(run.episodes)
+    assert without_seconds(bare.episodes).equals(without_seconds(run.episodes))
     assert bare.stamp != run.stamp, "commits name their pictures"
     assert not (bare.path / "frames").exists()
     assert read_thumbnail(bare.path, 0) is None

@@ -29,7 +29,9 @@ def rollout(writer: RunWriter, number: int, language: int) -> Rollout:
     buffers.tokens["backbone"][..., :language, :] = 0x3F80
     spans = [("language", 0, language), ("padding", language, 300)]
     buffers.roles.append({"backbone": spans if language else spans[1:]})
-    return Rollout(writer.plan.episodes[number], {"outcome": "oob"}, buffers, [])
+    return Rollout(
+        writer.plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles))
+    )
 
 
 def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(writer: RunWriter) -> None:

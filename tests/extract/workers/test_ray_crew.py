@@ -14,10 +14,13 @@ import pytest
 
 from probe_kit.errors import UnknownModelError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
+from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.workers import ray as crew
 from probe_kit.extract.workers.ray import ClusterFullWarning, run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
+from probe_kit.suite import Suite
+from tests.support.little_run import little_plan, little_writer
 
 EPISODES = 40
 
@@ -121,7 +124,11 @@ class Cluster:
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Scheduler, list[Event]]]:
+def run(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[Scheduler, list[Event]]]:
+    little_writer(locate(tmp_path / "run"), little_plan(small_suite))
+
     def play(cluster: Cluster, workers: int) -> tuple[Scheduler, list[Event]]:
         @contextmanager
         def connected(_address: str, log_to_driver: bool) -> Iterator[Cluster]:
@@ -131,7 +138,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[
         monkeypatch.setattr(crew, "ray_cluster", connected)
         scheduler, heard = Scheduler(range(EPISODES)), list[Event]()
         settings: Any = SimpleNamespace(workers=workers, ray="a cluster", device="cpu")
-        run_on_ray(settings, str(tmp_path), scheduler, heard.append)
+        run_on_ray(settings, str(tmp_path / "run"), scheduler, heard.append)
         assert all(actor.dead for actor in cluster.actors), "none outlives the extraction"
         return scheduler, heard
 

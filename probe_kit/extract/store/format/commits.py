@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 from probe_kit.errors import RunDamagedError
@@ -16,6 +17,7 @@ from probe_kit.extract.store.format.hashes import (
     read_sums,
 )
 from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hashing import sha256_json
 
@@ -29,6 +31,8 @@ _PARTS = {
     "provenance": str,
     "objects": dict,
 }
+_WITH_CONTROL_STEPS = 4
+"""The first schema whose commits hold the control step of every inference."""
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
 _PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
@@ -82,6 +86,9 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     name = f"{root.location}/{key}"
     commit = read_record(raw, name, redo(number))
     expect(commit, _PARTS, name, redo(number))
+    if root.schema >= _WITH_CONTROL_STEPS:
+        expect(commit, {"control_steps": list}, name, redo(number))
+    commit["outcome"] = in_current_words(commit["outcome"], "outcome")
     planned = root.planned.get(number)
     if planned is None:
         raise RunDamagedError(
@@ -111,6 +118,8 @@ def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
     ids = commit.get("instruction_ids", [])
     if not (isinstance(ids, list) and all(type(one) is int for one in ids)):
         yield "has other instruction ids than numbers"
+    if problem := _control_step_problem(commit):
+        yield problem
     needed = {object_key(array, number, axes) for array, axes in root.arrays.items()}
     trajectory = object_key(TRAJECTORY, number, TRAJECTORY_AXES)
     if lost := sorted(needed - {*commit["objects"]}):
@@ -122,6 +131,23 @@ def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
             yield f"names {trajectory}, though the run keeps no trajectories"
         if type(commit["outcome"].get("steps")) is not int:
             yield "does not say how many steps its trajectory has"
+
+
+def _control_step_problem(commit: Commit) -> str | None:
+    """What is wrong with the control steps of the inferences: none before the last one, none behind the end."""
+    steps = commit.get("control_steps")
+    if steps is None:
+        return None
+    if not all(type(step) is int for step in steps):
+        return "has other control steps than numbers"
+    ended = commit["outcome"].get("steps")
+    last = ended if type(ended) is int else None
+    rising = all(before < after for before, after in pairwise(steps))
+    if not rising or (steps and (steps[0] < 0 or (last is not None and steps[-1] >= max(last, 1)))):
+        return f"has {str(steps)[:60]} as control steps of its inferences, in an episode of {ended} steps"
+    if len(steps) < len(commit["roles"]):
+        return f"has control steps of {len(steps)} inferences, and {len(commit['roles'])} were captured"
+    return None
 
 
 def object_key(array: str, number: int, axes: int) -> str:
@@ -136,7 +162,7 @@ def _is_picture(key: str) -> bool:
 
 def _are_roles(root: Root, calls: list[Any]) -> bool:
     """Whether every captured inference says spans [role, start, stop] of the tokens of every stream."""
-    return len(calls) <= root.card["settings"]["captured_calls"] and all(
+    return len(calls) <= root.settings["captured_calls"] and all(
         isinstance(call, dict) and all(_are_spans(call.get(name)) for name in root.streams) for call in calls
     )
 

@@ -116,6 +116,11 @@ def as_record(content: Mapping[str, Any]) -> bytes:
     return _BEFORE + digest(plain).encode() + _AFTER + plain[1:]
 
 
+def record_hash(record: bytes) -> str:
+    """The hash that bytes of `as_record` carry."""
+    return record[len(_BEFORE) : len(_BEFORE) + _HEX].decode()
+
+
 def is_record(raw: bytes) -> bool:
     """Whether these bytes claim to be a record."""
     return raw.startswith(_BEFORE)

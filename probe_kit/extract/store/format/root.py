@@ -9,8 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from probe_kit.errors import RunDamagedError, RunNotFoundError
-from probe_kit.extract.run_layout import DATA, PLAN_FILE, RUN_FILE, SCHEMA_VERSION, StoredStream
+from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatchError
+from probe_kit.extract.run_layout import (
+    DATA,
+    PLAN_FILE,
+    READABLE_SCHEMAS,
+    RUN_FILE,
+    SCHEMA_VERSION,
+    StoredStream,
+)
 from probe_kit.extract.store.format.hashes import (
     HASH,
     Sum,
@@ -22,6 +29,7 @@ from probe_kit.extract.store.format.hashes import (
     read_record,
     read_sums,
 )
+from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import what_to_open
 from probe_kit.hashing import sha256_json
@@ -34,6 +42,8 @@ _EPISODE = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
     "episode": int,
 }
+_WITH_ITEM_HASHES = 4
+"""The first schema whose plan holds item hashes and the suite's parent."""
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
@@ -41,15 +51,30 @@ RESTORE = "Restore it from a copy, or extract the run again"
 class Root:
     """What `run.json` says, checked.
 
-    identity: the hash that was computed of it. streams: as it stores them, by name. sums: of the plan and the
-    arrays' metadata, by key.
+    card: as it is stored. settings: those of the card, in the words of now. identity: the hash that was computed
+    of it. streams: as it stores them, by name. sums: of the plan and the arrays' metadata, by key.
     """
 
     location: Location
     card: Mapping[str, Any]
+    settings: dict[str, Any]
     identity: str
     streams: Mapping[str, StoredStream]
     sums: Mapping[str, Sum]
+
+    @property
+    def schema(self) -> int:
+        """The schema that the run was written in."""
+        return int(self.card["schema_version"])
+
+    def check_continuable(self) -> None:
+        """Raise SettingsMismatchError unless this version writes runs of this schema."""
+        if self.schema != SCHEMA_VERSION:
+            raise SettingsMismatchError(
+                f"{self.location} holds a run of schema {self.schema}, which an earlier version of probe_kit "
+                f"wrote; this one writes schema {SCHEMA_VERSION} only. The run can be read, probed and "
+                "compared, but not continued. Choose another --out, or finish it with the version that began it"
+            )
 
     def read(self, key: str) -> bytes:
         """An object that belongs to every run. Raises RunDamagedError if it is missing or was changed."""
@@ -70,15 +95,37 @@ class Root:
     @cached_property
     def plan(self) -> list[dict[str, Any]]:
         """The planned episodes in order."""
-        name = f"{self.location}/{PLAN_FILE}"
-        content = read_plain(self.read(PLAN_FILE), name, RESTORE)
-        expect(content, {"episodes": list}, name, RESTORE)
-        plan: list[dict[str, Any]] = content["episodes"]
-        for episode in plan:
-            expect(episode if isinstance(episode, dict) else {}, _EPISODE, name, RESTORE)
+        name, parts = f"{self.location}/{PLAN_FILE}", self._episode_parts
+        plan: list[dict[str, Any]] = []
+        for episode in self._plan_file["episodes"]:
+            row = in_current_words(episode, "plan") if isinstance(episode, dict) else {}
+            expect(row, parts, name, RESTORE)
+            plan.append(row)
         if len({episode["episode"] for episode in plan}) < len(plan):
             raise RunDamagedError(f"{name} plans two episodes of one number. {RESTORE}")
         return plan
+
+    @property
+    def _episode_parts(self) -> dict[str, type]:
+        return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
+
+    @cached_property
+    def _plan_file(self) -> dict[str, Any]:
+        name = f"{self.location}/{PLAN_FILE}"
+        content = read_plain(self.read(PLAN_FILE), name, RESTORE)
+        expect(content, {"episodes": list}, name, RESTORE)
+        if self.schema >= _WITH_ITEM_HASHES and not isinstance(content.get("suite_parent", ...), str | None):
+            raise RunDamagedError(f"{name} does not say what its suite was selected from. {RESTORE}")
+        return content
+
+    @property
+    def suite_parent(self) -> str | None:
+        """Content hash of the suite that the run's suite was selected from.
+
+        None for a whole suite, and in runs of schema 3, which do not say it.
+        """
+        parent: str | None = self._plan_file.get("suite_parent")
+        return parent
 
     @cached_property
     def planned(self) -> dict[int, dict[str, Any]]:
@@ -94,7 +141,7 @@ class Root:
     @cached_property
     def arrays(self) -> dict[str, int]:
         """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
-        with_tokens = self.card["settings"]["tokens"] == "all"
+        with_tokens = self.settings["tokens"] == "all"
         return {name: axes for one in self.streams.values() for name, axes in one.arrays(with_tokens).items()}
 
 
@@ -125,12 +172,14 @@ def read_root(location: Location) -> Root:
         ) from None
     card = _read_card(raw, name)
     expect(card, _PARTS, name, RESTORE)
-    there = {part: kind for part, kind in _FURTHER.items() if part in card["settings"]}
-    expect(card["settings"], {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
     if sha256_json(card["settings"]) != card["settings_sha256"]:
         raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
+    settings = in_current_words(card["settings"], "settings")
+    there = {part: kind for part, kind in _FURTHER.items() if part in settings}
+    expect(settings, {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
     check_sums(card["objects"], name, RESTORE)
-    root = Root(location, card, card[HASH], _read_streams(card["streams"], name), read_sums(card["objects"]))
+    streams = _read_streams(card["streams"], name)
+    root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))
     if lost := {PLAN_FILE, *(f"{DATA}/{array}/zarr.json" for array in root.arrays)} - {*root.sums}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
@@ -139,10 +188,11 @@ def read_root(location: Location) -> Root:
 def _read_card(raw: bytes, name: str) -> dict[str, Any]:
     """What `run.json` says. Runs of former versions carried no hash of their own; their schema is named."""
     card = read_record(raw, name, RESTORE) if is_record(raw) else read_plain(raw, name, RESTORE)
-    if (schema := card.get("schema_version")) != SCHEMA_VERSION or type(schema) is not int:
+    if (schema := card.get("schema_version")) not in READABLE_SCHEMAS or type(schema) is not int:
         newer = type(schema) is int and schema > SCHEMA_VERSION
         raise RunDamagedError(
-            f"{name} has schema {schema}; this version of probe_kit reads schema {SCHEMA_VERSION}. "
+            f"{name} has schema {schema}; this version of probe_kit reads schemas "
+            f"{' and '.join(map(str, READABLE_SCHEMAS))}. "
             + ("Update probe_kit" if newer else "Extract the run again, or read it with the version that made it")
         )
     return read_record(raw, name, RESTORE)
@@ -150,7 +200,7 @@ def _read_card(raw: bytes, name: str) -> dict[str, Any]:
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     try:
-        streams = [StoredStream.from_json(dict(one)) for one in stored]
+        streams = [StoredStream.from_json(in_current_words(dict(one), "stream")) for one in stored]
     except (TypeError, ValueError, KeyError) as error:
         raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
     if len({stream.name for stream in streams}) < len(streams):

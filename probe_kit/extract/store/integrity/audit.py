@@ -24,9 +24,11 @@ from probe_kit.extract.store.format.commits import (
 from probe_kit.extract.store.format.root import RESTORE, Root, read_root
 from probe_kit.extract.store.integrity.deep import content_problems
 from probe_kit.extract.store.integrity.orphans import stray_keys
+from probe_kit.extract.store.label import read_label
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import read_provenances
+from probe_kit.extract.store.seconds import seconds_problems
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
             problems.append(str(error))
     problems += _commit_problems(root, commits)
     problems += picture_problems(location, commits)
+    problems += seconds_problems(root, commits)
+    problems += _caught(partial(read_label, root))
     problems += _provenance_problems(root, commits)
     if commits:
         problems += _caught(partial(read_certificate, root))

@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Mapping
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import DATA, FAILED, ILLUSTRATIONS, PROVENANCE, RUN_FILE
+from probe_kit.extract.run_layout import DATA, FAILED, ILLUSTRATIONS, LABEL_FILE, PROVENANCE, RUN_FILE
 from probe_kit.extract.store.certificates import certificate_keys
 from probe_kit.extract.store.format.bundles import BUNDLES, HEAD, PARTIAL, TIMES, bundle_keys, read_bundle
 from probe_kit.extract.store.format.columns import Columns, seal_key
 from probe_kit.extract.store.format.commits import Commit, commit_key, numbered, pictures_of
 from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.seconds import seconds_key
 
 
 def stray_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None, stamp: str) -> list[str]:
@@ -20,9 +21,11 @@ def stray_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
 def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None, stamp: str) -> Iterator[str]:
     """Keys of all that the root leads to: objects whose every changed byte is found."""
     yield RUN_FILE
+    yield LABEL_FILE
     yield from root.sums
     for number, commit in commits.items():
         yield commit_key(number)
+        yield seconds_key(number)
         yield f"{PROVENANCE}/{commit['provenance']}.json"
         yield from (f"{DATA}/{key}" for key in commit["objects"])
         yield from pictures_of(commit) or {}

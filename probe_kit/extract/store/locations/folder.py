@@ -26,12 +26,13 @@ from probe_kit.extract.run_layout import (
     PROVENANCE,
     RUN_FILE,
     SEALED,
+    TIMES,
     VIDEOS,
 )
 from probe_kit.extract.store.locations.location import TRIES, Location
 
 # What a killed process leaves: objects and columns that never got their final name.
-_WRITTEN_ASIDE = (COMMITS, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
+_WRITTEN_ASIDE = (COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
 _ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
 _PIECE = 1 << 20
 

@@ -45,7 +45,7 @@ class Certificate:
         sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
         n = f"n = {_span(sizes)} episodes per category"
         return cls(
-            settings.model, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
+            results.label, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
             results.key, settings.target, settings.call,
         )  # fmt: skip
 
