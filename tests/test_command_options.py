@@ -103,7 +103,7 @@ def test_a_wrong_choice_exits_2_and_names_the_choices(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", {command for command, _ in CLOSED})
+@pytest.mark.parametrize("command", sorted({command for command, _ in CLOSED}))
 def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> None:
     shown = re.findall(r"(--[a-z-]+) <[^>|]+\|[^>]+>", help_of(command))
     several = [option for (of, option), names in CLOSED.items() if of == command and len(names) > 1]
