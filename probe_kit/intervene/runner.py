@@ -39,7 +39,7 @@ def run_intervention(
     progress: Progress | None = None,
     on_fit_progress: Progress | None = None,
 ) -> InterventionResult:
-    """Intervene on a run's policy, and store what came of it with the run; what is stored is read back.
+    """Intervene on a run's policy and store the result with the run; a stored result is loaded.
 
     intervention: `ImageSwap()` by default. source: where policy and pictures are, by default the embedded suite
     and the model's own checkpoint. load: how the policy is found, if not by its name. progress: called after every

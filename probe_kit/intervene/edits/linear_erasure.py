@@ -68,7 +68,7 @@ class PaddedTokens:
         return np.asarray(np.minimum(*counts) >= FEWEST)
 
     def centred(self) -> "tuple[Array, Array]":
-        """(N, T, D) minus the means (T, D) over who is present; zero where nobody is."""
+        """(N, T, D) minus the means (T, D) over the samples that have the position; zero where none has."""
         here = self.present[..., None]
         counts = np.maximum(here.sum(axis=0), 1)
         means = np.where(here, self.values, 0).sum(axis=0) / counts

@@ -1,1 +1,1 @@
-"""Results of interventions, read back from a run."""
+"""Results of interventions, loaded from a run."""

@@ -100,7 +100,7 @@ class ConditionOutcomes:
 
     @classmethod
     def from_bytes(cls, content: bytes, former_kind: str | None = None) -> "ConditionOutcomes":
-        """Read back. former_kind: the kind's name in format 1, if it was stored in that."""
+        """Load. former_kind: the kind's name in format 1, if it was stored in that."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
             found: dict[str, Any] = dict(arrays)
         found = found if former_kind is None else current_arrays(found, former_kind)

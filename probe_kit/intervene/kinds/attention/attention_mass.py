@@ -55,7 +55,7 @@ class AttentionShares:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
-        """Read back."""
+        """Load what `to_bytes` made."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
             found: dict[str, Any] = {own.name: arrays[own.name] for own in fields(cls)}
         return cls(**{**found, "roles": tuple(map(str, found["roles"]))})

@@ -108,7 +108,7 @@ def erasure_notes(rows: Sequence[ErasureEffect], _: Measurement) -> list[str]:
     return [
         "Erasure is weaker evidence than interchange: what is read need not be linear, and may pass elsewhere. "
         "Loss beyond the controls is evidence of use. Absence of loss is not evidence against it.",
-        *(f"{row.category}, {row.name}: a probe is blind, and the action goes on as before." for row in blind),
+        *(f"{row.category}, {row.name}: the probe is at chance, and the action is as before." for row in blind),
         *(
             f"{row.category}, {row.name}: random subspaces of the same rank disrupt the action too."
             for row in broken
