@@ -228,7 +228,7 @@ STAND_INS = {
         r"--model xiaomi-r0": "--model pi0-tiny --categories color --items 12 --max-steps 12",
         r"train runs/xiaomi": "train runs/xiaomi --permutations 20",
     },
-    "docs/causal.md": {r"^(probe-kit intervene RUN)(?! --kind interchange)": r"\1 --items 2"},
+    "docs/causal.md": {r"^(probe-kit intervene RUN)(?! --kind (interchange|erase))": r"\1 --items 2"},
     "docs/embedded.md": {
         r"--items 40": "--categories color,shape --items 12",
         r"--model pi0-tiny": "--model pi0-tiny --max-steps 12",
