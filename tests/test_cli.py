@@ -187,7 +187,7 @@ def test_the_version_is_that_of_the_package() -> None:
 def test_an_option_of_another_command_says_which_one_has_it(arguments: list[str], home: str) -> None:
     answer = in_process(*arguments)
     assert answer.returncode == 2
-    assert f"but one of `{home}`" in " ".join(answer.stderr.replace("│", " ").split())
+    assert f"but of `{home}`" in " ".join(answer.stderr.replace("│", " ").split())
 
 
 def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(

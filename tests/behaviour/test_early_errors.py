@@ -35,7 +35,7 @@ CASES = {
     f"{EXTRACT} pi0 --checkpoint with-a-shard-missing": (3, "b.safetensors of model.safetensors.index.json"),
     f"{EXTRACT} prismatic": (2, "no default checkpoint"),
     f"{EXTRACT} pi0-tiny --device nonsense": (2, "This machine has cpu"),
-    f"{EXTRACT} pi0-tiny --dtype int8": (2, "float32, bfloat16"),
+    f"{EXTRACT} pi0-tiny --dtype int8": (2, "is not one of"),
     f"{EXTRACT} pi0-tiny -M foo=3": (2, "no model option foo"),
     f"{EXTRACT} pi0-tiny --weights-seed 3": (2, "random weights"),
     f"{EXTRACT} pi0-tiny --scene moon": (2, "moon"),

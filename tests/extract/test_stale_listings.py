@@ -16,6 +16,7 @@ from probe_kit.hooks import Site
 from probe_kit.intervene.store.answers import find_stored
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
+from probe_kit.train.results.store import read_probes
 from tests.extract.contents import objects
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.support.s3_server import BadServer
@@ -88,6 +89,10 @@ def _kind(key: str) -> str:
     return {"commits": "commits", "probes": "probes", "columns": "columns"}.get(top, "data")
 
 
+RESULTS = 3
+"""Which of `told` reads probe results."""
+
+
 def told(run: Run) -> tuple[Callable[[], Any], ...]:
     """What is read of a run, each by itself and anew."""
     again = partial(open_run, run.location)
@@ -105,11 +110,13 @@ def told(run: Run) -> tuple[Callable[[], Any], ...]:
 def test_reading_with_stale_listings_gives_the_same_or_an_error_by_name(
     lag: int, kept: Run, bad_server: BadServer
 ) -> None:
-    expected = [ask() for ask in told(kept)]
+    """Probes that a listing hides do not exist yet: older ones of the run are read."""
+    expected = [{ask()} for ask in told(kept)]
+    expected[RESULTS] |= {load_results(kept, key).scores.to_csv() for key in read_probes(kept.location)}
     stale(bad_server, lag)
     for ask, right in zip(told(kept), expected, strict=True):
         with suppress(ProbeKitError):
-            assert ask() == right
+            assert ask() in right
 
 
 def test_nothing_is_called_damaged_because_a_listing_misses_it(suite: Suite, bad_server: BadServer) -> None:

@@ -1,6 +1,7 @@
 """Runs whose probe accuracies are set by hand: decisions are right with a given probability."""
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +126,11 @@ def runs_in(folder: Path) -> Callable[..., ArrayRun]:
         return run
 
     return make
+
+
+@pytest.fixture(autouse=True)
+def _close_figures() -> Iterator[None]:
+    """pyplot warns of many open figures, and it counts those of every test of a process."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

@@ -77,7 +77,7 @@ def run_command(
     """
     mark = uuid4().hex
     log = watched.with_name(f"{watched.name}.log")
-    with log.open("w") as output:
+    with log.open("w", encoding="utf-8") as output:
         process = subprocess.Popen(
             [sys.executable, "-m", "probe_kit", *arguments],
             env={**os.environ, _MARK: mark, "OMP_NUM_THREADS": "1"},
@@ -105,7 +105,7 @@ def run_together(commands: Sequence[Sequence[str]], place: Path, ready: Callable
     for command, log in zip(commands, logs, strict=True):
         while running and running[0].poll() is None and not ready():
             time.sleep(_TICK_S)
-        with log.open("w") as output:
+        with log.open("w", encoding="utf-8") as output:
             given = [sys.executable, "-m", "probe_kit", *command]
             running.append(subprocess.Popen(given, stdout=output, stderr=subprocess.STDOUT))
     codes = [process.wait(LONGEST_S) for process in running]

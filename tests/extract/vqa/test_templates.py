@@ -75,5 +75,5 @@ def test_an_unknown_prompt_and_a_binary_file_are_refused(tmp_path: Path) -> None
         find_template("p3")
     file = tmp_path / "picture.png"
     file.write_bytes(b"\x89PNG\xff")
-    with pytest.raises(UsageError, match="no UTF-8 text"):
+    with pytest.raises(UsageError, match="not UTF-8 text"):
         find_template(str(file))

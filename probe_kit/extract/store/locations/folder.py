@@ -127,13 +127,18 @@ class Folder(Location):
     def create(self, key: str, content: bytes) -> bool:
         """Written aside, flushed to the disk, then linked to its name."""
         path = self._place(key)
-        path.parent.mkdir(exist_ok=True)
-        with _written_aside(path, content, flush=True) as aside:
+        for left in reversed(range(TRIES)):
             try:
-                os.link(aside, path)
+                path.parent.mkdir(exist_ok=True)
+                with _written_aside(path, content, flush=True) as aside:
+                    os.link(aside, path)
+                return True
             except FileExistsError:
                 return False
-        return True
+            except FileNotFoundError:
+                if not left:  # before: another process began to write here, and cleared what was written aside
+                    raise
+        return False
 
     def write(self, key: str, content: bytes) -> None:
         """Written aside, then renamed."""
