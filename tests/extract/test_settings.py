@@ -7,10 +7,10 @@ import pytest
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.prepared import check_run
 from probe_kit.extract.settings import run_label
-from probe_kit.hooks import EditFunction, Site
+from probe_kit.hooks import Edit, Site
 from probe_kit.suite import load_suite
 
-ZERO = EditFunction("zero", (Site("backbone", 1),))
+ZERO = Edit("zero", (Site("backbone", 1),))
 
 
 @pytest.mark.parametrize(

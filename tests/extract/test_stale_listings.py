@@ -101,7 +101,7 @@ def told(run: Run) -> tuple[Callable[[], Any], ...]:
         lambda: again().rows("expert", "tokens")[1].tobytes(),
         lambda: again().episodes.to_csv(),
         lambda: load_results(again()).scores.to_csv(),
-        lambda: find_stored(again()).answers().to_bytes(),
+        lambda: find_stored(again()).outcomes().to_bytes(),
     )
 
 

@@ -41,7 +41,7 @@ def numbers_of(run: Run) -> dict[str, str]:
             if isinstance(array, np.ndarray)
         ]  # fmt: skip
     for stored in stored_interventions(run):
-        found[f"displacements of intervention {stored.key}"] = [stored.answers().lateral]
+        found[f"displacements of intervention {stored.key}"] = [stored.outcomes().displacement]
     return {name: _hash(arrays) for name, arrays in found.items()}
 
 

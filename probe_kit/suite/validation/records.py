@@ -114,7 +114,7 @@ def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:
     """E03: the record follows a schema this tool can read."""
     version = str(record.get("schema_version", "none"))
     if version.split(".")[0] != SCHEMA_MAJOR:
-        yield error("E03", where, f"uses schema {version}; this tool reads {SCHEMA_MAJOR}.x")
+        yield error("E03", where, f"uses schema {terminal_safe(version[:80])}; this tool reads {SCHEMA_MAJOR}.x")
 
 
 def unique_ids(lines_of: Mapping[str, Sequence[int]]) -> Iterator[Finding]:

@@ -48,7 +48,7 @@ def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     dark, same = result.effects
     assert (same.condition, same.median_displacement) == ("dimmed-1", 0.0)
     assert dark.median_displacement > 0
-    stored = (copy.path / "interventions" / result.key / "effects.csv").read_text()
+    stored = (copy.path / "interventions" / result.key / "effects.csv").read_text(encoding="utf-8")
     assert stored.splitlines()[0] == "category,condition,n_episodes,median_displacement"
     code, shown, said = invoke(with_entry, str(copy.path), *asked, "--format", "json")
     assert [row["condition"] for row in json.loads(shown)["effects"]] == ["dimmed-0", "dimmed-1"]
