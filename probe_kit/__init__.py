@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         intervene_on,
         load_effects,
     )
-    from probe_kit.retention import retention as retention_table
+    from probe_kit.retention import retention_table
     from probe_kit.retention.displays import (
         FinalPositionsDisplay,
         IterationMapDisplay,
@@ -112,7 +112,7 @@ __getattr__ = lazy_names(
         "load_results": "train",
         "load_suite": "suite",
         "open_run": "extract",
-        "retention_table": "retention:retention",
+        "retention_table": "retention",
         "train_probes": "train",
         "write_report": "retention.report",
     },

@@ -18,9 +18,9 @@ from probe_kit.suite import Suite
 
 # The keys of `retention --format json` are part of the contract (architecture, command line).
 KEYS = set(
-    "model category view n_episodes n_items sr sr_original sr_swapped p_wrong p_oob delta regime chance "  # noqa: SIM905
-    "prefix_accuracy prefix_layer action_accuracy action_layer action_iteration retention retention_debiased "
-    "retention_ci prefix_p_fwe gap".split()
+    "model category view n_episodes n_items sr sr_original sr_swapped share_wrong share_outside delta regime chance "  # noqa: SIM905
+    "backbone_accuracy backbone_layer action_accuracy action_layer action_iteration retention retention_debiased "
+    "retention_ci backbone_p_fwe gap".split()
 )
 
 

@@ -17,9 +17,9 @@ from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import Follow, Source, intervene_on
 from probe_kit.intervene.kinds.image_swap.effects import WORTH
-from probe_kit.retention import RetentionRow, retention
+from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.text import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
-from probe_kit.retention.report.category_summary import Said, verdict
+from probe_kit.retention.report.category_summary import CategoryVerdict, verdict
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, FittingTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
-Truth = Said
+Truth = CategoryVerdict
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def probed(
         permutations=permutations,
         controls=("binding",),
         suite=suite.folder,
-        twin=twin,
+        untrained=twin,
         progress=progress,
     )
     progress = stage(f"exchanging pictures, {organism.name}")
@@ -176,7 +176,7 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
 
 def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
     """What the instrument says of every organism's run, and the truth, a category each."""
-    rows = [(organism, row) for organism, run in runs for row in retention([run]).rows]
+    rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
     shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
         Finding(one.name, row.category, one.expected(row.category), measured(row, shown), row) for one, row in rows
@@ -191,7 +191,7 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     """
     said = verdict(row)
     bounded = row.follows_net_ci is not None and (row.follows_net_ci[1] or 0.0) < WORTH
-    return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
+    return "encoded, unused" if said == "inconclusive" and row.backbone_signal and bounded and shown else said
 
 
 def to_rich(findings: Sequence[Finding]) -> "FittingTable":
@@ -232,8 +232,8 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.prefix_accuracy),
-        number(row.prefix_p_fwe, 3),
+        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.backbone_accuracy),
+        number(row.backbone_p_fwe, 3),
         beats(row), percent(row.action_accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

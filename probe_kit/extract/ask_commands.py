@@ -111,7 +111,7 @@ def ask(
     One run per prompt and picture size, in the scenes that `probe-kit extract` plays with the same --suite,
     --scene and --seed. Every question is asked twice, with the options exchanged, and answered twice: in text, and
     as a choice between the options' logits. Runs are read like any other: `probe-kit retention ASKED… ACTED…` puts
-    both in one table, with --gap it tests the difference, and `probe-kit join` says what is known and not used.
+    both in one table, with --vlm-vla it tests the difference, and `probe-kit stages` says what is known and not used.
 
     The same command continues interrupted runs; other settings in the same folder are refused.
     """
@@ -193,4 +193,4 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         say(f"{run.label}: {counts}{reasons}; option mass {mass:.2f}")
         out.print(str(run.location), soft_wrap=True)
     places = " ".join(str(run.location) for run in runs)
-    say(marked("next: [bold]probe-kit retention {}[/], with acting runs behind", places))
+    say(marked("next: [bold]probe-kit retention {}[/], with policy runs behind", places))

@@ -12,16 +12,16 @@ from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
 from probe_kit.retention.behaviour.wordings import WordingPair, wording_pairs
-from probe_kit.retention.columns.text_table import ANSWERS, PlainTable, answer_table, gap_tables, size_table
+from probe_kit.retention.columns.text_table import ANSWERS, TextTable, answer_table, size_table, vlm_vla_tables
 from probe_kit.retention.compare.differences import Difference, group_differences
-from probe_kit.retention.compare.pairing import Compared, compare_runs
-from probe_kit.retention.compare.vlm_vla import VlmGap, vlm_gaps
+from probe_kit.retention.compare.pairing import PairedRuns, compare_runs
+from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.formats.dataframe import frame_of
 from probe_kit.retention.formats.json import table_json
-from probe_kit.retention.rows.build import Drawn, RowSettings, run_rows
+from probe_kit.retention.rows.build import RowSettings, RowWithDraws, run_rows
 from probe_kit.retention.rows.category_mean import mean_row
-from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged, check_epsilons
+from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
@@ -51,7 +51,7 @@ class RetentionTable:
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
     wordings: list[WordingPair] = field(default_factory=list)
-    gaps: list[VlmGap] = field(default_factory=list)
+    gaps: list[VlmVlaDifference] = field(default_factory=list)
     unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -137,13 +137,13 @@ class RetentionTable:
         return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further, self.unpaired)
 
     @property
-    def further_tables(self) -> list[PlainTable]:
+    def further_tables(self) -> list[TextTable]:
         """Answers, sizes of the picture by prompt, and VLM − VLA, as far as runs were asked."""
         found = [answer_table(self.all_rows), size_table(self.means)]
-        return [table for table in found if table is not None] + gap_tables(self.gaps)
+        return [table for table in found if table is not None] + vlm_vla_tables(self.gaps)
 
 
-def retention(
+def retention_table(
     runs: Sequence[RunReader] | Mapping[str, Sequence[RunReader]],
     views: Sequence[str] | None = None,
     *,
@@ -169,8 +169,8 @@ def retention(
     `probe_kit.env.scoring.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
     trajectories has no success rate by another rule than `disc`. A run without activations or probes shows success
     rates only.
-    score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
-    their items in whose name a side stands. gap: compare every asked run with every acting one, see `vlm_gaps`.
+    score: by which VLM runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
+    their items in whose name a side stands. gap: compare every VLM run with every acting one, see `vlm_vla_differences`.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, for a run that is given twice, or for `against` where it is none of them; SceneError
     for overlapping zones.
@@ -190,7 +190,7 @@ def retention(
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
     notes += unscored
     settings = RowSettings(views, iterations, epsilons, seed, rule, last_steps)
-    drawn: list[Drawn] = []
+    drawn: list[RowWithDraws] = []
     means: list[RetentionRow] = []
     for name, run in listed:
         found = run_rows(run, results.get(str(run.location)), settings, name)
@@ -198,10 +198,10 @@ def retention(
         shown = dict.fromkeys(one.row.view for one in found)
         means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
     names = distinct_labels([run for _, run in listed])
-    compared = Compared([], ())
+    compared = PairedRuns([], ())
     if isinstance(runs, Mapping):
         by_group = {name: [one for one in drawn if one.row.group == name] for name in runs}
-        compared = Compared(group_differences(by_group, against), ())
+        compared = PairedRuns(group_differences(by_group, against), ())
     elif len(listed) > 1 or against is not None:
         compared = compare_runs([run for _, run in listed], drawn, names, against, gap)
     notes += [f"{run.location} was listened to and did not act: SR is n/a." for _, run in listed if _heard(run)]
@@ -210,12 +210,12 @@ def retention(
     rows, means = (
         [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
     )
-    judged = [by_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
+    judged = [under_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
     pairs = [pair for run in judged for pair in _wordings(run, names[str(run.location)])]
-    gaps = vlm_gaps([run for _, run in listed], names) if gap else []
+    gaps = vlm_vla_differences([run for _, run in listed], names) if gap else []
     if gap and not gaps:
         raise UsageError(
-            "--gap compares asked runs with acting ones in the same categories, and these runs have no such pair. "
+            "--vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no such pair. "
             "Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
     return RetentionTable(

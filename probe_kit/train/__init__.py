@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_calls
-    from probe_kit.train.results.control_scores import BaselineScore, Controls, Excess, TwinScore
+    from probe_kit.train.results.control_scores import BaselineScore, Controls, Excess, UntrainedScore
     from probe_kit.train.results.probe_curve import Curve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
@@ -41,7 +41,7 @@ __all__ = [
     "Progress",
     "RunReader",
     "Target",
-    "TwinScore",
+    "UntrainedScore",
     "load_calls",
     "load_results",
     "save_results",
@@ -70,7 +70,7 @@ __getattr__ = lazy_names(
         "RunReader": "data.run_reader",
         "TARGETS": "data.labels",
         "Target": "data.labels",
-        "TwinScore": "results.control_scores",
+        "UntrainedScore": "results.control_scores",
         "load_calls": "results.by_call",
         "load_results": "results.store",
         "save_results": "results.store",

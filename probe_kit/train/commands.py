@@ -50,7 +50,7 @@ def train(
         ),
     ] = None,
     suite: Annotated[Path | None, typer.Option(help="Folder of the run's suite, for pixels and binding.")] = None,
-    twin: Annotated[
+    untrained: Annotated[
         str | None, typer.Option(help="Run of the same episodes to subtract, usually by random weights.")
     ] = None,
     call: Annotated[
@@ -86,7 +86,7 @@ def train(
     units = cast("FoldUnit", _one_of("folds", folds, FOLD_UNITS))
     rest = cast("Incomplete", _one_of("incomplete", incomplete, INCOMPLETE))
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    beside = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
+    beside = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     pictures = suite or embedded_suite_of(opened)
     for number in _calls(call, opened):
         with progress() as bar:
@@ -102,7 +102,7 @@ def train(
                 incomplete=rest,
                 controls=baselines if baselines is not None else _default_controls(pictures),
                 suite=pictures,
-                twin=beside,
+                untrained=beside,
                 seed=seed,
                 jobs=jobs,
                 device=device,
@@ -111,7 +111,7 @@ def train(
             )
         _print_peaks(results, opened.random_weights)
     if not results.controls.excess:
-        say("signal is judged against chance only: give --suite, or a --twin by random weights")
+        say("signal is judged against chance only: give --suite, or --untrained with a run of random weights")
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
@@ -241,6 +241,6 @@ def _beats(best: "pd.Series[Any]") -> str:
     from probe_kit.statistics.significance import SIGNIFICANCE
 
     chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
-    tried = {"chance": chance, "binding": best["beats_binding"], "twin": best["beats_twin"]}
+    tried = {"chance": chance, "binding": best["beats_binding"], "untrained": best["beats_untrained"]}
     found = [name if better else f"not {name}" for name, better in tried.items() if not isna(better)]
     return ", ".join(found) or "–"

@@ -35,8 +35,8 @@ def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
     return RetentionRow(
         run="run", model="pi0-tiny", random_weights=False, weights_sha256="0" * 64, suite="suite@1",
         run_settings="s", probe_settings="p", category="color", view="mean", n_episodes=48, n_items=24, sr=sr,
-        regime=regime(sr, 0.14, 1 - sr, 0.0)[0], prefix_accuracy=0.9, prefix_p_fwe=p,
-        prefix_beats={"chance": chance, "binding": None, "twin": None} | beats,
+        regime=regime(sr, 0.14, 1 - sr, 0.0)[0], backbone_accuracy=0.9, backbone_p_fwe=p,
+        backbone_exceeds={"chance": chance, "binding": None, "untrained": None} | beats,
     )  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
     assert verdict(row(sr, p)) == expected
 
 
-@pytest.mark.parametrize("control", ["binding", "twin"])
+@pytest.mark.parametrize("control", ["binding", "untrained"])
 def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
     """Color of the random twin had p = 0.005 against chance, and knew nothing."""
     assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
@@ -109,7 +109,7 @@ def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
 
 def test_the_table_shows_the_margin_that_decides() -> None:
     """Over 48 episodes Δ is 14.1 points, over their 24 items 20.0, and that is what the verdict rests on."""
-    shown = replace(row(0.66, 0.3), delta=0.1414, delta_regime=0.2001)
+    shown = replace(row(0.66, 0.3), delta=0.1414, chance_margin=0.2001)
     with out.capture() as printed:
         out.print(to_rich([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
     text = printed.get()

@@ -23,7 +23,7 @@ from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.intervene import Effects, Follow, Source, intervene_on, load_effects, stored_interventions
 from probe_kit.intervene.replay.rollout import planned_of
 from probe_kit.intervene.replay.session import Bench
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -172,7 +172,7 @@ def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: Effects,
     path = mine.path / "interventions" / effects.key / name
     path.write_bytes(path.read_bytes()[:-3] + b"}\n ")
     with pytest.raises(RunDamagedError, match=name):
-        retention([open_run(mine.path)])
+        retention_table([open_run(mine.path)])
 
 
 def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
@@ -181,14 +181,14 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     assert stored_interventions(fewer) == []
     with pytest.raises(NoInterventionsError, match="probe-kit intervene"):
         load_effects(fewer)
-    assert all(row.follows is None for row in retention([fewer]).rows)
+    assert all(row.follows is None for row in retention_table([fewer]).rows)
 
 
 # -- what retention makes of it ------------------------------------------------------------------------------
 
 
 def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Effects) -> None:
-    table = retention([copy])
+    table = retention_table([copy])
     assert {row.category: row.follows for row in table.rows} == {row.category: row.follows for row in effects.rows}
     assert all(row.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
@@ -197,7 +197,7 @@ def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Effects) -> 
 
 
 def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:
-    assert "ollows" not in retention([recorded_run]).to_markdown()
+    assert "ollows" not in retention_table([recorded_run]).to_markdown()
 
 
 # -- refusing ------------------------------------------------------------------------------------------------

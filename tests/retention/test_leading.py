@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import HtmlTable, behaviour_table, retention_table
+from probe_kit.retention.formats.html import HtmlTable, behaviour_table, probe_table
 from probe_kit.retention.report.summaries import read_row, summarise
 from probe_kit.train import ArrayRun
 
@@ -21,7 +21,7 @@ FURTHER = ("area", "debiased", "published")
 @pytest.fixture
 def table(probed_run: ProbedRun) -> RetentionTable:
     runs = [probed_run({"color": TIED}, name) for name in ("one", "other")]
-    return retention({"first": [runs[0]], "second": [runs[1]]})
+    return retention_table({"first": [runs[0]], "second": [runs[1]]})
 
 
 def headings(table: HtmlTable | None) -> str:
@@ -37,7 +37,7 @@ def console(table: RetentionTable) -> str:
 
 def every_form(table: RetentionTable) -> dict[str, str]:
     """Text from the retention table on, by form; the one of a page is its headings and cells."""
-    html = retention_table(table.all_rows, table.differences)
+    html = probe_table(table.all_rows, table.differences)
     assert html is not None
     cells = " | ".join(cell.text for cell in html.body[0])
     return {
@@ -66,7 +66,7 @@ def test_every_table_names_the_call_the_first_iteration_and_ties(table: Retentio
 
 def test_ties_stand_in_the_row_and_in_the_reading(table: RetentionTable) -> None:
     row = table.rows[0]
-    assert (row.prefix_ties, row.action_ties) == (1, 2)
+    assert (row.backbone_ties, row.action_ties) == (1, 2)
     words = " ".join(read_row(row))
     assert "and at 1 other site as well" in words
     assert "and at 2 other sites as well" in words
@@ -75,9 +75,9 @@ def test_ties_stand_in_the_row_and_in_the_reading(table: RetentionTable) -> None
 def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable) -> None:
     row = table.rows[0]
     assert row.delta is not None
-    assert row.delta_regime is not None
-    assert row.delta < row.delta_regime
-    deciding, papers = f"{100 * row.delta_regime:.1f}", f"{100 * row.delta:.1f}"
+    assert row.chance_margin is not None
+    assert row.delta < row.chance_margin
+    deciding, papers = f"{100 * row.chance_margin:.1f}", f"{100 * row.delta:.1f}"
     page = behaviour_table(table.all_rows)
     texts = {
         "console": console(table),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
@@ -16,22 +16,22 @@ SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
 WEAK = ([0.5, 0.8, 0.6], [[0.5, 0.8]])
 NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
 CONTRACT_KEYS = {
-    "model", "category", "view", "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "p_wrong", "p_oob",
-    "delta", "regime", "chance", "prefix_accuracy", "prefix_layer", "action_accuracy", "action_layer",
-    "action_iteration", "retention", "retention_debiased", "retention_ci", "prefix_p_fwe", "gap",
+    "model", "category", "view", "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "share_wrong", "share_outside",
+    "delta", "regime", "chance", "backbone_accuracy", "backbone_layer", "action_accuracy", "action_layer",
+    "action_iteration", "retention", "retention_debiased", "retention_ci", "backbone_p_fwe", "gap",
 }  # fmt: skip
 
 
 @pytest.fixture
 def table(probed_run: ProbedRun) -> RetentionTable:
-    return retention([probed_run({"color": SIGNAL, "shape": WEAK, "counting": NONE})])
+    return retention_table([probed_run({"color": SIGNAL, "shape": WEAK, "counting": NONE})])
 
 
 def test_a_row_joins_behaviour_peaks_and_retention(table: RetentionTable) -> None:
     row = table.rows[0]
     assert (row.category, row.view, row.n_episodes, row.n_items, row.n_groups) == ("color", "mean", 200, 100, 100)
-    assert (row.sr, row.p_wrong, row.p_oob) == (0.6, 0.3, 0.1)
-    assert (row.prefix_accuracy, row.prefix_layer, row.prefix_depth) == (0.9, 1, 0.5)
+    assert (row.sr, row.share_wrong, row.share_outside) == (0.6, 0.3, 0.1)
+    assert (row.backbone_accuracy, row.backbone_layer, row.backbone_depth) == (0.9, 1, 0.5)
     assert (row.action_accuracy, row.action_layer, row.action_iteration) == (0.7, 1, 0)
     assert row.retention == pytest.approx(0.5)
     assert row.gap == pytest.approx(0.3)
@@ -40,7 +40,7 @@ def test_a_row_joins_behaviour_peaks_and_retention(table: RetentionTable) -> Non
 def test_the_mean_averages_ratios_and_names_the_categories_left_out(table: RetentionTable) -> None:
     (mean,) = table.means
     assert mean.retention == pytest.approx((0.2 / 0.4 + 0.3 / 0.3) / 2)
-    assert mean.prefix_accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
+    assert mean.backbone_accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
     assert mean.categories == ("color", "shape", "counting")
     assert mean.left_out == ("counting",)
     assert mean.retention_note == "without counting"
@@ -63,21 +63,21 @@ def test_csv_has_one_line_per_row_and_numbers_in_every_interval_column(table: Re
     rows = list(csv.DictReader(io.StringIO(table.to_csv())))
     assert len(rows) == 4
     assert float(rows[0]["retention_ci_low"]) < float(rows[0]["retention_ci_high"])
-    assert rows[0]["prefix_layer"] == "1"
+    assert rows[0]["backbone_layer"] == "1"
     assert rows[3]["categories"] == "color shape counting"
 
 
 def test_a_run_without_activations_shows_success_rates_only(probed_run: ProbedRun) -> None:
     probed = probed_run({"color": SIGNAL})
     scripted = ArrayRun(probed.path.parent / "scripted", "expert", probed.suite, probed.episodes, {})
-    (row,) = retention([scripted]).rows
-    assert (row.sr, row.view, row.prefix_accuracy, row.retention_note) == (0.6, None, None, "n/a (no probes)")
+    (row,) = retention_table([scripted]).rows
+    assert (row.sr, row.view, row.backbone_accuracy, row.retention_note) == (0.6, None, None, "n/a (no probes)")
 
 
 def test_runs_are_never_averaged_with_each_other(probed_run: ProbedRun) -> None:
     first = probed_run({"color": SIGNAL}, "pi0")
     second = probed_run({"color": WEAK}, "smolvla", suite="other@1#ba9876543210")
-    means = retention([first, second]).means
+    means = retention_table([first, second]).means
     assert [(mean.model, mean.suite) for mean in means] == [("pi0", first.suite), ("smolvla", second.suite)]
     assert [mean.retention for mean in means] == pytest.approx([0.5, 1.0])
 
@@ -85,9 +85,9 @@ def test_runs_are_never_averaged_with_each_other(probed_run: ProbedRun) -> None:
 def test_views_and_keys_that_are_not_there_are_errors(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     with pytest.raises(UnknownSiteError, match="has probes of mean, not of last"):
-        retention([run], views=["last"])
+        retention_table([run], views=["last"])
     with pytest.raises(UsageError, match="no probe results"):
-        retention([run], keys=["ffffffffffff"])
+        retention_table([run], keys=["ffffffffffff"])
 
 
 UNDEFINED = ([0.5, 0.5, 0.5], [[0.54, 0.5]])
@@ -98,9 +98,9 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
     probed = probed_run({"color": SIGNAL, "counting": NONE, "shape": UNDEFINED})
     episodes = probed.episodes.assign(outcome="oob", side_placed="none")
     bare = ArrayRun(probed.path.parent / "bare", "expert", probed.suite, episodes, {})
-    table = retention({"probed": [probed], "bare": [bare]})
-    pair = retention({"a": [probed], "b": [probed_run({"color": SIGNAL, "counting": NONE}, "other")]})
-    for frame in (table.to_frame(), retention([bare]).to_frame(), pair.differences_frame()):
+    table = retention_table({"probed": [probed], "bare": [bare]})
+    pair = retention_table({"a": [probed], "b": [probed_run({"color": SIGNAL, "counting": NONE}, "other")]})
+    for frame in (table.to_frame(), retention_table([bare]).to_frame(), pair.differences_frame()):
         floats = [
             name for name in frame if any(part in str(name) for part in FLOATS) and "defined" not in str(name)
         ]
@@ -123,7 +123,7 @@ TEXTS = ("retention_note", "score")
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:
     """Late iterations hold the decision itself as a noisy action; the first sees pure noise."""
-    table = retention([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
+    table = retention_table([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
     row, mean = table.all_rows
     assert row.action_first_accuracy is not None
     assert row.action_accuracy is not None

@@ -12,12 +12,12 @@ from probe_kit.retention.columns.text import (
     rule_name,
     wording_title,
 )
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.text_table import TextTable, is_asked
 from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 
-def condition_tables(rows: Sequence[RetentionRow], wordings: Sequence[WordingPair]) -> list[PlainTable]:
+def condition_tables(rows: Sequence[RetentionRow], wordings: Sequence[WordingPair]) -> list[TextTable]:
     """What the outcome rule makes of every model, and the wordings of each run against each other."""
     acted = [row for row in once_per_category(rows) if not is_asked(row)]
     found = []
@@ -25,11 +25,11 @@ def condition_tables(rows: Sequence[RetentionRow], wordings: Sequence[WordingPai
         columns = ("model", "category", *(f"{name} %" for name, _ in RULE_COLUMNS))
         cells = tuple((model_name(row), row.category, *(cell(row) for _, cell in RULE_COLUMNS)) for row in acted)
         note = "; ".join(rule_sentences(rows))
-        found.append(PlainTable(f"What the {rule_name(acted)} makes of it", note, columns, cells))
+        found.append(TextTable(f"What the {rule_name(acted)} makes of it", note, columns, cells))
     for title, pairs in groupby(wordings, key=wording_title):
         columns = ("category", *(name for name, _ in WORDING_COLUMNS))
         cells = tuple((pair.category, *(cell(pair) for _, cell in WORDING_COLUMNS)) for pair in pairs)
-        found.append(PlainTable(title, _LADDER, columns, cells))
+        found.append(TextTable(title, _LADDER, columns, cells))
     return found
 
 

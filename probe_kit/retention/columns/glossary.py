@@ -84,7 +84,7 @@ GLOSSARY = MappingProxyType(
         ),
         "beats": (
             "What the best layer is better than, family-wise and paired by question: chance; binding, an "
-            "untrained conjunction of pictures and words; the twin, the same network with random weights. Only "
+            "untrained conjunction of pictures and words; untrained, the same network with random weights. Only "
             "what beats all that was tried is knowledge; against chance alone a random network can look knowing."
         ),
         "retention": (
@@ -119,7 +119,7 @@ GLOSSARY = MappingProxyType(
             "The same probe on the layout, the words, or the two pictures alone. Red: the suite gives the "
             "answer away without a model."
         ),
-        "twin": (
+        "untrained": (
             "The same probes on another run of the same episodes, usually with untrained weights, subtracted."
         ),
         "random weights": "Nobody trained this model. It shows what knowing nothing looks like.",

@@ -6,6 +6,8 @@ from probe_kit.retention.columns.text import (
     action_share,
     action_value,
     area_value,
+    backbone_share,
+    backbone_value,
     bounded_value,
     call_value,
     category_name,
@@ -13,8 +15,6 @@ from probe_kit.retention.columns.text import (
     difference_test,
     model_name,
     number,
-    prefix_share,
-    prefix_value,
     retention_value,
     success_interval,
     success_value,
@@ -24,31 +24,31 @@ from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.estimators.bootstrap_draws import Limits
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
-Line = RetentionRow | Difference
+TableRow = RetentionRow | Difference
 Cell = Callable[[RetentionRow], str]
 
 
-def compared(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> list[Line]:
+def compared(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> list[TableRow]:
     """Rows of one run as they are; those of several by category, each followed by its differences, means last."""
     if len({(row.group, row.run) for row in rows}) < 2:
         return list(rows)
     categories = list(dict.fromkeys(row.category for row in rows))
     ordered = sorted(categories, key=lambda name: name == MEAN)
     shown = _among(rows, differences)
-    lines: list[Line] = [*rows, *shown]
+    lines: list[TableRow] = [*rows, *shown]
     return [line for name in ordered for line in lines if line.category == name]
 
 
-def behaviour_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[Line]:
+def behaviour_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
     """Lines of success rates. rows: once per category and run."""
     once = {(row.group, row.minus, row.category): row for row in reversed(differences) if row.sr is not None}
     return compared(rows, list(once.values())[::-1])
 
 
-def probe_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[Line]:
+def probe_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
     """Lines of probes, view by view."""
     views = dict.fromkeys(row.view for row in rows)
-    known = [row for row in differences if row.prefix_accuracy is not None or row.action_accuracy is not None]
+    known = [row for row in differences if row.backbone_accuracy is not None or row.action_accuracy is not None]
     return [
         line
         for view in views
@@ -62,7 +62,7 @@ def _among(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> l
     return [row for row in differences if {row.group, row.minus} <= names]
 
 
-def cell_of(cell: Cell, line: Line) -> str:
+def cell_of(cell: Cell, line: TableRow) -> str:
     """What stands in a column in any line; nothing where differences have no such number."""
     if isinstance(line, RetentionRow):
         return cell(line)
@@ -85,7 +85,7 @@ def difference_legend(differences: Sequence[Difference], behaviour: bool = True)
     own = "" if all(row.paired for row in differences) else "of other items: each side's own groups drawn"
     tests = "p of SR: exact, signs of groups flipped, in means over all items (Holm: all categories and pairs)"
     shown = tests if behaviour and any(row.p is not None for row in differences) else ""
-    probes = "best sites held fixed" if any(row.prefix_accuracy is not None for row in differences) else ""
+    probes = "best sites held fixed" if any(row.backbone_accuracy is not None for row in differences) else ""
     return "differences: 95 %, " + "; ".join(filter(None, [drawn, own, probes, shown]))
 
 
@@ -118,7 +118,7 @@ def _success(row: Difference) -> str:
 
 
 def _prefix(row: Difference) -> str:
-    return _points(row.prefix_accuracy, row.prefix_ci)
+    return _points(row.backbone_accuracy, row.backbone_ci)
 
 
 def _action(row: Difference) -> str:
@@ -136,8 +136,8 @@ _OF_DIFFERENCES: Mapping[Cell, Callable[[Difference], str]] = {
     call_value: lambda row: "–" if row.call is None else str(row.call),
     success_interval: _success,
     success_value: _success,
-    prefix_value: _prefix,
-    prefix_share: _prefix,
+    backbone_value: _prefix,
+    backbone_share: _prefix,
     action_value: _action,
     action_share: _action,
     retention_value: _bounded,

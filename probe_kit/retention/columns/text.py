@@ -53,9 +53,9 @@ def success_value(row: RetentionRow) -> str:
     return NOT_ACTED if row.sr is None else percent(row.sr)
 
 
-def prefix_value(row: RetentionRow) -> str:
+def backbone_value(row: RetentionRow) -> str:
     """Accuracy of the backbone's best site in percent, with its interval."""
-    return with_limits(percent(row.prefix_accuracy), row.prefix_ci, percent)
+    return with_limits(percent(row.backbone_accuracy), row.backbone_ci, percent)
 
 
 def action_value(row: RetentionRow) -> str:
@@ -63,9 +63,9 @@ def action_value(row: RetentionRow) -> str:
     return with_limits(percent(row.action_accuracy), row.action_ci, percent)
 
 
-def prefix_share(row: RetentionRow) -> str:
+def backbone_share(row: RetentionRow) -> str:
     """Accuracy of the backbone's best site without its interval."""
-    return percent(row.prefix_accuracy)
+    return percent(row.backbone_accuracy)
 
 
 def action_share(row: RetentionRow) -> str:
@@ -93,7 +93,7 @@ def _judged(cell: Callable[[RetentionRow], str]) -> Callable[[RetentionRow], str
 
 
 RULE_COLUMNS: list[Column] = [
-    ("answered", _judged(lambda row: percent(row.p_answered))),
+    ("answered", _judged(lambda row: percent(row.share_answered))),
     (
         "SR of answered [95 %]",
         _judged(lambda row: with_limits(percent(row.sr_answered), row.sr_answered_ci, percent)),
@@ -102,9 +102,9 @@ RULE_COLUMNS: list[Column] = [
         "SR of grasped [95 %]",
         _judged(lambda row: with_limits(percent(row.sr_grasped), row.sr_grasped_ci, percent)),
     ),
-    ("answers that never left the start", _judged(lambda row: percent(row.p_answers_unmoved))),
+    ("answers that never left the start", _judged(lambda row: percent(row.share_unmoved_answers))),
     ("doing nothing scores", _judged(lambda row: percent(row.sr_idle))),
-    ("in both zones", _judged(lambda row: percent(row.p_both) if row.p_both else "–")),
+    ("in both zones", _judged(lambda row: percent(row.share_both_zones) if row.share_both_zones else "–")),
 ]
 """What stands beside a success rate, because an outcome rule may give it away; in percent."""
 
@@ -127,11 +127,11 @@ def followed(rows: Sequence[RetentionRow]) -> bool:
 ANSWER_SCORES: list[Column] = [
     ("by text", lambda row: percent(row.accuracy_text)),
     ("by logits", lambda row: percent(row.accuracy_logits)),
-    ("without letter bias", lambda row: percent(row.accuracy_debiased)),
-    ("unreadable", lambda row: percent(row.p_unreadable)),
-    ("near ties", lambda row: percent(row.p_near_tie)),
+    ("without letter bias", lambda row: percent(row.accuracy_order_balanced)),
+    ("unreadable", lambda row: percent(row.share_unparsable)),
+    ("near ties", lambda row: percent(row.share_near_tie)),
 ]
-"""What answers of asked runs say by each score, in percent."""
+"""What answers of VLM runs say by each score, in percent."""
 ANSWER_MEASURES: list[Column] = [
     ("option mass", lambda row: number(row.option_mass)),
     ("letter bias", lambda row: number(row.letter_bias)),
@@ -191,12 +191,12 @@ FURTHER_RETENTION: list[Column] = [
 
 def margin_value(row: RetentionRow) -> str:
     """The Δ that decides the regime, in points: over as many items as count."""
-    return percent(row.delta_regime)
+    return percent(row.chance_margin)
 
 
 def paper_margin(row: RetentionRow) -> str:
     """The paper's Δ in points, over episodes; it decides nothing here."""
-    return percent(row.delta)
+    return percent(row.chance_margin_episodes)
 
 
 def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
@@ -209,9 +209,9 @@ def place(layer: int | None, iteration: int | None = None, ties: int | None = No
     return f"{layer}{more}" if iteration is None else f"{layer} @{iteration}{more}"
 
 
-def prefix_place(row: RetentionRow) -> str:
+def backbone_place(row: RetentionRow) -> str:
     """Where the backbone's best site is."""
-    return place(row.prefix_layer, None, row.prefix_ties)
+    return place(row.backbone_layer, None, row.backbone_ties)
 
 
 def action_place(row: RetentionRow) -> str:
@@ -236,7 +236,7 @@ def call_words(call: int) -> str:
 
 def beats(row: RetentionRow) -> str:
     """What the backbone's best site is better than, and what not; says so if only chance was asked."""
-    found = {name: better for name, better in row.prefix_beats.items() if better is not None}
+    found = {name: better for name, better in row.backbone_exceeds.items() if better is not None}
     if set(found) == {"chance"}:
         return "against chance only" if found["chance"] else "not chance"
     return ", ".join(name if better else f"not {name}" for name, better in found.items()) or "–"
@@ -282,12 +282,20 @@ CONTROL_PARTS: dict[str, Sequence[Column]] = {
         ("binding", baseline("binding")),
     ],
     "Selectivity": [
-        ("selectivity: backbone", lambda row: percent(row.prefix_selectivity)),
+        ("selectivity: backbone", lambda row: percent(row.backbone_selectivity)),
         ("action", lambda row: percent(row.action_selectivity)),
     ],
-    "Against the twin": [
-        ("backbone − twin", lambda row: with_limits(percent(row.prefix_twin), row.prefix_twin_ci, percent)),
-        ("action − twin", lambda row: with_limits(percent(row.action_twin), row.action_twin_ci, percent)),
+    "Against the untrained network": [
+        (
+            "backbone − untrained",
+            lambda row: with_limits(
+                percent(row.backbone_minus_untrained), row.backbone_minus_untrained_ci, percent
+            ),
+        ),
+        (
+            "action − untrained",
+            lambda row: with_limits(percent(row.action_minus_untrained), row.action_minus_untrained_ci, percent),
+        ),
     ],
 }
 """Columns of the controls, by the question they answer."""
@@ -300,7 +308,7 @@ CONTROL_COLUMNS: list[Column] = [
 
 def controlled(rows: Sequence[RetentionRow]) -> bool:
     """Whether any row was held against a control."""
-    return any(row.baselines or row.twin for row in rows)
+    return any(row.baselines or row.untrained for row in rows)
 
 
 # -- wordings ------------------------------------------------------------------------------------------------

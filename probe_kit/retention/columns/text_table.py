@@ -17,14 +17,14 @@ from probe_kit.retention.columns.text import (
     success_interval,
     with_limits,
 )
-from probe_kit.retention.compare.vlm_vla import VlmGap
+from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 ANSWERS = "Answers"
 
 
 @dataclass(frozen=True)
-class PlainTable:
+class TextTable:
     """title and note: what it shows, and what to know when reading it. cells: a row of text per line."""
 
     title: str
@@ -34,7 +34,7 @@ class PlainTable:
 
 
 def is_asked(row: RetentionRow) -> bool:
-    """Whether a row is of an asked run."""
+    """Whether a row is of a VLM run."""
     return row.kind == "asks"
 
 
@@ -47,13 +47,13 @@ _ANSWERS: Sequence[Column] = [
 ]
 
 
-def answer_table(rows: Sequence[RetentionRow]) -> PlainTable | None:
-    """How asked runs answered, by every score; None if no run was asked."""
+def answer_table(rows: Sequence[RetentionRow]) -> TextTable | None:
+    """How VLM runs answered, by every score; None if no run was asked."""
     asked = once_per_category([row for row in rows if is_asked(row)])
     if not asked:
         return None
     scores = ", ".join(dict.fromkeys(str(row.score) for row in asked))
-    return PlainTable(
+    return TextTable(
         ANSWERS,
         f"accuracy is by {scores}; {ANSWER_LEGEND}",
         tuple(name for name, _ in _ANSWERS),
@@ -61,7 +61,7 @@ def answer_table(rows: Sequence[RetentionRow]) -> PlainTable | None:
     )
 
 
-def size_table(means: Sequence[RetentionRow]) -> PlainTable | None:
+def size_table(means: Sequence[RetentionRow]) -> TextTable | None:
     """Mean accuracy by model and prompt, a column per size of the picture; None unless something varies."""
     asked = [row for row in once_per_category(means) if is_asked(row) and row.category == MEAN]
     sizes = sorted({str(row.picture_size) for row in asked}, key=lambda size: [int(n) for n in size.split("x")])
@@ -76,7 +76,7 @@ def size_table(means: Sequence[RetentionRow]) -> PlainTable | None:
         lines.setdefault((name, prompt), {})[str(row.picture_size)] = success_interval(row)
     if len(asked) < 2:
         return None
-    return PlainTable(
+    return TextTable(
         "Accuracy by prompt and size of the picture",
         "mean over categories in %, with its 95 % interval",
         ("model", "prompt", *sizes),
@@ -84,32 +84,32 @@ def size_table(means: Sequence[RetentionRow]) -> PlainTable | None:
     )
 
 
-_GAPS: Sequence[tuple[str, Callable[[VlmGap], str]]] = [
+_GAPS: Sequence[tuple[str, Callable[[VlmVlaDifference], str]]] = [
     ("category", lambda gap: gap.category),
     ("VLM %", lambda gap: percent(gap.accuracy)),
     ("VLA %", lambda gap: percent(gap.sr)),
-    ("VLM − VLA [95 %]", lambda gap: with_limits(percent(gap.vlm_gap), gap.vlm_gap_ci, percent)),
+    ("VLM − VLA [95 %]", lambda gap: with_limits(percent(gap.difference), gap.difference_ci, percent)),
     ("p", lambda gap: number(gap.p, 4)),
     ("p (Holm)", lambda gap: number(gap.p_holm, 4)),
     ("items", lambda gap: str(gap.n_items)),
 ]
 
 
-def gap_tables(gaps: Sequence[VlmGap]) -> list[PlainTable]:
-    """One table per pair of an asked and an acting run."""
+def vlm_vla_tables(gaps: Sequence[VlmVlaDifference]) -> list[TextTable]:
+    """One table per pair of a VLM run and a policy run."""
     return [
         _gap_table(asked, acted, list(rows))
         for (asked, acted), rows in groupby(gaps, key=lambda gap: (gap.asked, gap.acted))
     ]
 
 
-def _gap_table(asked: str, acted: str, rows: Sequence[VlmGap]) -> PlainTable:
+def _gap_table(asked: str, acted: str, rows: Sequence[VlmVlaDifference]) -> TextTable:
     frames = {row.same_frames for row in rows}
     seen = (
         "the same first frames" if frames == {True} else "OTHER first frames" if False in frames else "no hashes"
     )
     items = "the same items" if all(row.paired for row in rows) else "OTHER items: not paired, no p"
-    return PlainTable(
+    return TextTable(
         f"VLM − VLA: {asked} − {acted}",
         f"{items}; {seen}; p: exact, whole groups of items flipped",
         tuple(name for name, _ in _GAPS),

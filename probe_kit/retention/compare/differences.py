@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Estimates, Limits, average
-from probe_kit.retention.rows.build import Drawn
+from probe_kit.retention.rows.build import RowWithDraws
 from probe_kit.retention.rows.category_mean import average_estimates
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.paired_tests import holm
@@ -38,8 +38,8 @@ class Difference:
     paired: bool
     sr: float | None = None
     sr_ci: Limits | None = None
-    prefix_accuracy: float | None = None
-    prefix_ci: Limits | None = None
+    backbone_accuracy: float | None = None
+    backbone_ci: Limits | None = None
     action_accuracy: float | None = None
     action_ci: Limits | None = None
     retention: float | None = None
@@ -61,7 +61,7 @@ class Side:
     """One side of a comparison: what it is called, the rows of its runs, and where it lies if it is one run."""
 
     name: str
-    drawn: Sequence[Drawn]
+    drawn: Sequence[RowWithDraws]
     run: str | None = None
 
     def only(self, categories: Sequence[str]) -> "Side":
@@ -69,7 +69,9 @@ class Side:
         return replace(self, drawn=[one for one in self.drawn if one.row.category in categories])
 
 
-def group_differences(groups: Mapping[str, Sequence[Drawn]], against: str | None = None) -> list[Difference]:
+def group_differences(
+    groups: Mapping[str, Sequence[RowWithDraws]], against: str | None = None
+) -> list[Difference]:
     """Every group minus every later one, or minus the group `against`, per view and category and over all.
 
     Raises UsageError for a group that is none of them.
@@ -102,7 +104,7 @@ Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
 """Per category, a table of outcomes of each run."""
 
 
-def _outcomes(drawn: Sequence[Drawn]) -> Outcomes:
+def _outcomes(drawn: Sequence[RowWithDraws]) -> Outcomes:
     """Once per run, whatever number of views it has."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for one in drawn:
@@ -117,7 +119,7 @@ def _behaviour(views: Mapping[str | None, Mapping[str, Estimates]]) -> dict[str 
     return {None: {name: {"sr": found["sr"]} if "sr" in found else {} for name, found in first.items()}}
 
 
-def _by_view(drawn: Sequence[Drawn]) -> dict[str | None, dict[str, Estimates]]:
+def _by_view(drawn: Sequence[RowWithDraws]) -> dict[str | None, dict[str, Estimates]]:
     """Estimates per view and category, averaged over runs; a quantity that a run lacks is left out."""
     views: dict[str | None, dict[str, list[Estimates]]] = {}
     for one in drawn:

@@ -1,7 +1,7 @@
 """Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
 
 known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance, binding
-and twin. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side is
+and untrained. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side is
 right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
 """
 
@@ -63,7 +63,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Joined:
+class CategoryCounts:
     """One category, or all of them (`all`).
 
     counts: items by known, encoded, used, such as `101` for known, not encoded, used; without probes `1-1`.
@@ -93,8 +93,8 @@ class Joined:
 
 
 @dataclass(frozen=True)
-class KnownUsed:
-    """An asked and an acting run joined, item by item. view: of the probes; None without any.
+class KnownUsedTable:
+    """A VLM run and a policy run joined, item by item. view: of the probes; None without any.
 
     notes: what a reader must know, a sentence each.
     """
@@ -103,7 +103,7 @@ class KnownUsed:
     acted: str
     score: str
     view: str | None
-    rows: tuple[Joined, ...]
+    rows: tuple[CategoryCounts, ...]
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -129,16 +129,16 @@ class KnownUsed:
         )
 
 
-def join(
+def match_runs(
     asked: RunReader,
     acted: RunReader,
     results: ProbeResults | None = None,
     view: str | None = None,
     seed: int = 0,
-) -> KnownUsed:
-    """Join an asked run (as `scored` reads it) with an acting one and its probes.
+) -> KnownUsedTable:
+    """Join a VLM run (as `scored` reads it) with a policy run and its probes.
 
-    results: probes of the acting run; None joins known and used only. view: one that was probed, by default the
+    results: probes of the policy run; None joins known and used only. view: one that was probed, by default the
     first. seed: of the halves in which sites are chosen, and of permutations.
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
@@ -157,7 +157,7 @@ def join(
         rows.append(_over_all(whole, rows, seed))
     notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *_without_signal(rows)]
     score = str(getattr(asked, "score", "text"))
-    return KnownUsed(asked.label, acted.label, score, chosen, tuple(_with_holm(rows)), tuple(notes))
+    return KnownUsedTable(asked.label, acted.label, score, chosen, tuple(_with_holm(rows)), tuple(notes))
 
 
 # -- the same questions ----------------------------------------------------------------------------------
@@ -166,13 +166,13 @@ def join(
 def _refuse_kinds(asked: RunReader, acted: RunReader) -> None:
     if ask_of(asked) is None or ask_of(acted) is not None:
         raise UsageError(
-            f"{asked.location} and {acted.location} are not an asked and an acting run, in this order; make them "
+            f"{asked.location} and {acted.location} are not a VLM run and a policy run, in this order; make them "
             "with `probe-kit ask` and `probe-kit extract`"
         )
 
 
 def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
-    """The episodes of both: columns of the acting run, and `outcome_asked`."""
+    """The episodes of both: columns of the policy run, and `outcome_asked`."""
     for run in (asked, acted):
         if FRAME not in run.episodes or run.episodes[FRAME].isna().any():
             raise OtherFramesError(
@@ -292,7 +292,7 @@ def _mark(known: bool, encoded: float, used: bool) -> str:
     return f"{int(known)}{middle}{int(used)}"
 
 
-def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
+def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> CategoryCounts:
     known, used = items["known"].to_numpy(bool), items["used"].to_numpy(bool)
     values = items["encoded"].to_numpy(float)
     probed = bool(len(values)) and not np.isnan(values).any()
@@ -305,7 +305,7 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
     ]
     every = ["".join(parts) for parts in product(marks, middle, marks)]
     singles = [mark if probed else f"{mark[0]}-{mark[2]}" for own in items["marks"] for mark in own]
-    return Joined(
+    return CategoryCounts(
         category=category,
         n_items=len(items),
         n_groups=int(items["group"].nunique()),
@@ -355,7 +355,7 @@ def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
     }
 
 
-def _over_all(items: "pd.DataFrame", rows: Sequence[Joined], seed: int) -> Joined:
+def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) -> CategoryCounts:
     signals = {row.signal for row in rows}
     whole = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
     if whole.encoded is None:
@@ -366,7 +366,7 @@ def _over_all(items: "pd.DataFrame", rows: Sequence[Joined], seed: int) -> Joine
     return replace(whole, p_linked=p)
 
 
-def _with_holm(rows: Sequence[Joined]) -> list[Joined]:
+def _with_holm(rows: Sequence[CategoryCounts]) -> list[CategoryCounts]:
     """The tests of all categories are one family; those over all categories are a summary and no part of it."""
     single = [row for row in rows if row.category != OVERALL]
     corrected = iter(holm([one.p for row in single for one in row.comparisons]))
@@ -398,7 +398,7 @@ def _of_picture(asked: RunReader) -> list[str]:
     return notes
 
 
-def _without_signal(rows: Sequence[Joined]) -> list[str]:
+def _without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
     dull = [row.category for row in rows if row.signal is False and row.category != OVERALL]
     if not dull:
         return []

@@ -10,7 +10,7 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
 from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Axis, Weighed, stored_attention
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -39,7 +39,7 @@ class AttentionDisplay(Panelled):
     mean: Percent
     iterations: Percent
     heads: Percent
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -51,10 +51,10 @@ class AttentionDisplay(Panelled):
                 f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
                 "--kind attention`"
             )
-        return cls._of(found, category, Certificate.of_run(run))
+        return cls._of(found, category, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, weighed: Weighed, category: str, certificate: Certificate) -> Self:
+    def _of(cls, weighed: Weighed, category: str, certificate: ProvenanceLine) -> Self:
         left_out = {ALL, "special", *TILE_ROLES}
         blocks = np.unique(weighed.frame(("block",))["block"].to_numpy(np.int64))
         roles = tuple(role for role in weighed.shares() if role not in left_out)
@@ -101,7 +101,7 @@ class AttentionDisplay(Panelled):
 def attention_curve(run: RunReader) -> "Figure":
     """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
     displays = [
-        AttentionDisplay._of(weighed, category, Certificate.of_run(run))
+        AttentionDisplay._of(weighed, category, ProvenanceLine.of_run(run))
         for category, weighed in stored_attention(run).items()
     ]
     if not displays:

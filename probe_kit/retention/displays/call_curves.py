@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import known_view
 from probe_kit.retention.displays.base.style import (
     PARTS,
@@ -36,7 +36,7 @@ _RELABELLED = "best relabelled probe, 95 %"
 
 
 @dataclass
-class CallCurveDisplay(Shown):
+class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run; the
@@ -50,7 +50,7 @@ class CallCurveDisplay(Shown):
     lines: tuple[CallLine, ...]
     events: tuple[EventTimes, ...]
     aligned: Mapping[str, tuple[AlignedLine, ...]]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -78,7 +78,7 @@ class CallCurveDisplay(Shown):
             lines=tuple(map(curves.line, curves.streams)),
             events=tuple(curves.event_times()),
             aligned={event: lines for event, lines in aligned.items() if lines},
-            certificate=Certificate.of_results(first, curves.view),
+            certificate=ProvenanceLine.of_results(first, curves.view),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -182,7 +182,7 @@ def _finish(axes: "Axes", title: str, below: str) -> None:
     axes.set_xlabel(below, fontsize=8.5)
 
 
-def _complete(figure: "Figure", axes: "Axes", certificate: Certificate, tested: bool) -> None:
+def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, tested: bool) -> None:
     """tested: whether markers are filled where something is evidence."""
 
     handles: dict[str, Artist] = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))

@@ -11,7 +11,7 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.kinds.site_effects import Passing
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import GREY, series
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -45,7 +45,7 @@ class DoseResponseDisplay(Panelled):
     controls: Percent
     norm_ratio: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -62,10 +62,10 @@ class DoseResponseDisplay(Panelled):
                 f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
             )
         chosen = place or next(iter(found))
-        return cls._of(found[chosen], category, chosen, Certificate.of_run(run))
+        return cls._of(found[chosen], category, chosen, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, rows: Sequence[Passing], category: str, place: str, certificate: Certificate) -> Self:
+    def _of(cls, rows: Sequence[Passing], category: str, place: str, certificate: ProvenanceLine) -> Self:
         own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.dose))
         doses = np.array([float(row.dose) for row in own])
         names = dict.fromkeys(row.direction for row in rows if row.is_control)
@@ -113,7 +113,7 @@ class DoseResponseDisplay(Panelled):
 def dose_response(run: RunReader) -> "Figure":
     """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
     displays = [
-        DoseResponseDisplay._of(rows, category, place, Certificate.of_run(run))
+        DoseResponseDisplay._of(rows, category, place, ProvenanceLine.of_run(run))
         for category, every in stored_steering(run).items()
         for place, rows in every.items()
     ]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -30,7 +30,7 @@ _MANY = 300  # points, above which a vector figure holds them as a picture
 
 
 @dataclass
-class FinalPositionsDisplay(Shown):
+class FinalPositionsDisplay(Display):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
     xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and
@@ -42,7 +42,7 @@ class FinalPositionsDisplay(Shown):
     outcome: NDArray[np.str_]
     never_moved: int
     scene: Mapping[str, Any]
-    certificate: Certificate
+    certificate: ProvenanceLine
     rule: str = DEFAULT_RULE
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
@@ -70,7 +70,7 @@ class FinalPositionsDisplay(Shown):
             outcome=episodes["outcome"].to_numpy(dtype=str),
             never_moved=int(unmoved),
             scene=scene,
-            certificate=Certificate.of_run(run),
+            certificate=ProvenanceLine.of_run(run),
             rule=getattr(run, "rule", DEFAULT_RULE),
         )
 

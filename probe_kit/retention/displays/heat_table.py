@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar, Self
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import axes_for, caption
 from probe_kit.retention.formats.heat import HEAT, heat_colour
 from probe_kit.retention.rows.row import RetentionRow
@@ -34,7 +34,7 @@ class Cell:
 
 
 @dataclass
-class HeatTableDisplay(Shown):
+class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
@@ -44,7 +44,7 @@ class HeatTableDisplay(Shown):
     rows: tuple[str, ...]
     columns: tuple[str, ...]
     cells: tuple[tuple[Cell, ...], ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     parts: ClassVar[tuple[str, ...]] = ("",)
     title: ClassVar[str] = ""
     note: ClassVar[str] = ""
@@ -78,7 +78,7 @@ class HeatTableDisplay(Shown):
             cells=tuple(
                 tuple(cell(line[name]) if name in line else blank for name in columns) for line in lines.values()
             ),
-            certificates=tuple(Certificate.of_row(list(line.values())[-1]) for line in lines.values()),
+            certificates=tuple(ProvenanceLine.of_row(list(line.values())[-1]) for line in lines.values()),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:

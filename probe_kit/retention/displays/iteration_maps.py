@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class IterationMapDisplay(Shown):
+class IterationMapDisplay(Display):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
     accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream, and
@@ -41,7 +41,7 @@ class IterationMapDisplay(Shown):
     iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -71,7 +71,7 @@ class IterationMapDisplay(Shown):
             iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
             significant=grid["signal"].to_numpy(dtype=bool),
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )
 
     @property

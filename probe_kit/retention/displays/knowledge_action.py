@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import (
     axes_for,
     caption,
@@ -42,7 +42,7 @@ class GapPoint:
 
 
 @dataclass
-class KnowledgeActionDisplay(Shown):
+class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
     On the diagonal the policy acts on what can be read; below it, it knows more than it does. Both axes run from 0
@@ -51,7 +51,7 @@ class KnowledgeActionDisplay(Shown):
 
     stream: str
     points: tuple[GapPoint, ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -74,7 +74,7 @@ class KnowledgeActionDisplay(Shown):
                 f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
             )
         means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
-        return cls(stream, tuple(points), tuple(Certificate.of_row(mean) for mean in means))
+        return cls(stream, tuple(points), tuple(ProvenanceLine.of_row(mean) for mean in means))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and captions."""
@@ -101,17 +101,17 @@ class KnowledgeActionDisplay(Shown):
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     prefix = stream == "backbone"
-    accuracy = row.prefix_accuracy if prefix else row.action_accuracy
+    accuracy = row.backbone_accuracy if prefix else row.action_accuracy
     if accuracy is None or row.sr is None or row.sr_ci is None:
         return None
     return GapPoint(
         model=model_name(row),
         category=row.category,
         accuracy=accuracy,
-        accuracy_ci=row.prefix_ci if prefix else row.action_ci,
+        accuracy_ci=row.backbone_ci if prefix else row.action_ci,
         sr=row.sr,
         sr_ci=row.sr_ci,
-        significant=row.prefix_signal if prefix else row.action_signal,
+        significant=row.backbone_signal if prefix else row.action_signal,
     )
 
 

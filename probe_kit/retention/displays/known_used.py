@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.compare.known_used import KnownUsed
-from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.compare.known_used import KnownUsedTable
+from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.style import (
     BLUE,
     GREEN,
@@ -43,7 +43,7 @@ _LEAST = 6.0  # percent of a bar that has room for a number
 
 
 @dataclass
-class KnownUsedDisplay(Shown):
+class KnownUsedDisplay(Display):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
     counts: items by category and code, such as `101` for known, not encoded, used (`1-1` without probes). title:
@@ -56,7 +56,7 @@ class KnownUsedDisplay(Shown):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_join(cls, joined: KnownUsed) -> Self:
+    def from_join(cls, joined: KnownUsedTable) -> Self:
         """From what `probe_kit.retention.compare.known_used.join` gives."""
         seen = f"probes in view {joined.view}" if joined.view else "no probes"
         return cls(

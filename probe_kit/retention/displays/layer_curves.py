@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import (
     DPI,
@@ -41,11 +41,11 @@ _PEAK = "best of its stream (all, where several tie)"
 
 
 @dataclass
-class LayerCurveDisplay(Shown):
+class LayerCurveDisplay(Display):
     """Held-out accuracy by layer, for one category in one view.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above binding
-    and twin where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
+    and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
     relabelling; None below 20 relabellings.
     """
 
@@ -54,7 +54,7 @@ class LayerCurveDisplay(Shown):
     chance: float
     null_band: tuple[float, float] | None
     streams: tuple[StreamCurve, ...]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -77,7 +77,7 @@ class LayerCurveDisplay(Shown):
             chance=curve.chance,
             null_band=None if band is None else (float(band[0]), float(band[1])),
             streams=tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False)),
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -116,7 +116,7 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
     Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
     for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only where
     there are several lines. Filled markers are above chance against the best site of their stream (family-wise
-    p < 0.05), and above binding and twin where those were run. Grey: chance, and the band that holds 95 % of the
+    p < 0.05), and above binding and untrained where those were run. Grey: chance, and the band that holds 95 % of the
     accuracies under relabelling. view: the first probed one by default. Raises UnknownSiteError for a view that
     was not probed, UsageError for an iteration.
     """

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_name
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import known_view, of_iterations, scores_of
 from probe_kit.retention.displays.base.style import (
     ABOVE_CHANCE,
@@ -43,7 +43,7 @@ class ModelCurve:
 
 
 @dataclass
-class ModelDepthDisplay(Shown):
+class ModelDepthDisplay(Display):
     """Held-out accuracy above chance against depth, averaged over categories, one line per model.
 
     At each layer the best of the iterations counts, in each category by itself. Lines have no markers: a mean over
@@ -52,7 +52,7 @@ class ModelDepthDisplay(Shown):
 
     stream: str
     models: tuple[ModelCurve, ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -78,7 +78,7 @@ class ModelDepthDisplay(Shown):
         return cls(
             stream=stream,
             models=tuple(_curve(one, stream, shown, iterations, name) for one, shown, name in kept),
-            certificates=tuple(Certificate.of_results(one, shown) for one, shown, _ in kept),
+            certificates=tuple(ProvenanceLine.of_results(one, shown) for one, shown, _ in kept),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:

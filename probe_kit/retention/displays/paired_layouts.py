@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.behaviour.success_rate import PairedItems, paired_items
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -24,7 +24,7 @@ _PARTS = (
 
 
 @dataclass
-class PairedLayoutsDisplay(Shown):
+class PairedLayoutsDisplay(Display):
     """Items by outcome of their two layouts, per category.
 
     Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its
@@ -32,7 +32,7 @@ class PairedLayoutsDisplay(Shown):
     """
 
     items: dict[str, PairedItems]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -40,7 +40,7 @@ class PairedLayoutsDisplay(Shown):
         """From the episodes of a run; items that ran in one layout are left out."""
         by_category = run.episodes.groupby("category", sort=False)
         items = {str(category): paired_items(episodes) for category, episodes in by_category}
-        return cls(items, Certificate.of_run(run))
+        return cls(items, ProvenanceLine.of_run(run))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""

@@ -13,11 +13,10 @@ from probe_kit.intervene.kinds.attention.attention_mass import stored_attention
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.compare.known_used import KnownUsed
+from probe_kit.retention.compare.known_used import KnownUsedTable
 from probe_kit.retention.displays.attention import attention_curve
 from probe_kit.retention.displays.base.style import SIGNAL
 from probe_kit.retention.displays.call_curves import aligned_curves, call_curves
-from probe_kit.retention.displays.causal_curve import causal_curve, shown_passing
 from probe_kit.retention.displays.dose_response import dose_response
 from probe_kit.retention.displays.final_positions import final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -35,10 +34,11 @@ from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.role_curves import role_curves
 from probe_kit.retention.displays.side_by_side import curves_side_by_side, has_maps, maps_side_by_side
+from probe_kit.retention.displays.site_effect_curve import shown_passing, site_effect_curve
 from probe_kit.retention.estimators.by_call import CallCurves, event_calls
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
+from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.by_call import load_calls
@@ -56,7 +56,7 @@ DOTS = f"Dots mark evidence: {SIGNAL}"
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class ReportFigure:
     """A figure that can be drawn.
 
     name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
@@ -84,7 +84,7 @@ class Exhibit:
             plt.close(figure)
 
 
-def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
+def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[ReportFigure]:
     """Every figure that the runs and the probes of their table allow. Nothing is drawn yet.
 
     Raises UsageError for a run that the table was not made of.
@@ -96,19 +96,22 @@ def gallery(runs: Sequence[RunReader], table: RetentionTable) -> list[Exhibit]:
     called = {row.run: model_name(row) for row in table.rows}
     names = [called[str(run.location)] for run in runs]
     exhibits = [*_of_table(table, results, names), *_of_rules(runs)]
-    exhibits += [*_side_by_side(results, names, table.iterations), *exhibit_joins(joins_of(runs, table).found)]
+    exhibits += [
+        *_side_by_side(results, names, table.iterations),
+        *known_used_figures(joins_of(runs, table).found),
+    ]
     for position, (name, run, probed) in enumerate(zip(run_names(runs), runs, results, strict=True)):
         if can_be_judged(run, table.rule, table.last_steps):
-            exhibits += _of_run(name, position, by_rule(run, table.rule, table.last_steps))
+            exhibits += _of_run(name, position, under_rule(run, table.rule, table.last_steps))
         if probed is not None:
             exhibits += _of_probes(name, position, probed, table.iterations)
             exhibits += _of_calls(name, position, run, probed)
-            exhibits += _of_causes(name, position, run, probed)
+            exhibits += _site_effect_figures(name, position, run, probed)
         exhibits += [*_of_steering(name, position, run), *_of_attention(name, position, run)]
     return exhibits
 
 
-def save_figures(exhibits: Sequence[Exhibit], folder: Path) -> Iterator[Path]:
+def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
     """Draw exhibits into `folder` as PNG and PDF, one after the other; gives the path of every PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     for exhibit in exhibits:
@@ -124,7 +127,7 @@ def caption_of(figure: "Figure") -> str:
     return str(getattr(figure, "caption", ""))
 
 
-def _metadata(suffix: str, exhibit: Exhibit, caption: str) -> dict[str, str | None]:
+def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str | None]:
     """The caption goes with the file, in what readers of its format show of it."""
     if suffix == ".pdf":
         return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
@@ -143,20 +146,22 @@ def run_names(runs: Sequence[RunReader]) -> list[str]:
 
 def _of_table(
     table: RetentionTable, results: Sequence[ProbeResults | None], names: Sequence[str]
-) -> list[Exhibit]:
-    def show(display: _TableDisplay, name: str, title: str, subject: str) -> Exhibit:
-        return Exhibit(name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True)
+) -> list[ReportFigure]:
+    def show(display: _TableDisplay, name: str, title: str, subject: str) -> ReportFigure:
+        return ReportFigure(
+            name, title, subject, display.note, None, lambda: _figure(display.from_table(table)), True
+        )
 
     acted = [row for row in table.rows if row.sr is not None]
-    exhibits: list[Exhibit] = []
+    exhibits: list[ReportFigure] = []
     if acted:
         exhibits += [
             show(SuccessTableDisplay, "success", "Success rate", "behaviour"),
             show(SideTableDisplay, "sides", "Success rate by side", "behaviour"),
         ]
-    if any(row.prefix_accuracy is not None for row in acted):
+    if any(row.backbone_accuracy is not None for row in acted):
         exhibits.append(
-            Exhibit(
+            ReportFigure(
                 "knowledge-action", "Knowledge and action", "retention",
                 "Each point is one category: how well the answer can be read inside the model (across) and how "
                 "often the model acts on it (up). Points far below the line are knowledge that does not reach the "
@@ -170,7 +175,7 @@ def _of_table(
     if len(probed) > 1:
         known, called = zip(*probed, strict=True)
         exhibits.append(
-            Exhibit(
+            ReportFigure(
                 "model-depths", "Models by depth", "probes",
                 "How far above chance the answer can be read, against depth as a fraction, so that models with "
                 "different numbers of layers can be compared.",
@@ -182,7 +187,7 @@ def _of_table(
 
 def _side_by_side(
     results: Sequence[ProbeResults | None], names: Sequence[str], iterations: Iterations
-) -> list[Exhibit]:
+) -> list[ReportFigure]:
     """Of every view that two or more runs were probed in."""
     probed = [(one, name) for one, name in zip(results, names, strict=True) if one is not None]
     views = list(dict.fromkeys(view for one, _ in probed for view in one.settings.views))
@@ -193,7 +198,7 @@ def _side_by_side(
             continue
         known, called = zip(*own, strict=True)
         exhibits.append(
-            Exhibit(
+            ReportFigure(
                 f"curves-side-by-side{_suffix(view, views)}",
                 "Layer curves side by side" + (f", view {view}" * (len(views) > 1)), "probes",
                 "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
@@ -204,7 +209,7 @@ def _side_by_side(
         )  # fmt: skip
         if sum(has_maps(one, view) for one in known) > 1:
             exhibits.append(
-                Exhibit(
+                ReportFigure(
                     f"maps-side-by-side{_suffix(view, views)}",
                     "Layer × iteration side by side" + (f", view {view}" * (len(views) > 1)), "probes",
                     "Where and when the answer can be read while the action is made, a column per run. Colours "
@@ -215,10 +220,10 @@ def _side_by_side(
     return exhibits
 
 
-def exhibit_joins(joins: Sequence[KnownUsed]) -> list[Exhibit]:
-    """A figure per join of an asked and an acting run."""
+def known_used_figures(joins: Sequence[KnownUsedTable]) -> list[ReportFigure]:
+    """A figure per join of a VLM run and a policy run."""
     return [
-        Exhibit(
+        ReportFigure(
             f"known-used-{number}", "Known, encoded, used", "join",
             "Every question once: does the reader know the answer, does a probe read it in the policy, and does "
             "the action follow, each in both layouts. Red is lost: known and encoded, not used.",
@@ -228,16 +233,16 @@ def exhibit_joins(joins: Sequence[KnownUsed]) -> list[Exhibit]:
     ]  # fmt: skip
 
 
-def _known_used(joined: KnownUsed) -> "Figure":
+def _known_used(joined: KnownUsedTable) -> "Figure":
     return _figure(KnownUsedDisplay.from_join(joined))
 
 
-def _of_rules(runs: Sequence[RunReader]) -> list[Exhibit]:
+def _of_rules(runs: Sequence[RunReader]) -> list[ReportFigure]:
     runs = [run for run in runs if getattr(run, "has_trajectories", False) and not run.episodes.empty]
     if not runs:
         return []
     return [
-        Exhibit(
+        ReportFigure(
             "outcome-rules", "The same episodes by every outcome rule", "behaviour",
             "What counts as an answer decides the success rate. A black mark is what a policy that does nothing "
             "would score by that rule: where there is one, the untouched cube already counts as put on a picture.",
@@ -246,11 +251,11 @@ def _of_rules(runs: Sequence[RunReader]) -> list[Exhibit]:
     ]  # fmt: skip
 
 
-def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
+def _of_run(name: str, position: int, run: RunReader) -> list[ReportFigure]:
     if listened(run.episodes):
         return []
     exhibits = [
-        Exhibit(
+        ReportFigure(
             f"{name}-paired-layouts", "The same question, pictures swapped", "behaviour",
             "Every question is asked twice, with the two pictures exchanged. Knowing the answer means right both "
             "times; always going to one side means right once. Bold p: more items are right twice than wrong "
@@ -260,7 +265,7 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
     ]  # fmt: skip
     if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
         exhibits.append(
-            Exhibit(
+            ReportFigure(
                 f"{name}-final-positions", "Where the cube ended", "behaviour",
                 "The table from above, the robot below the picture. An episode counts as an answer if the middle "
                 "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried "
@@ -271,10 +276,10 @@ def _of_run(name: str, position: int, run: RunReader) -> list[Exhibit]:
     return exhibits
 
 
-def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iterations) -> list[Exhibit]:
+def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iterations) -> list[ReportFigure]:
     views = results.settings.views
     exhibits = [
-        Exhibit(
+        ReportFigure(
             f"{name}-layer-curves{_suffix(view, views)}", "Layer curves" + (f", view {view}" * (len(views) > 1)),
             "probes",
             "How often a linear probe names the side of the correct picture in episodes it has not seen, layer by "
@@ -287,7 +292,7 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
     ]  # fmt: skip
     scores = results.scores
     exhibits += [
-        Exhibit(
+        ReportFigure(
             f"{name}-iteration-maps{_suffix(view, views)}",
             "Layer × iteration" + (f", view {view}" * (len(views) > 1)), "probes",
             "The action is made in several iterations (flow-matching steps or action tokens). Dark cells: "
@@ -301,7 +306,7 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
     for stream, rows in scores.groupby("stream", sort=False):
         if rows["view"].nunique() > 1:
             exhibits.append(
-                Exhibit(
+                ReportFigure(
                     f"{name}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
                     "The same probes on the mean of one kind of token at a time.",
                     position, partial(role_curves, results, str(stream), iterations=iterations),
@@ -310,28 +315,28 @@ def _of_probes(name: str, position: int, results: ProbeResults, iterations: Iter
     return exhibits
 
 
-def _of_causes(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
+def _site_effect_figures(name: str, position: int, run: RunReader, results: ProbeResults) -> list[ReportFigure]:
     """Only where an interchange is stored with the run."""
     if not set(shown_passing(run)) & set(results.settings.categories):
         return []
     view = results.settings.views[0]
     return [
-        Exhibit(
+        ReportFigure(
             f"{name}-causes", "Readable and used", "interventions",
             "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
             "layer are taken from the same inference before exchanged pictures. A layer that is readable and "
             "turns nothing is read by nothing behind it.",
-            position, partial(causal_curve, run, results, view),
+            position, partial(site_effect_curve, run, results, view),
         )
     ]  # fmt: skip
 
 
-def _of_steering(name: str, position: int, run: RunReader) -> list[Exhibit]:
+def _of_steering(name: str, position: int, run: RunReader) -> list[ReportFigure]:
     """Only where a steering is stored with the run."""
     if not stored_steering(run):
         return []
     return [
-        Exhibit(
+        ReportFigure(
             f"{name}-doses", "How much of a direction turns the action", "interventions",
             "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of the "
             "direction is added; filled: beyond random directions of the same norm (the band). One side may be "
@@ -341,12 +346,12 @@ def _of_steering(name: str, position: int, run: RunReader) -> list[Exhibit]:
     ]  # fmt: skip
 
 
-def _of_attention(name: str, position: int, run: RunReader) -> list[Exhibit]:
+def _of_attention(name: str, position: int, run: RunReader) -> list[ReportFigure]:
     """Only where attention is stored with the run."""
     if not stored_attention(run):
         return []
     return [
-        Exhibit(
+        ReportFigure(
             f"{name}-attention", "What is weighed", "interventions",
             "How much of the attention that what acts pays lies on the pictures, the words and its own tokens, by "
             "the block whose keys are read. Dots: single heads; bars: from the least to the most of any "
@@ -356,14 +361,14 @@ def _of_attention(name: str, position: int, run: RunReader) -> list[Exhibit]:
     ]  # fmt: skip
 
 
-def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -> list[Exhibit]:
+def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -> list[ReportFigure]:
     """Only where a later inference was probed as well."""
     calls = load_calls(run, results)
     if len(calls) < 2:
         return []
     views, events = results.settings.views, event_calls(run)
     exhibits = [
-        Exhibit(
+        ReportFigure(
             f"{name}-calls{_suffix(view, views)}", "Over the episode" + (f", view {view}" * (len(views) > 1)),
             "probes",
             f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
@@ -376,7 +381,7 @@ def _of_calls(name: str, position: int, run: RunReader, results: ProbeResults) -
     curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
     shown = [event for event in EVENTS if any(_aligned(one, event) for one in curves)]
     return exhibits + [
-        Exhibit(
+        ReportFigure(
             f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
             "The same, with every episode's inferences counted from its own event: 0 is the last one before it.",
             position, partial(aligned_curves, calls, event, views[0], events),

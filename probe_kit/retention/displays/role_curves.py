@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Self
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
 from probe_kit.retention.displays.base.style import (
     accuracy_axis,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class RoleCurvesDisplay(Shown):
+class RoleCurvesDisplay(Display):
     """Held-out accuracy by layer, one line per view of one stream, for one category.
 
     curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
@@ -42,7 +42,7 @@ class RoleCurvesDisplay(Shown):
     stream: str
     chance: float
     curves: dict[str, StreamCurve]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -74,7 +74,7 @@ class RoleCurvesDisplay(Shown):
             stream=stream,
             chance=curve_of(results, category, shown).chance,
             curves=found,
-            certificate=Certificate.of_results(results, shown),
+            certificate=ProvenanceLine.of_results(results, shown),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import (
     accuracy_axis,
@@ -67,7 +67,7 @@ def curves_side_by_side(
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
     figure.supylabel(f"held-out accuracy (%), view {view}", fontsize=9)
-    caption(figure, *(Certificate.of_results(one, view) for _, one in known))
+    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in known))
     return figure
 
 
@@ -140,7 +140,7 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
     figure.supylabel("iteration", fontsize=9)
     draw_scale(figure, grid, drawn, displays)
     draw_legend(figure)
-    caption(figure, *(Certificate.of_results(one, view) for _, one in shown))
+    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in shown))
     return figure
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.glossary import GLOSSARY
 from probe_kit.retention.columns.lines import (
-    Line,
+    TableRow,
     behaviour_lines,
     cell_of,
     compared,
@@ -21,6 +21,8 @@ from probe_kit.retention.columns.text import (
     action_place,
     action_value,
     area_value,
+    backbone_place,
+    backbone_value,
     beats,
     bounded_value,
     call_value,
@@ -33,13 +35,11 @@ from probe_kit.retention.columns.text import (
     once_per_category,
     percent,
     plain_value,
-    prefix_place,
-    prefix_value,
     probed,
     success_interval,
     view_name,
 )
-from probe_kit.retention.columns.text_table import PlainTable
+from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import heat_colour
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -182,15 +182,15 @@ _BEHAVIOUR = [
         )
         for name, cell in FOLLOWED_COLUMNS
     ),
-    _share("± Δ", "delta_regime", "Δ"),
-    _share("paper's Δ", "delta", "paper's Δ"),
+    _share("± Δ", "chance_margin", "Δ"),
+    _share("paper's Δ", "chance_margin_episodes", "paper's Δ"),
     _Column(
         "reading", _reading,
         lambda row: row.sr, "reading",
     ),
-    _share("wrong %", "p_wrong", "wrong"),
-    _share("outside %", "p_oob", "outside"),
-    _share("never moved %", "p_never_moved", "never moved"),
+    _share("wrong %", "share_wrong", "wrong"),
+    _share("outside %", "share_outside", "outside"),
+    _share("never moved %", "share_never_moved", "never moved"),
     _share("left %", "sr_left", "left", heat=True),
     _share("right %", "sr_right", "right", heat=True),
     _Column("right twice", _twice, lambda row: row.items_both_right, "right twice"),
@@ -206,7 +206,7 @@ _MORE_BEHAVIOUR = [
     _share("original %", "sr_original", "original"),
     _share("swapped %", "sr_swapped", "swapped"),
     _share("goes left %", "side_preference", "goes left"),
-    _share("flagged steps %", "p_flagged", "flagged"),
+    _share("flagged steps %", "share_invalid_action", "flagged"),
 ]
 
 _RETENTION = [
@@ -220,11 +220,11 @@ _RETENTION = [
     _Column("debiased [95 %]", debiased_value, _debiased, "debiased", _debiased),
     _Column("published", plain_value, _retention, "retention", _retention),
     _Column(
-        "backbone % [95 %]", prefix_value,
-        lambda row: row.prefix_accuracy, "backbone", strong=lambda row: row.prefix_signal,
+        "backbone % [95 %]", backbone_value,
+        lambda row: row.backbone_accuracy, "backbone", strong=lambda row: row.backbone_signal,
     ),
-    _Column("layer", prefix_place, lambda row: row.prefix_layer, "layer"),
-    _Column("p", lambda row: _p(row.prefix_p_fwe), lambda row: row.prefix_p_fwe, "p"),
+    _Column("layer", backbone_place, lambda row: row.backbone_layer, "layer"),
+    _Column("p", lambda row: _p(row.backbone_p_fwe), lambda row: row.backbone_p_fwe, "p"),
     _Column(
         "action % [95 %]", action_value,
         lambda row: row.action_accuracy, "action", strong=lambda row: row.action_signal,
@@ -243,8 +243,8 @@ _RETENTION = [
 
 _CONTROL_MEANINGS = {
     **dict.fromkeys(("position", "instruction", "pixels"), "position, instruction, pixels"),
-    "binding": "beats", "selectivity: backbone": "selectivity", "action": "selectivity", "backbone − twin": "twin",
-    "action − twin": "twin",
+    "binding": "beats", "selectivity: backbone": "selectivity", "action": "selectivity", "backbone − untrained": "untrained",
+    "action − untrained": "untrained",
 }  # fmt: skip
 
 
@@ -263,7 +263,7 @@ def more_behaviour_table(rows: Sequence[RetentionRow]) -> HtmlTable:
     return _table("Success rate by layout and zone radius", compared(once_per_category(rows)), columns)
 
 
-def retention_table(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> HtmlTable | None:
+def probe_table(rows: Sequence[RetentionRow], differences: Sequence[Difference] = ()) -> HtmlTable | None:
     """Probes and retention; None if no run was probed."""
     if not probed(rows):
         return None
@@ -271,13 +271,13 @@ def retention_table(rows: Sequence[RetentionRow], differences: Sequence[Differen
     return replace(_table("Probes and retention", lines, _RETENTION), captions=_captions(lines, behaviour=False))
 
 
-def _captions(lines: Sequence[Line], behaviour: bool = True) -> tuple[str, ...]:
+def _captions(lines: Sequence[TableRow], behaviour: bool = True) -> tuple[str, ...]:
     legend = difference_legend([line for line in lines if isinstance(line, Difference)], behaviour)
     return (f"{legend[0].upper()}{legend[1:]}.",) if legend else ()
 
 
 def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
-    """Baselines, selectivity and twin; None if nothing was controlled."""
+    """Baselines, selectivity and untrained; None if nothing was controlled."""
     if not controlled(rows):
         return None
     columns = [
@@ -289,7 +289,7 @@ def control_table(rows: Sequence[RetentionRow]) -> HtmlTable | None:
     return _table("Controls", compared(probed(rows)), columns)
 
 
-def plain_tables(tables: Sequence[PlainTable]) -> list[HtmlTable]:
+def plain_tables(tables: Sequence[TextTable]) -> list[HtmlTable]:
     """As they are; rows of means stay below when others are sorted."""
     return [
         HtmlTable(
@@ -315,7 +315,7 @@ def _radius(radius: str) -> _Column:
     return _Column(f"SR % at {1000 * float(radius):g} mm", lambda row: percent(value(row)), value, meaning, value)
 
 
-def _table(title: str, lines: Sequence[Line], columns: Sequence[_Column]) -> HtmlTable:
+def _table(title: str, lines: Sequence[TableRow], columns: Sequence[_Column]) -> HtmlTable:
     rows = [line for line in lines if isinstance(line, RetentionRow)]
     several = len({(row.group, row.run) for row in rows}) > 1
     shown = [column for column in columns if any(_text(column, line) not in ("–", "") for line in lines)]
@@ -341,11 +341,11 @@ def _unbroken(name: str) -> str:
     return name.replace(" %", "\u00a0%").replace("± ", "±\u00a0")
 
 
-def _text(column: _Column, line: Line) -> str:
+def _text(column: _Column, line: TableRow) -> str:
     return cell_of(column.text, line)
 
 
-def _cell(column: _Column, line: Line, several: bool) -> HtmlCell:
+def _cell(column: _Column, line: TableRow, several: bool) -> HtmlCell:
     """several: whether the category says whose row it is."""
     text = _text(column, line)
     below = ""
@@ -366,7 +366,7 @@ def _cell(column: _Column, line: Line, several: bool) -> HtmlCell:
     )
 
 
-def _name(line: Line) -> str:
+def _name(line: TableRow) -> str:
     return difference_name(line) if isinstance(line, Difference) else model_name(line)
 
 

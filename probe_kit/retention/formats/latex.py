@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from probe_kit.retention.columns.conditions import rule_sentences
-from probe_kit.retention.columns.lines import Line, cell_of, compared, difference_legend
+from probe_kit.retention.columns.lines import TableRow, cell_of, compared, difference_legend
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     CONTROL_COLUMNS,
@@ -12,6 +12,8 @@ from probe_kit.retention.columns.text import (
     FURTHER_RETENTION,
     action_place,
     action_share,
+    backbone_place,
+    backbone_share,
     beats,
     call_value,
     category_name,
@@ -21,8 +23,6 @@ from probe_kit.retention.columns.text import (
     margin_value,
     model_name,
     paper_margin,
-    prefix_place,
-    prefix_share,
     probed,
     retention_value,
     rule_name,
@@ -30,7 +30,7 @@ from probe_kit.retention.columns.text import (
     title,
     view_name,
 )
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.text_table import TextTable, is_asked
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import HEAT
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -52,7 +52,7 @@ def latex(
     rows: Sequence[RetentionRow],
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
-    further: Sequence[PlainTable] = (),
+    further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> str:
     """Complete `table` environments: retention with differences between runs, then controls where there are any.
@@ -124,7 +124,7 @@ def _retention_table(
 def _body(
     rows: Sequence[RetentionRow], differences: Sequence[Difference], columns: "Sequence[_Column]"
 ) -> list[str]:
-    """Lines with a rule around means and between asked and acting runs."""
+    """Lines with a rule around means and between VLM runs and policy runs."""
     body: list[str] = []
     for kind in dict.fromkeys(row.kind for row in rows):
         of_kind = [row for row in rows if row.kind == kind]
@@ -157,8 +157,8 @@ _COLUMNS: list[_Column] = [
     ("$p$ (Holm)", DIFFERENCE_TEST[1], "r"),
     (r"$\Delta$", margin_value, "r"),
     (r"$\Delta$ (paper)", paper_margin, "r"),
-    ("Prefix", prefix_share, "r"),
-    ("Layer", prefix_place, "r"),
+    ("Prefix", backbone_share, "r"),
+    ("Layer", backbone_place, "r"),
     ("Action", action_share, "r"),
     ("Layer", action_place, "r"),
     ("First it.", first_iteration, "r"),
@@ -177,11 +177,11 @@ def _columns(rows: Sequence[RetentionRow], differences: Sequence[Difference]) ->
     return [column for column in columns if differences or column[1] is not DIFFERENCE_TEST[1]]
 
 
-def _line(line: Line, columns: Sequence[_Column]) -> str:
+def _line(line: TableRow, columns: Sequence[_Column]) -> str:
     return " & ".join(_coloured_retention(cell, line) for _, cell, _ in columns) + r" \\"
 
 
-def _coloured_retention(cell: Callable[[RetentionRow], str], line: Line) -> str:
+def _coloured_retention(cell: Callable[[RetentionRow], str], line: TableRow) -> str:
     text = escape(cell_of(cell, line))
     heated = cell is retention_value and isinstance(line, RetentionRow) and line.retention_defined
     if not heated or line.retention_bounded is None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.lines import (
-    Line,
+    TableRow,
     behaviour_lines,
     cell_of,
     compared,
@@ -21,6 +21,8 @@ from probe_kit.retention.columns.text import (
     Column,
     action_place,
     action_value,
+    backbone_place,
+    backbone_value,
     beats,
     call_value,
     category_name,
@@ -33,8 +35,6 @@ from probe_kit.retention.columns.text import (
     once_per_category,
     paper_margin,
     percent,
-    prefix_place,
-    prefix_value,
     probed,
     retention_value,
     rule_name,
@@ -42,7 +42,7 @@ from probe_kit.retention.columns.text import (
     title,
     view_name,
 )
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.text_table import TextTable, is_asked
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import RetentionRow
 
@@ -57,10 +57,10 @@ SUCCESS_COLUMNS: list[Column] = [
     ("SR % [95 %]", success_interval),
     ("± Δ %", margin_value),
     ("paper's Δ %", paper_margin),
-    ("wrong %", lambda row: percent(row.p_wrong)),
-    ("outside %", lambda row: percent(row.p_oob)),
-    ("never moved %", lambda row: percent(row.p_never_moved)),
-    ("flagged steps %", lambda row: percent(row.p_flagged)),
+    ("wrong %", lambda row: percent(row.share_wrong)),
+    ("outside %", lambda row: percent(row.share_outside)),
+    ("never moved %", lambda row: percent(row.share_never_moved)),
+    ("flagged steps %", lambda row: percent(row.share_invalid_action)),
     ("original / swapped %", lambda row: f"{percent(row.sr_original)} / {percent(row.sr_swapped)}"),
     ("left / right %", lambda row: f"{percent(row.sr_left)} / {percent(row.sr_right)}"),
     ("regime", lambda row: _regime(row)),
@@ -74,9 +74,9 @@ RETENTION_COLUMNS: list[Column] = [
     ("category", category_name),
     ("bounded retention [95 %]", retention_value),
     *FURTHER_RETENTION,
-    ("backbone % [95 %]", prefix_value),
-    ("at layer", prefix_place),
-    ("p", lambda row: number(row.prefix_p_fwe, 3)),
+    ("backbone % [95 %]", backbone_value),
+    ("at layer", backbone_place),
+    ("p", lambda row: number(row.backbone_p_fwe, 3)),
     ("action % [95 %]", action_value),
     ("at layer @iteration", action_place),
     ("p", lambda row: number(row.action_p_fwe, 3)),
@@ -93,7 +93,7 @@ def markdown(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
-    further: Sequence[PlainTable] = (),
+    further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> str:
     """Success rates and, where there are any, retention, controls, conditions, more and notes.
@@ -135,7 +135,7 @@ def _regime(row: RetentionRow) -> str:
     return row.regime or _score(row)
 
 
-def _lines_table(heading: str, lines: Sequence[Line], columns: Sequence[Column]) -> str:
+def _lines_table(heading: str, lines: Sequence[TableRow], columns: Sequence[Column]) -> str:
     cells = [[cell_of(cell, line) for _, cell in columns] for line in lines]
     return _markdown_table(heading, [name for name, _ in columns], cells)
 

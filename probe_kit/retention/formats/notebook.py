@@ -9,7 +9,7 @@ from probe_kit.retention.formats.html import (
     HtmlCell,
     HtmlTable,
     behaviour_table,
-    retention_table,
+    probe_table,
 )
 from probe_kit.retention.rows.row import RetentionRow
 
@@ -19,7 +19,7 @@ _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of t
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The report's first tables, without its page: headings explain themselves when pointed at."""
-    found = [behaviour_table(rows, differences), retention_table(rows, differences)]
+    found = [behaviour_table(rows, differences), probe_table(rows, differences)]
     return _heading(rows) + "".join(_table(one) for one in found if one is not None)
 
 

@@ -10,7 +10,7 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
 from probe_kit.retention.columns.lines import (
-    Line,
+    TableRow,
     behaviour_lines,
     cell_of,
     compared,
@@ -30,6 +30,8 @@ from probe_kit.retention.columns.text import (
     Column,
     action_place,
     action_value,
+    backbone_place,
+    backbone_value,
     beats,
     bounded_value,
     call_words,
@@ -41,12 +43,10 @@ from probe_kit.retention.columns.text import (
     once_per_category,
     paper_margin,
     percent,
-    prefix_place,
-    prefix_value,
     probed,
     success_interval,
 )
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.text_table import TextTable, is_asked
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import detectable
@@ -66,12 +66,12 @@ def rich_tables(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
-    further: Sequence[PlainTable] = (),
+    further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> "Group":
     """Success rates of all runs in one table, retention and controls in one per view; wordings, more and notes.
 
-    Several runs go by letters, under each other, with their differences below them. Asked runs stand above a rule.
+    Several runs go by letters, under each other, with their differences below them. VLM runs stand above a rule.
     further: tables behind these. unpaired: why runs have no differences.
     """
     from rich.console import Group
@@ -93,7 +93,7 @@ def rich_tables(
 def _of_kind(
     rows: Sequence[RetentionRow], differences: Sequence[Difference], called: "_Letters"
 ) -> "list[FittingTable]":
-    """Of asked, or of acting runs."""
+    """Of asked, or of policy runs."""
     once = once_per_category(rows)
     lines = behaviour_lines(once, differences)
     if is_asked(rows[0]):
@@ -114,7 +114,7 @@ def _of_kind(
     return tables
 
 
-def _plain(table: PlainTable) -> FittingTable:
+def _plain(table: TextTable) -> FittingTable:
     """Its first columns name the rows."""
     fixed = 1 if table.columns[0] == "category" else 2
     return FittingTable(
@@ -135,9 +135,9 @@ def _plain(table: PlainTable) -> FittingTable:
 
 def _judged(rows: Sequence[RetentionRow]) -> list[str]:
     """A warning where nothing but chance was beaten, because nothing else was tried."""
-    found = [row.prefix_beats for row in rows if row.prefix_beats]
+    found = [row.backbone_exceeds for row in rows if row.backbone_exceeds]
     tried = any(better is not None for beats in found for name, better in beats.items() if name != "chance")
-    mark = "signal is judged against chance only: add the controls binding and twin"
+    mark = "signal is judged against chance only: add the controls binding and untrained"
     return [mark] if found and not tried else []
 
 
@@ -171,8 +171,8 @@ _ANSWERS: dict[str, Sequence[Column]] = {
         ("left / right", _sides),
     ],
     "How it answered": [
-        ("wrong", lambda row: percent(row.p_wrong)),
-        ("unread", lambda row: percent(row.p_oob)),
+        ("wrong", lambda row: percent(row.share_wrong)),
+        ("unread", lambda row: percent(row.share_outside)),
         *(column for column in ANSWER_SCORES if column[0] != "unreadable"),  # that is: unread
         *ANSWER_MEASURES,
     ],
@@ -188,17 +188,17 @@ _SUCCESS: dict[str, Sequence[Column]] = {
         *FOLLOWED_COLUMNS,
     ],
     "Where the cube ended": [
-        ("wrong", lambda row: percent(row.p_wrong)),
-        ("outside", lambda row: percent(row.p_oob)),
-        ("never moved", lambda row: percent(row.p_never_moved)),
+        ("wrong", lambda row: percent(row.share_wrong)),
+        ("outside", lambda row: percent(row.share_outside)),
+        ("never moved", lambda row: percent(row.share_never_moved)),
     ],
     "What the outcome rule makes of it": RULE_COLUMNS,
 }
 _RETENTION: dict[str, Sequence[Column]] = {
     "In the backbone": [
-        ("backbone % [95 %]", prefix_value),
-        ("layer", prefix_place),
-        ("p", lambda row: number(row.prefix_p_fwe, 3)),
+        ("backbone % [95 %]", backbone_value),
+        ("layer", backbone_place),
+        ("p", lambda row: number(row.backbone_p_fwe, 3)),
         ("beats", beats),
     ],
     "Where the action is made": [
@@ -233,7 +233,7 @@ def _letter(at: int) -> str:
 
 def _of_runs(
     what: str,
-    lines: Sequence[Line],
+    lines: Sequence[TableRow],
     parts: Mapping[str, Sequence[Column]],
     notes: Sequence[str],
     called: _Letters,
@@ -255,7 +255,7 @@ def _of_runs(
     return _fitting(title, "; ".join(filter(None, [sizes, *notes, legend])), name, names, lines, parts)
 
 
-def _short(line: Line, rows: Sequence[RetentionRow], called: _Letters) -> str:
+def _short(line: TableRow, rows: Sequence[RetentionRow], called: _Letters) -> str:
     """A run's letter, or those of two; a group of several runs by its name."""
     if isinstance(line, RetentionRow):
         return called[line.group, line.run]
@@ -273,7 +273,7 @@ def _fitting(
     caption: str,
     name: str,
     names: Sequence[str],
-    lines: Sequence[Line],
+    lines: Sequence[TableRow],
     parts: Mapping[str, Sequence[Column]],
 ) -> FittingTable:
     """Columns in which no line has anything to show are left out."""
@@ -293,7 +293,7 @@ def _fitting(
     )
 
 
-def _style(line: Line) -> str:
+def _style(line: TableRow) -> str:
     return " ".join(["bold"] * (line.category == MEAN) + ["italic"] * isinstance(line, Difference))
 
 
@@ -302,10 +302,10 @@ def _coloured(cell: str) -> Cell:
 
 
 def _control_legend(rows: Sequence[RetentionRow]) -> str:
-    twin = f"; twin: {rows[0].twin}" if rows[0].twin else ""
+    untrained = f"; untrained: {rows[0].untrained}" if rows[0].untrained else ""
     fewest = min(row.n_items for row in rows if row.category != MEAN)
     seen = f"with {fewest} items a leak of {percent(detectable(fewest))} % is found in 4 of 5 suites"
-    return f"held-out accuracy % without the model, {seen}; selectivity: accuracy above random labels{twin}"
+    return f"held-out accuracy % without the model, {seen}; selectivity: accuracy above random labels{untrained}"
 
 
 def _sizes_of(runs: Mapping[str, Sequence[RetentionRow]]) -> str:
@@ -329,7 +329,7 @@ def _sizes(rows: Sequence[RetentionRow]) -> str:
     ]
     if groups := [row.n_groups for row in single if row.n_groups is not None]:
         parts.append(f"{_span(groups)} groups")
-    flags = [percent(row.p_flagged) for row in single if row.p_flagged is not None]
+    flags = [percent(row.share_invalid_action) for row in single if row.share_invalid_action is not None]
     if flags:
         parts.append(f"no action in {' / '.join(dict.fromkeys(flags))} % of steps (flagged)")
     if calls := sorted({row.call for row in single if row.call is not None}):

@@ -13,10 +13,10 @@ from probe_kit.retention.text import spell
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import FittingTable
 
-Said = Verdict | Literal["known", "unknown"]
+CategoryVerdict = Verdict | Literal["known", "unknown"]
 
 _READ = {True: "can be read in the policy's backbone", False: "cannot be read in its backbone"}
-_ACTED: dict[Said, str] = {
+_ACTED: dict[CategoryVerdict, str] = {
     "used": "the policy acts on it",
     "encoded, unused": "the policy does not act on it",
     "absent": "the policy does not act on it",
@@ -30,7 +30,7 @@ _ACTED: dict[Said, str] = {
 }
 
 
-def verdict(row: RetentionRow) -> Said:
+def verdict(row: RetentionRow) -> CategoryVerdict:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
     In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the action
@@ -43,12 +43,12 @@ def verdict(row: RetentionRow) -> Said:
     if row.used is not None:
         return cast("Verdict", row.used)
     if row.regime == Regime.KNOWLEDGE:
-        return "used" if row.prefix_signal else "acted on, not found"
-    return "encoded, unused" if row.prefix_signal else "absent"
+        return "used" if row.backbone_signal else "acted on, not found"
+    return "encoded, unused" if row.backbone_signal else "absent"
 
 
 @dataclass(frozen=True)
-class Chapter:
+class CategorySummary:
     """One category: of the reader that was asked (None where nobody was), of the probes, and of the action.
 
     sr, known_sr, backbone: shares of right episodes, answers and held-out probe decisions.
@@ -59,7 +59,7 @@ class Chapter:
     known_sr: float | None
     encoded: bool
     backbone: float | None
-    used: Said
+    used: CategoryVerdict
     sr: float | None
 
     @property
@@ -88,12 +88,12 @@ class Chapter:
 
 
 @dataclass(frozen=True)
-class Story:
+class PolicySummary:
     """A policy's chapters. reader: what was asked beside it, empty for nobody."""
 
     policy: str
     reader: str
-    chapters: tuple[Chapter, ...]
+    chapters: tuple[CategorySummary, ...]
 
     def to_rich(self) -> "FittingTable":
         """A line per category: known, encoded and used, with the share each rests on."""
@@ -119,8 +119,8 @@ class Story:
         )
 
 
-def stories(rows: Sequence[RetentionRow]) -> list[Story]:
-    """One per probed policy of a retention table, by the first view of each, beside the first asked run.
+def policy_summaries(rows: Sequence[RetentionRow]) -> list[PolicySummary]:
+    """One per probed policy of a retention table, by the first view of each, beside the first VLM run.
 
     Runs that were only listened to, or not probed, have none; so have policies on another suite than the reader's
     no reader.
@@ -128,7 +128,7 @@ def stories(rows: Sequence[RetentionRow]) -> list[Story]:
     asked = [row for row in rows if row.category != MEAN and _asks_for_the_answer(row)]
     acted: dict[str, list[RetentionRow]] = {}
     for row in rows:
-        if row.kind == "acts" and row.category != MEAN and not row.listened and row.prefix_accuracy is not None:
+        if row.kind == "acts" and row.category != MEAN and not row.listened and row.backbone_accuracy is not None:
             acted.setdefault(row.run, []).append(row)
     return [_story([row for row in own if row.view == own[0].view], asked) for own in acted.values()]
 
@@ -137,20 +137,22 @@ def _asks_for_the_answer(row: RetentionRow) -> bool:
     return row.kind == "asks" and row.asked_for in (None, "target") and row.picture != "none"
 
 
-def _story(rows: Sequence[RetentionRow], asked: Sequence[RetentionRow]) -> Story:
+def _story(rows: Sequence[RetentionRow], asked: Sequence[RetentionRow]) -> PolicySummary:
     same = [row for row in asked if row.suite == rows[0].suite]
     first = {row.category: row for row in same if row.run == same[0].run}
     reader = model_name(same[0]) if same else ""
-    return Story(model_name(rows[0]), reader, tuple(_chapter(row, first.get(row.category)) for row in rows))
+    return PolicySummary(
+        model_name(rows[0]), reader, tuple(_chapter(row, first.get(row.category)) for row in rows)
+    )
 
 
-def _chapter(row: RetentionRow, asked: RetentionRow | None) -> Chapter:
-    return Chapter(
+def _chapter(row: RetentionRow, asked: RetentionRow | None) -> CategorySummary:
+    return CategorySummary(
         category=row.category,
         known=None if asked is None else verdict(asked) == "known",
         known_sr=None if asked is None else asked.sr,
-        encoded=row.prefix_signal,
-        backbone=row.prefix_accuracy,
+        encoded=row.backbone_signal,
+        backbone=row.backbone_accuracy,
         used=verdict(row),
         sr=row.sr,
     )

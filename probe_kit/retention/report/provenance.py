@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from probe_kit.extract.store.locations.summary import NOT_PROTECTED
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
@@ -49,7 +49,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
     return Provenance(
         name,
-        Certificate.of_run(run).line,
+        ProvenanceLine.of_run(run).line,
         tuple((key, value) for key, value in facts.items() if value),
         tuple((key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value),
     )
@@ -78,7 +78,7 @@ def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
 
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
     """A sentence for a methods section, and BibTeX."""
-    lines = "; ".join(Certificate.of_run(run).line.replace(" · ", ", ") for run in runs)
+    lines = "; ".join(ProvenanceLine.of_run(run).line.replace(" · ", ", ") for run in runs)
     sentence = (
         f"Evaluated with probe_kit {__version__} under the Act2Answer protocol ({PAPER}): {lines}. Success rates "
         "from a PyBullet scene are comparable with each other, not with those of other simulators."

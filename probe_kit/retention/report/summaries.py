@@ -53,13 +53,15 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
     rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
     found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
-    if mean.prefix_accuracy is not None:
-        found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
+    if mean.backbone_accuracy is not None:
+        found.append(
+            Headline(f"{percent(mean.backbone_accuracy)} %", "backbone", "best probe, mean of categories")
+        )
     if mean.action_accuracy is not None:
         found.append(
             Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
         )
-    if mean.prefix_accuracy is not None and mean.action_accuracy is not None:
+    if mean.backbone_accuracy is not None and mean.action_accuracy is not None:
         found.append(_retention_headline(mean, rows))
     return found
 
@@ -79,11 +81,11 @@ def _interval_words(row: RetentionRow) -> str:
 
 def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = [_behaviour(mean, rows)]
-    if any(row.prefix_accuracy is not None for row in rows):
+    if any(row.backbone_accuracy is not None for row in rows):
         found.append(_knowledge(rows))
     if any(row.retention is not None for row in rows):
         found.append(_retention(mean, rows))
-    if mean.gap is not None and any(row.prefix_signal for row in rows):
+    if mean.gap is not None and any(row.backbone_signal for row in rows):
         found.append(
             f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
             f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
@@ -102,7 +104,7 @@ def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
 
 
 def _knowledge(rows: Sequence[RetentionRow]) -> str:
-    backbone = [row for row in rows if row.prefix_signal]
+    backbone = [row for row in rows if row.backbone_signal]
     expert = [row for row in rows if row.action_signal]
     text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
     if any(row.action_accuracy is not None for row in rows):
@@ -112,7 +114,11 @@ def _knowledge(rows: Sequence[RetentionRow]) -> str:
 
 def _judge(rows: Sequence[RetentionRow]) -> str:
     """What had to be beaten."""
-    names = [name for name in ("binding", "twin") if any(row.prefix_beats.get(name) is not None for row in rows)]
+    names = [
+        name
+        for name in ("binding", "untrained")
+        if any(row.backbone_exceeds.get(name) is not None for row in rows)
+    ]
     *first, last = ["chance", *names]
     return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
 
@@ -138,16 +144,16 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = []
     if mean.random_weights:
         found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
-    if (mean.p_never_moved or 0) > _MOSTLY:
+    if (mean.share_never_moved or 0) > _MOSTLY:
         found.append(
-            f"The cube never moved in {percent(mean.p_never_moved)} % of episodes: the policy does not grasp, so "
+            f"The cube never moved in {percent(mean.share_never_moved)} % of episodes: the policy does not grasp, so "
             "its success rate says nothing about what it knows."
         )
-    elif (mean.p_oob or 0) > _MOSTLY:
-        found.append(f"The cube reached neither picture in {percent(mean.p_oob)} % of episodes.")
-    if mean.p_flagged:
+    elif (mean.share_outside or 0) > _MOSTLY:
+        found.append(f"The cube reached neither picture in {percent(mean.share_outside)} % of episodes.")
+    if mean.share_invalid_action:
         found.append(
-            f"In {percent(mean.p_flagged)} % of its steps the policy put out something that is no action."
+            f"In {percent(mean.share_invalid_action)} % of its steps the policy put out something that is no action."
         )
     biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
     if biased:
@@ -174,17 +180,17 @@ def read_row(row: RetentionRow) -> list[str]:
     if row.items_both_right is not None:
         items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
         found.append(f"{row.items_both_right} of {items} questions right in both layouts.")
-    if row.prefix_accuracy is not None:
+    if row.backbone_accuracy is not None:
         found.append(
-            f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
-            f"{row.prefix_depth:.2f}{_ties_words(row.prefix_ties)}: "
-            f"{_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
+            f"In the backbone a probe is right in {percent(row.backbone_accuracy)} % at best, at depth "
+            f"{row.backbone_depth:.2f}{_ties_words(row.backbone_ties)}: "
+            f"{_clear_words(row.backbone_p_fwe, row.backbone_exceeds)}."
         )
     if row.action_accuracy is not None:
         step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
         found.append(
             f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}"
-            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_beats)}."
+            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_exceeds)}."
         )
     if row.retention_defined and row.retention_bounded is not None:
         found.append(f"Bounded retention {row.retention_bounded:.2f} ({_interval_words(row)}).")
@@ -198,7 +204,7 @@ def _ties_words(ties: int | None) -> str:
 def _clear_words(p: float | None, beats: Beats) -> str:
     if p is None:
         return "not tested, for lack of relabellings"
-    controls = {"binding": "an untrained conjunction of pictures and words", "twin": "its twin"}
+    controls = {"binding": "an untrained conjunction of pictures and words", "untrained": "the untrained network"}
     equals = [words for name, words in controls.items() if beats.get(name) is False]
     clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
     return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"

@@ -21,14 +21,22 @@ from probe_kit.retention.estimators.bootstrap_draws import (
     sr_estimate,
 )
 from probe_kit.retention.estimators.retention import Iterations, Peak, Retention, best_site, measure_retention
-from probe_kit.retention.rows.interventions import with_following
-from probe_kit.retention.rows.outcome_rules import Judged, Ruled
-from probe_kit.retention.rows.parts import ActionPeak, Asked, BackbonePeak, Background, Behaviour, Kept, Source
+from probe_kit.retention.rows.interventions import add_image_swap
+from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
+from probe_kit.retention.rows.parts import (
+    ActionPeak,
+    AnswerStats,
+    BackbonePeak,
+    Behaviour,
+    ControlScores,
+    RetentionScores,
+    RunInfo,
+)
 from probe_kit.retention.rows.row import Part, RetentionRow
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import Controls, TwinScore
+from probe_kit.train.results.control_scores import Controls, UntrainedScore
 from probe_kit.train.results.probe_curve import Curve
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -37,7 +45,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class RowWithDraws:
     """A row and the estimates behind its numbers. outcomes: the episodes of its success rate, if it has one."""
 
     row: RetentionRow
@@ -63,7 +71,7 @@ class RowSettings:
 
 def run_rows(
     run: RunReader, results: ProbeResults | None, settings: RowSettings, group: str | None = None
-) -> list[Drawn]:
+) -> list[RowWithDraws]:
     """One row per category and view of `run`, in the order of its episodes; without `results`, success rates only.
 
     Raises UnknownSiteError for a view that was not probed.
@@ -72,25 +80,25 @@ def run_rows(
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
-    judged, found = Judged.of(run, settings.rule, settings.last_steps), stored_following(run)
+    judged, found = RunUnderRule.of(run, settings.rule, settings.last_steps), stored_following(run)
     located, carried = (stored_places(run), stored_carriers(run)) if found else ({}, {})
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
-    return [replace(one, row=with_following(one.row, found, located, carried)) for one in drawn]
+    return [replace(one, row=add_image_swap(one.row, found, located, carried)) for one in drawn]
 
 
 def _row(
-    judged: Judged,
+    judged: RunUnderRule,
     results: ProbeResults | None,
     settings: RowSettings,
     group: str | None,
     category: str,
     episodes: "pd.DataFrame",
     view: str | None,
-) -> Drawn:
+) -> RowWithDraws:
     run, heard = judged.run, listened(episodes)
     parts: list[Part] = [_source(run, results, heard), _asked(run, episodes)]
     estimates: dict[str, Estimate] = {}
@@ -101,10 +109,10 @@ def _row(
         parts += [judged.part(episodes), _behaviour(success, sensitivity(episodes, radii))]
         estimates = {"sr": sr_estimate(episodes, run.suite), **judged.estimates(episodes)}
     else:
-        parts += [Ruled(rule=judged.rule, rule_words=judged.words), _unmoved(episodes, heard)]
+        parts += [OutcomeRuleScores(rule=judged.rule, rule_words=judged.words), _unmoved(episodes, heard)]
     curve = None if results is None or view is None else results.curves.get((category, view))
     if results is not None and view is not None and curve is not None:
-        probed = _Probed(results.controls, category, view, curve, _peaks(curve, settings.iterations))
+        probed = _ProbePeaks(results.controls, category, view, curve, _peaks(curve, settings.iterations))
         retention = measure_retention(curve, settings.iterations, settings.seed, probed.beats.get("prefix"))
         estimates |= probe_estimates(curve, probed.peaks, retention, run.suite)
         parts += [
@@ -115,13 +123,17 @@ def _row(
         ]
     elif results is not None:
         parts.append(
-            Kept(retention_note=f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})")
+            RetentionScores(
+                retention_note=f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
+            )
         )
-    return Drawn(RetentionRow.of(category, view, group, *parts), estimates, None if success is None else episodes)
+    return RowWithDraws(
+        RetentionRow.of(category, view, group, *parts), estimates, None if success is None else episodes
+    )
 
 
-def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> Source:
-    return Source(
+def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> RunInfo:
+    return RunInfo(
         run=str(run.location),
         model=run.model,
         label=run.label,
@@ -136,13 +148,13 @@ def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> Source
     )
 
 
-def _asked(run: RunReader, episodes: "pd.DataFrame") -> Asked:
+def _asked(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     ask = ask_of(run)
     if ask is None:
-        return Asked()
+        return AnswerStats()
     text = episodes["outcome_text" if "outcome_text" in episodes else "outcome"]
     bias = episodes["letter_bias"].astype(float).mean()
-    return Asked(
+    return AnswerStats(
         kind="asks",
         prompt=str(ask["prompt"]),
         picture=str(ask["picture"]),
@@ -151,11 +163,11 @@ def _asked(run: RunReader, episodes: "pd.DataFrame") -> Asked:
         score=getattr(run, "score", "text"),
         accuracy_text=float((text == "correct").mean()),
         accuracy_logits=float((episodes["outcome_logits"] == "correct").mean()),
-        accuracy_debiased=float((episodes["outcome_debiased"] == "correct").mean()),
-        p_unreadable=float((text == "oob").mean()),
+        accuracy_order_balanced=float((episodes["outcome_debiased"] == "correct").mean()),
+        share_unparsable=float((text == "oob").mean()),
         option_mass=float(episodes["option_mass"].mean()),
         letter_bias=_number(float(bias)),
-        p_near_tie=float(episodes["near_tie"].astype(bool).mean()),
+        share_near_tie=float(episodes["near_tie"].astype(bool).mean()),
     )
 
 
@@ -172,18 +184,18 @@ def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviou
         n_episodes=success.n_episodes,
         n_items=success.n_items,
         sr=success.sr,
-        delta=success.delta,
-        delta_items=success.delta_items,
-        delta_regime=success.delta_regime,
+        chance_margin_episodes=success.chance_margin_episodes,
+        chance_margin_items=success.chance_margin_items,
+        chance_margin=success.chance_margin,
         sr_ci=success.ci,
         sr_original=success.sr_original,
         sr_swapped=success.sr_swapped,
         sr_left=success.sr_left,
         sr_right=success.sr_right,
-        p_wrong=success.p_wrong,
-        p_oob=success.p_oob,
-        p_never_moved=success.p_never_moved,
-        p_flagged=success.p_flagged,
+        share_wrong=success.share_wrong,
+        share_outside=success.share_outside,
+        share_never_moved=success.share_never_moved,
+        share_invalid_action=success.share_invalid_action,
         regime=str(success.regime),
         regime_reason=success.reason,
         side_preference=success.side_preference,
@@ -203,7 +215,7 @@ def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
 
 
 @dataclass(frozen=True)
-class _Probed:
+class _ProbePeaks:
     """The probes of one category in one view, and their best sites: `prefix` and `action`, as far as there are."""
 
     controls: Controls
@@ -222,25 +234,25 @@ class _Probed:
 
     def backbone(self, estimates: Estimates) -> BackbonePeak:
         """Of the backbone's best site."""
-        peak, twin = self.peaks.get("prefix"), self._twin("backbone")
+        peak, untrained = self.peaks.get("prefix"), self._untrained("backbone")
         if peak is None:
             return BackbonePeak()
         return BackbonePeak(
-            prefix_accuracy=peak.accuracy,
-            prefix_ci=estimates["prefix_accuracy"].ci,
-            prefix_layer=peak.site.layer,
-            prefix_depth=self.curve.depth(peak.site),
-            prefix_p_fwe=_number(peak.p_fwe),
-            prefix_selectivity=self._selectivity(peak),
-            prefix_beats=self.beats["prefix"],
-            prefix_twin=None if twin is None else twin.difference,
-            prefix_twin_ci=None if twin is None else twin.ci,
-            prefix_ties=peak.ties,
+            backbone_accuracy=peak.accuracy,
+            backbone_ci=estimates["backbone_accuracy"].ci,
+            backbone_layer=peak.site.layer,
+            backbone_depth=self.curve.depth(peak.site),
+            backbone_p_fwe=_number(peak.p_fwe),
+            backbone_selectivity=self._selectivity(peak),
+            backbone_exceeds=self.beats["prefix"],
+            backbone_minus_untrained=None if untrained is None else untrained.difference,
+            backbone_minus_untrained_ci=None if untrained is None else untrained.ci,
+            backbone_ties=peak.ties,
         )
 
     def action(self, estimates: Estimates) -> ActionPeak:
         """Of the best site where the action is made."""
-        peak, twin = self.peaks.get("action"), self._twin(self.curve.action_stream)
+        peak, untrained = self.peaks.get("action"), self._untrained(self.curve.action_stream)
         if peak is None:
             return ActionPeak()
         first = self._first_iteration(peak)
@@ -252,29 +264,29 @@ class _Probed:
             action_iteration=peak.site.iteration,
             action_p_fwe=_number(peak.p_fwe),
             action_selectivity=self._selectivity(peak),
-            action_beats=self.beats["action"],
-            action_twin=None if twin is None else twin.difference,
-            action_twin_ci=None if twin is None else twin.ci,
+            action_exceeds=self.beats["action"],
+            action_minus_untrained=None if untrained is None else untrained.difference,
+            action_minus_untrained_ci=None if untrained is None else untrained.ci,
             action_first_accuracy=None if first is None else first.accuracy,
             action_first_layer=None if first is None else first.site.layer,
             action_ties=peak.ties,
         )
 
-    def background(self, success: SuccessRate | None) -> Background:
+    def background(self, success: SuccessRate | None) -> ControlScores:
         """What the best sites are held against."""
         baselines, prefix = self.controls.of_category(self.category), self.peaks.get("prefix")
-        twins = [self._twin(stream) for stream in ("backbone", self.curve.action_stream)]
-        return Background(
+        untrained = [self._untrained(stream) for stream in ("backbone", self.curve.action_stream)]
+        return ControlScores(
             n_groups=self.curve.n_groups,
             chance=self.curve.chance,
             gap=None if prefix is None or success is None else prefix.accuracy - success.sr,
             baselines={name: score.accuracy for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
-            twin=next((twin.twin for twin in twins if twin is not None), None),
+            untrained=next((untrained.untrained for untrained in untrained if untrained is not None), None),
         )
 
-    def _twin(self, stream: str | None) -> TwinScore | None:
-        return None if stream is None else self.controls.twin_peak(self.category, self.view, stream)
+    def _untrained(self, stream: str | None) -> UntrainedScore | None:
+        return None if stream is None else self.controls.untrained_peak(self.category, self.view, stream)
 
     def _selectivity(self, peak: Peak) -> float | None:
         return _number(peak.accuracy - float(self.curve.control_accuracy[self.curve.sites.index(peak.site)]))
@@ -286,10 +298,10 @@ class _Probed:
         return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
 
 
-def _kept(retention: Retention | None) -> Kept:
+def _kept(retention: Retention | None) -> RetentionScores:
     if retention is None:
-        return Kept(retention_note="n/a (one stream only)")
-    return Kept(
+        return RetentionScores(retention_note="n/a (one stream only)")
+    return RetentionScores(
         retention=_number(retention.plain),
         retention_defined=retention.defined,
         retention_note=retention.note,

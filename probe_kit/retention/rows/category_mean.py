@@ -6,20 +6,20 @@ from typing import Any
 
 from probe_kit.retention.behaviour.success_rate import normalised_score
 from probe_kit.retention.estimators.bootstrap_draws import UNBOUNDED, Estimates, Limits, average
-from probe_kit.retention.rows.build import Drawn
+from probe_kit.retention.rows.build import RowWithDraws
 from probe_kit.retention.rows.outcome_rules import mean_part
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 _AVERAGED = (
-    "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
-    "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
-    "action_twin", "action_first_accuracy", "accuracy_text", "accuracy_logits", "accuracy_debiased",
-    "p_unreadable", "option_mass", "letter_bias", "p_near_tie", "follows", "against", "follows_net",
+    "sr_original", "sr_swapped", "sr_left", "sr_right", "share_wrong", "share_outside", "share_never_moved", "share_invalid_action", "chance",
+    "backbone_accuracy", "action_accuracy", "gap", "backbone_selectivity", "action_selectivity", "backbone_minus_untrained",
+    "action_minus_untrained", "action_first_accuracy", "accuracy_text", "accuracy_logits", "accuracy_order_balanced",
+    "share_unparsable", "option_mass", "letter_bias", "share_near_tie", "follows", "against", "follows_net",
 )  # fmt: skip
 _OF_THE_RUN = ("kind", "prompt", "picture", "picture_size", "asked_for", "score")
 
 
-def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
+def mean_row(drawn: Sequence[RowWithDraws]) -> RetentionRow:
     """The category average of rows of one run and view; retention over the categories where it is defined.
 
     Intervals: items, or groups for probes, drawn within each category.
@@ -52,13 +52,13 @@ def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
         sr=_mean(rows, "sr"),
         **vars(mean_part(rows, {name: _limits(estimates, name) for name in ("sr_answered", "sr_grasped")})),
         sr_ci=_limits(estimates, "sr"),
-        prefix_ci=_limits(estimates, "prefix_accuracy"),
+        backbone_ci=_limits(estimates, "backbone_accuracy"),
         action_ci=_limits(estimates, "action_accuracy"),
         **{name: _mean(rows, name) for name in _AVERAGED},
         sr_by_epsilon=_mean_by_key([row.sr_by_epsilon for row in rows]),
         baselines=_mean_by_key([row.baselines for row in rows]),
         leaks=tuple(dict.fromkeys(name for row in rows for name in row.leaks)),
-        twin=first.twin,
+        untrained=first.untrained,
         retention=_mean(counted, "retention"),
         retention_debiased=_mean(counted, "retention_debiased"),
         retention_ci=_retention_limits(counted, estimates, "retention_debiased", "retention_ci"),

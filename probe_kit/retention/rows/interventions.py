@@ -8,11 +8,11 @@ from dataclasses import replace
 
 from probe_kit.intervene.kinds.image_swap.effects import Following
 from probe_kit.intervene.kinds.image_swap.verdict import control_for, judge
-from probe_kit.retention.rows.parts import Followed
+from probe_kit.retention.rows.parts import SwapEffect
 from probe_kit.retention.rows.row import RetentionRow
 
 
-def with_following(
+def add_image_swap(
     row: RetentionRow,
     found: Mapping[str, Following],
     located: Mapping[str, Sequence[str]],
@@ -26,10 +26,10 @@ def with_following(
     own = found.get(row.category)
     if own is None:
         return row
-    encoded = row.prefix_signal if row.prefix_beats else None
+    encoded = row.backbone_signal if row.backbone_exceeds else None
     category, control = row.category, control_for(row.category, found)
     judged = judge(encoded, own, control, located.get(category), carried.get(category, ()))
-    part = Followed(
+    part = SwapEffect(
         follows=own.follows,
         against=own.against,
         follows_net=own.net,

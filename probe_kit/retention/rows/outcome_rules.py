@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ruled:
+class OutcomeRuleScores:
     """The outcome rule, and what it gives away.
 
     rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
-    n_answered, p_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped, sr_grasped:
-    the same of episodes in which both fingers ever touched the cube. p_answers_unmoved: share of answers whose
+    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped, sr_grasped:
+    the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of answers whose
     cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the picture in
-    whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes. p_both: share of
+    whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes. share_both_zones: share of
     episodes whose cube counts for both pictures, which is called correct. sr_by_rule: by every rule, at the last
     step. behaviour: shares of episodes by what hand and cube did.
     What is about answers is there for every run with a success rate; the rest is None or empty where the run
@@ -39,16 +39,16 @@ class Ruled:
     rule_words: str = ""
     last_steps: int = 1
     n_answered: int | None = None
-    p_answered: float | None = None
+    share_answered: float | None = None
     sr_answered: float | None = None
     sr_answered_ci: Limits | None = None
     n_grasped: int | None = None
     sr_grasped: float | None = None
     sr_grasped_ci: Limits | None = None
-    p_answers_unmoved: float | None = None
+    share_unmoved_answers: float | None = None
     sr_idle: float | None = None
     idle_side: str | None = None
-    p_both: float | None = None
+    share_both_zones: float | None = None
     sr_by_rule: dict[str, float] = field(default_factory=dict)
     behaviour: dict[str, float] = field(default_factory=dict)
 
@@ -68,7 +68,7 @@ class Judgeable(Protocol):
 
 
 @dataclass(frozen=True)
-class Judged:
+class RunUnderRule:
     """A run by one rule. run: with its outcomes by that rule. verdicts, behaviour: None without trajectories."""
 
     run: RunReader
@@ -96,19 +96,19 @@ class Judged:
         """Whether there is a success rate by this rule: by the default rule it was stored with every run."""
         return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
 
-    def part(self, episodes: "pd.DataFrame") -> Ruled:
+    def part(self, episodes: "pd.DataFrame") -> OutcomeRuleScores:
         """The row part of some of the episodes; their index is their position in the run."""
         if not self.scored:
-            return Ruled(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
+            return OutcomeRuleScores(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
         answered = 1 - shares_of(episodes, "oob")
         rate = self._conditional(episodes, answered)
         facts = {} if self.verdicts is None else self._facts(episodes, answered)
-        return Ruled(
+        return OutcomeRuleScores(
             rule=self.rule,
             rule_words=self.words,
             last_steps=self.last_steps,
             n_answered=int((episodes["outcome"] != "oob").sum()),
-            p_answered=float(answered.mean()),
+            share_answered=float(answered.mean()),
             sr_answered=None if rate is None else rate.value,
             sr_answered_ci=None if rate is None else rate.ci,
             **facts,
@@ -138,10 +138,10 @@ class Judged:
             "n_grasped": int(grasped.sum()),
             "sr_grasped": None if rate is None else rate.value,
             "sr_grasped_ci": None if rate is None else rate.ci,
-            "p_answers_unmoved": float(stayed / answered.sum()) if answered.any() else None,
+            "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
             "sr_idle": float((own["idle"] == "correct").mean()),
             "idle_side": _idle_side(own["idle"], episodes["side_correct"]),
-            "p_both": float(own["both"].mean()),
+            "share_both_zones": float(own["both"].mean()),
             "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
             "behaviour": _behaviour(acted),
         }
@@ -180,16 +180,16 @@ def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
     return found
 
 
-AVERAGED = ("p_answered", "sr_answered", "sr_grasped", "p_answers_unmoved", "sr_idle", "p_both")
+AVERAGED = ("share_answered", "sr_answered", "sr_grasped", "share_unmoved_answers", "sr_idle", "share_both_zones")
 """Fields of which a row of category means holds the average."""
 
 
-def mean_part(rows: Sequence[Ruled], limits: Mapping[str, Limits | None]) -> Ruled:
+def mean_part(rows: Sequence[OutcomeRuleScores], limits: Mapping[str, Limits | None]) -> OutcomeRuleScores:
     """The part of a row that averages over categories; limits: of `sr_answered` and `sr_grasped`."""
     first = rows[0]
     sides = {row.idle_side for row in rows}
     averages = {name: _mean([getattr(row, name) for row in rows]) for name in AVERAGED}
-    return Ruled(
+    return OutcomeRuleScores(
         rule=first.rule,
         rule_words=first.rule_words,
         last_steps=first.last_steps,
@@ -218,7 +218,7 @@ def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
     return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
 
 
-def rule_sentence(row: Ruled) -> str:
+def rule_sentence(row: OutcomeRuleScores) -> str:
     """What outcomes were judged by, and what the rule gives away; for captions."""
     steps = f", mean of the last {row.last_steps} control steps (all, where there are fewer)" * (
         row.last_steps > 1
@@ -240,7 +240,7 @@ def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
     return bool(getattr(run, "has_trajectories", False))
 
 
-def by_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
+def under_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
     """The run with its outcomes by a rule, for figures; as it is where it cannot be judged."""
     if (rule, last_steps) == (DEFAULT_RULE, 1) or not getattr(run, "has_trajectories", False):
         return run

@@ -9,7 +9,7 @@ from probe_kit.retention.estimators.bootstrap_draws import Limits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class RunInfo:
     """Whose numbers a row holds.
 
     label: what the run is called in tables and legends. action_stream: `expert`, or `action` in a policy without
@@ -34,7 +34,7 @@ class Source:
 class Behaviour:
     """What the policy did; `sr` is None where it was listened to and did not act.
 
-    delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
+    chance_margin_episodes, chance_margin_items, chance_margin: Δ over episodes (the paper's), over items, and over as many items as count,
     which decides `regime`. sr_by_epsilon: SR by zone radius in metres. sr and all that follows from it is None
     where the outcome rule needs trajectories that the run does not keep.
     """
@@ -42,18 +42,18 @@ class Behaviour:
     n_episodes: int
     n_items: int
     sr: float | None
-    delta: float | None = None
-    delta_items: float | None = None
-    delta_regime: float | None = None
+    chance_margin_episodes: float | None = None
+    chance_margin_items: float | None = None
+    chance_margin: float | None = None
     sr_ci: Limits | None = None
     sr_original: float | None = None
     sr_swapped: float | None = None
     sr_left: float | None = None
     sr_right: float | None = None
-    p_wrong: float | None = None
-    p_oob: float | None = None
-    p_never_moved: float | None = None
-    p_flagged: float | None = None
+    share_wrong: float | None = None
+    share_outside: float | None = None
+    share_never_moved: float | None = None
+    share_invalid_action: float | None = None
     regime: str | None = None
     regime_reason: str | None = None
     side_preference: float | None = None
@@ -66,13 +66,13 @@ class Behaviour:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
+class AnswerStats:
     """How a run was asked and what else its answers say; `kind` is `acts` for a run that was not.
 
     asked_for: `target`, `distractor` or `absent`. score: by which of its scores `sr` is. accuracy_text,
-    accuracy_logits, accuracy_debiased: shares that are right by each score. p_unreadable: answers in text that
+    accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in text that
     could not be read. option_mass: mean probability of the admissible answers together. letter_bias: mean
-    logit by which the option named first is preferred. p_near_tie: choices that rounding may have made.
+    logit by which the option named first is preferred. share_near_tie: choices that rounding may have made.
     """
 
     kind: str = "acts"
@@ -83,15 +83,15 @@ class Asked:
     score: str | None = None
     accuracy_text: float | None = None
     accuracy_logits: float | None = None
-    accuracy_debiased: float | None = None
-    p_unreadable: float | None = None
+    accuracy_order_balanced: float | None = None
+    share_unparsable: float | None = None
     option_mass: float | None = None
     letter_bias: float | None = None
-    p_near_tie: float | None = None
+    share_near_tie: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed:
+class SwapEffect:
     """What the exchange of the two pictures did, if `probe-kit intervene` was run; see `intervene.Following`.
 
     follows, against: shares of episodes; follows_net: their difference, follows_p: exact, one-sided. used: the
@@ -111,21 +111,21 @@ class Followed:
 class BackbonePeak:
     """The backbone's best site, the first one on ties.
 
-    prefix_ties: how many other sites are as accurate. prefix_selectivity: its accuracy above that of the same
-    probe on random labels of items. prefix_beats: whether it is better than `chance`, `binding` and `twin`,
-    family-wise; None for a control that was not run. prefix_twin: how much more accurate it is than `twin`'s.
+    backbone_ties: how many other sites are as accurate. backbone_selectivity: its accuracy above that of the same
+    probe on random labels of items. backbone_exceeds: whether it is better than `chance`, `binding` and `untrained`,
+    family-wise; None for a control that was not run. backbone_minus_untrained: how much more accurate it is than `untrained`'s.
     """
 
-    prefix_accuracy: float | None = None
-    prefix_ci: Limits | None = None
-    prefix_layer: int | None = None
-    prefix_depth: float | None = None
-    prefix_p_fwe: float | None = None
-    prefix_selectivity: float | None = None
-    prefix_beats: dict[str, bool | None] = field(default_factory=dict)
-    prefix_twin: float | None = None
-    prefix_twin_ci: Limits | None = None
-    prefix_ties: int | None = None
+    backbone_accuracy: float | None = None
+    backbone_ci: Limits | None = None
+    backbone_layer: int | None = None
+    backbone_depth: float | None = None
+    backbone_p_fwe: float | None = None
+    backbone_selectivity: float | None = None
+    backbone_exceeds: dict[str, bool | None] = field(default_factory=dict)
+    backbone_minus_untrained: float | None = None
+    backbone_minus_untrained_ci: Limits | None = None
+    backbone_ties: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,16 +143,16 @@ class ActionPeak:
     action_iteration: int | None = None
     action_p_fwe: float | None = None
     action_selectivity: float | None = None
-    action_beats: dict[str, bool | None] = field(default_factory=dict)
-    action_twin: float | None = None
-    action_twin_ci: Limits | None = None
+    action_exceeds: dict[str, bool | None] = field(default_factory=dict)
+    action_minus_untrained: float | None = None
+    action_minus_untrained_ci: Limits | None = None
     action_first_accuracy: float | None = None
     action_first_layer: int | None = None
     action_ties: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
+class RetentionScores:
     """How much of the backbone's signal reaches the action.
 
     `retention` is the published ratio even when `retention_defined` is False, and then no category mean contains
@@ -172,11 +172,11 @@ class Kept:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Background:
+class ControlScores:
     """What the probes are held against.
 
     chance: accuracy of always naming the larger class. baselines: accuracy of each control that never sees the
-    model; leaks: those above chance. gap: prefix accuracy − SR. twin: the run of random weights beside this one.
+    model; leaks: those above chance. gap: prefix accuracy − SR. untrained: the run of random weights beside this one.
     """
 
     n_groups: int | None = None
@@ -184,4 +184,4 @@ class Background:
     gap: float | None = None
     baselines: dict[str, float] = field(default_factory=dict)
     leaks: tuple[str, ...] = ()
-    twin: str | None = None
+    untrained: str | None = None

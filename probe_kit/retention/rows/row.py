@@ -4,27 +4,47 @@ from dataclasses import dataclass
 from typing import Self
 
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.rows.outcome_rules import Ruled
+from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
 from probe_kit.retention.rows.parts import (
     ActionPeak,
-    Asked,
+    AnswerStats,
     BackbonePeak,
-    Background,
     Behaviour,
-    Followed,
-    Kept,
-    Source,
+    ControlScores,
+    RetentionScores,
+    RunInfo,
+    SwapEffect,
 )
 from probe_kit.train.results.control_scores import signal
 
 MEAN = "mean"
 """Category of the rows that average over categories."""
 
-Part = Source | Behaviour | Followed | Asked | Ruled | BackbonePeak | ActionPeak | Kept | Background
+Part = (
+    RunInfo
+    | Behaviour
+    | SwapEffect
+    | AnswerStats
+    | OutcomeRuleScores
+    | BackbonePeak
+    | ActionPeak
+    | RetentionScores
+    | ControlScores
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Followed, Behaviour, Source):
+class RetentionRow(
+    ControlScores,
+    RetentionScores,
+    ActionPeak,
+    BackbonePeak,
+    AnswerStats,
+    OutcomeRuleScores,
+    SwapEffect,
+    Behaviour,
+    RunInfo,
+):
     """One line of the retention table: its parts, side by side under their own names.
 
     In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
@@ -43,14 +63,14 @@ class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Fol
         return cls(category=category, view=view, group=group, **fields)
 
     @property
-    def prefix_signal(self) -> bool:
+    def backbone_signal(self) -> bool:
         """Whether the backbone knows the answer: better than chance and every control that was run."""
-        return bool(self.prefix_beats) and signal(self.prefix_beats)
+        return bool(self.backbone_exceeds) and signal(self.backbone_exceeds)
 
     @property
     def action_signal(self) -> bool:
         """The same of the stream the action is made in."""
-        return bool(self.action_beats) and signal(self.action_beats)
+        return bool(self.action_exceeds) and signal(self.action_exceeds)
 
     @property
     def action_name(self) -> str:

@@ -19,7 +19,7 @@ from probe_kit.train.crossval.metrics import chance_level, correctness
 from probe_kit.train.data.labels import target_labels
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, Excess, TwinScore
+from probe_kit.train.results.control_scores import BINDING, UNTRAINED, BaselineScore, Excess, UntrainedScore
 from probe_kit.train.results.probe_curve import Curve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
@@ -84,19 +84,23 @@ def _baseline_scores(
         )
 
 
-def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
-    """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
-    if run.location.address == twin.location.address:
-        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
-    here, there = (_labels_by_episode(one, settings) for one in (run, twin))
+def check_untrained(run: RunReader, untrained: RunReader, settings: ProbeSettings) -> None:
+    """Raise UsageError unless `untrained` is another run of the same episodes with the same labels."""
+    if run.location.address == untrained.location.address:
+        raise UsageError(
+            f"{run.location} cannot be its own untrained control; give another run of the same episodes"
+        )
+    here, there = (_labels_by_episode(one, settings) for one in (run, untrained))
     if here != there:
         raise UsageError(
-            f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
+            f"the untrained control {untrained.model!r} has {len(there)} episodes to probe, "
+            f"{run.model!r} has {len(here)}, and they "
             "are not the same. Extract both from the same suite."
         )
-    if run.settings_sha256 == twin.settings_sha256:
+    if run.settings_sha256 == untrained.settings_sha256:
         raise UsageError(
-            f"{twin.location} is a copy of {run.location}, which cannot be its own twin; give other weights"
+            f"{untrained.location} is a copy of {run.location}, which cannot be its own untrained control; "
+            "give other weights"
         )
 
 
@@ -115,38 +119,48 @@ def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[st
     ]
 
 
-def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
-    """`results` held against the same probes of a twin. Raises UsageError if the twin saw other episodes."""
+def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResults:
+    """`results` compared with the same probes of an untrained network.
+
+    Raises UsageError if that one saw other episodes.
+    """
     scores = [
-        score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
+        score
+        for place, curve in results.curves.items()
+        for score in _untrained_scores(results, place, curve, untrained)
     ]
-    excess = [one for place, curve in results.curves.items() for one in _twin_excess(results, place, curve, twin)]
-    return replace(results, controls=results.controls.with_twin(scores).with_excess(excess))
+    excess = [
+        one
+        for place, curve in results.curves.items()
+        for one in _untrained_excess(results, place, curve, untrained)
+    ]
+    return replace(results, controls=results.controls.with_untrained(scores).with_excess(excess))
 
 
-def _twin_excess(
-    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
+def _untrained_excess(
+    results: ProbeResults, place: tuple[str, str], curve: Curve, untrained: ProbeResults
 ) -> Iterator[Excess]:
-    """Every site of a stream against the best of the twin's."""
-    other = twin.curves[place]
+    """Every site of a stream against the best of the untrained network's."""
+    other = untrained.curves[place]
     for stream in dict.fromkeys(site.stream for site in curve.sites):
         if not other.stream(stream).size:
             continue
         rows, others = curve.stream(stream), other.correct[other.stream(stream)]
-        seed = derive_seed(TWIN, results.settings.seed, *place, stream)
+        seed = derive_seed("twin", results.settings.seed, *place, stream)
         p = better_than_best(curve.correct[rows], others, curve.groups, seed)
         best = float(others.mean(axis=1).max())
         for row, of_site in zip(rows, p, strict=True):
-            yield Excess(TWIN, *place, str(curve.sites[row]), best, float(of_site))
+            yield Excess(UNTRAINED, *place, str(curve.sites[row]), best, float(of_site))
 
 
-def _twin_scores(
-    results: ProbeResults, place: tuple[str, str], curve: Curve, twin: ProbeResults
-) -> Iterator[TwinScore]:
-    other = twin.curves[place]
+def _untrained_scores(
+    results: ProbeResults, place: tuple[str, str], curve: Curve, untrained: ProbeResults
+) -> Iterator[UntrainedScore]:
+    other = untrained.curves[place]
     if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
         raise UsageError(
-            f"category {place[0]!r}: the twin {twin.settings.model!r} has {other.labels.size} episodes, this run "
+            f"category {place[0]!r}: the untrained control {untrained.settings.model!r} has "
+            f"{other.labels.size} episodes, this run "
             f"{curve.labels.size}, and they are not the same. Extract both from the same suite."
         )
     pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
@@ -157,15 +171,16 @@ def _twin_scores(
     )
     seed = units_seed(curve.groups, results.settings.suite)
     low, high = group_bootstrap(here - there, curve.groups, seed, bounds=GAINS)
-    for column, (row, twin_row, peak) in enumerate(pairs):
-        yield TwinScore(
+    for column, (row, untrained_row, peak) in enumerate(pairs):
+        yield UntrainedScore(
             *place,
             site=str(curve.sites[row]),
-            twin_site=str(other.sites[twin_row]),
+            untrained_site=str(other.sites[untrained_row]),
             peak=peak,
             accuracy=float(here[:, column].mean()),
-            twin_accuracy=float(there[:, column].mean()),
+            untrained_accuracy=float(there[:, column].mean()),
             difference=float((here - there)[:, column].mean()),
             ci=(float(low[column]), float(high[column])),
-            twin=twin.settings.model + (" (random weights)" if twin.settings.random_weights else ""),
+            untrained=untrained.settings.model
+            + (" (random weights)" if untrained.settings.random_weights else ""),
         )

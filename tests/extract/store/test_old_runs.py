@@ -19,7 +19,7 @@ from probe_kit.extract.plan import Plan
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train.results.inventory import inventory
 
@@ -80,7 +80,7 @@ def test_an_old_run_labels_its_axes_as_new_ones_do(runs: Path) -> None:
 
 def test_an_old_run_still_makes_a_table(runs: Path) -> None:
     run = open_run(runs / "pooled")
-    table = retention([run])
+    table = retention_table([run])
     assert {row.category for row in table.rows} == {"color"}
     assert table.rows[0].n_episodes == len(EXPECTED["pooled"]["outcomes"])
 
@@ -129,7 +129,7 @@ def test_an_old_run_is_not_continued(runs: Path, small_suite: Suite) -> None:
 def test_an_old_run_has_no_success_rate_by_rules_that_need_trajectories(runs: Path) -> None:
     run = open_run(runs / "pooled")
     assert not run.has_trajectories
-    table = retention([run], rule="box")
+    table = retention_table([run], rule="box")
     assert (table.rows[0].sr, table.rows[0].rule) == (None, "box")
     assert "keeps no trajectories" in " ".join(table.notes)
-    assert retention([run], rule="disc").rows[0].sr is not None
+    assert retention_table([run], rule="disc").rows[0].sr is not None

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.vlm_answers import scored
-from probe_kit.retention.columns.known_used_table import rich_join
-from probe_kit.retention.compare.known_used import Joined, encoded_decisions, join
+from probe_kit.retention.columns.known_used_table import rich_known_used
+from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
 SIZES = {"color": 14, "shape": 12}
@@ -111,7 +111,7 @@ def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRu
     encoded: dict[str, bool] = {}
     for curve in results.curves.values():
         encoded |= dict(zip(curve.episodes, encoded_decisions(curve), strict=True))
-    found = join(reader, policy, results)
+    found = match_runs(reader, policy, results)
     assert [row.category for row in found.rows] == ["color", "shape", "all"]
     for row in found.rows:
         expected = recount(reader, policy, encoded, row.category)
@@ -146,7 +146,7 @@ def test_encoded_decisions_are_chosen_on_other_groups(tmp_path: Path) -> None:
 
 def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(tmp_path: Path) -> None:
     one_side = {"color": np.array([[True, False], [False, True]] * 10)}
-    found = join(asked(tmp_path, one_side), acted(tmp_path, one_side))
+    found = match_runs(asked(tmp_path, one_side), acted(tmp_path, one_side))
     (row,) = found.rows
     assert (row.known, row.used, row.encoded) == (0, 0, None)
     assert row.counts == {"1-1": 0, "1-0": 0, "0-1": 0, "0-0": 20}
@@ -156,15 +156,15 @@ def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(t
 
 def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    assert join(scored(reader, "logits"), policy).rows[-1].known == 0, "it always says left"
-    debiased = join(scored(reader, "debiased"), policy)
+    assert match_runs(scored(reader, "logits"), policy).rows[-1].known == 0, "it always says left"
+    debiased = match_runs(scored(reader, "debiased"), policy)
     assert debiased.rows[-1].known == 26
     assert debiased.score == "debiased"
 
 
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    found = join(reader, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
+    found = match_runs(reader, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
     assert [row.signal for row in found.rows] == [True, False, None]
     assert any(note.startswith("In shape probes beat neither") for note in found.notes)
 
@@ -175,44 +175,44 @@ def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, Sai
         first_frame_sha256=policy.episodes["first_frame_sha256"].where(policy.episodes.index > 1, "another")
     )
     with pytest.raises(OtherFramesError, match="2 of 52 episodes begin with another frame"):
-        join(reader, replace(policy, episodes=other))
+        match_runs(reader, replace(policy, episodes=other))
     for bare in (policy.episodes.drop(columns="first_frame_sha256"), other.assign(first_frame_sha256=None)):
         with pytest.raises(OtherFramesError, match="does not say what its first frames were"):
-            join(reader, replace(policy, episodes=bare))
+            match_runs(reader, replace(policy, episodes=bare))
 
 
 def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    with pytest.raises(UsageError, match="not an asked and an acting run, in this order"):
-        join(policy, reader)
+    with pytest.raises(UsageError, match="not a VLM run and a policy run, in this order"):
+        match_runs(policy, reader)
     strange = policy.episodes.assign(item_id="other-" + policy.episodes["item_id"])
     with pytest.raises(UsageError, match="no question in common"):
-        join(reader, replace(policy, episodes=strange))
+        match_runs(reader, replace(policy, episodes=strange))
     half = policy.episodes[policy.episodes["layout"] == "original"]
     with pytest.raises(UsageError, match="no item in both layouts"):
-        join(reader, replace(policy, episodes=half))
+        match_runs(reader, replace(policy, episodes=half))
     with pytest.raises(UsageError, match="view 'last' was not probed"):
-        join(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
+        match_runs(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
 
 
 def test_what_is_left_out_is_said(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
     fewer = replace(reader, episodes=reader.episodes[reader.episodes["category"] == "color"])
-    found = join(fewer, policy, probes(policy, {"color": [0.9]}))
+    found = match_runs(fewer, policy, probes(policy, {"color": [0.9]}))
     assert [row.category for row in found.rows] == ["color"]
     assert any(note.startswith("24 episodes of") for note in found.notes)
 
 
 def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    found = join(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
+    found = match_runs(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
-    console.print(rich_join(found))
+    console.print(rich_known_used(found))
     text = console.export_text()
     for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "known − used"):
         assert words in text
     frame = found.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}
     assert found.to_json()["rows"][0]["counts"] == found.rows[0].counts
-    assert isinstance(found.rows[0], Joined)
+    assert isinstance(found.rows[0], CategoryCounts)
     assert isinstance(frame, pd.DataFrame)

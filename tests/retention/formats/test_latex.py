@@ -2,7 +2,7 @@ from collections.abc import Callable
 
 import pytest
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.formats.latex import escape, heat_colour
 from probe_kit.train import ArrayRun
 
@@ -10,7 +10,7 @@ from probe_kit.train import ArrayRun
 @pytest.fixture
 def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
     accuracies = {"color": ([0.5, 0.9, 0.7], [[0.6, 0.7]]), "traffic_sign": ([0.5, 0.55, 0.5], [[0.58, 0.5]])}
-    return retention([probed_run(accuracies, "pi0-tiny", random_weights=True)])
+    return retention_table([probed_run(accuracies, "pi0-tiny", random_weights=True)])
 
 
 def test_text_is_escaped_and_only_defined_retention_is_coloured(table: RetentionTable) -> None:

@@ -7,7 +7,7 @@ import pytest
 from probe_kit._terminal.console import out
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.report.category_summary import stories
+from probe_kit.retention.report.category_summary import policy_summaries
 from probe_kit.retention.rows.row import MEAN
 
 
@@ -26,7 +26,7 @@ def answers(category: str, sr: float = 1.0, **fields: Any) -> RetentionRow:
 
 def acts(category: str, backbone: float | None, used: str, sr: float = 0.5, **fields: Any) -> RetentionRow:
     chance = None if backbone is None else backbone > 0.7
-    beats = {"prefix_beats": {"chance": chance}, "prefix_accuracy": backbone, "used": used}
+    beats = {"backbone_exceeds": {"chance": chance}, "backbone_accuracy": backbone, "used": used}
     return row("acts", category, sr=sr, view="mean", **beats, **fields)
 
 
@@ -38,7 +38,7 @@ ROWS = [
 
 
 def test_every_category_is_a_sentence_with_the_numbers_it_rests_on() -> None:
-    (story,) = stories(ROWS)
+    (story,) = policy_summaries(ROWS)
     assert (story.policy, story.reader) == ("pi0-tiny", "vlm-tiny")
     assert [one.outcome for one in story.chapters] == [
         "known; used", "known; encoded, unused", "not known; absent",
@@ -58,33 +58,33 @@ def test_without_a_reader_nothing_is_said_of_knowing() -> None:
         [*ROWS[4:], answers("color", suite="another@1")],
         [*ROWS[4:], answers("color", picture="none")],
     ):
-        (story,) = stories(rows)
+        (story,) = policy_summaries(rows)
         assert story.reader == ""
         assert {one.known for one in story.chapters} == {None}
         assert "reader" not in story.chapters[0].sentence
 
 
 def test_a_category_that_was_not_asked_about_is_told_without_the_reader() -> None:
-    (story,) = stories([answers("state"), *ROWS[4:]])
+    (story,) = policy_summaries([answers("state"), *ROWS[4:]])
     assert [one.known for one in story.chapters] == [None, True, None]
 
 
 def test_every_probed_policy_has_its_story_by_its_first_view() -> None:
     again = RetentionRow(**{**vars(acts("color", 0.6, "absent")), "view": "mean:language"})
     rows = [*ROWS, again, acts("color", 0.5, "absent", run="twin", random_weights=True)]
-    first, twin = stories(rows)
+    first, twin = policy_summaries(rows)
     assert (first.policy, twin.policy) == ("pi0-tiny", "pi0-tiny (random weights)")
     assert [len(one.chapters) for one in (first, twin)] == [3, 1]
 
 
-@pytest.mark.parametrize("fields", [{"listened": True}, {"prefix_accuracy": None}])
+@pytest.mark.parametrize("fields", [{"listened": True}, {"backbone_accuracy": None}])
 def test_who_only_listened_or_was_not_probed_has_none(fields: dict[str, Any]) -> None:
     plain = vars(acts("color", 1.0, "used"))
-    assert stories([RetentionRow(**{**plain, **fields})]) == []
+    assert policy_summaries([RetentionRow(**{**plain, **fields})]) == []
 
 
 def test_the_table_fits_a_narrow_terminal() -> None:
-    (story,) = stories(ROWS)
+    (story,) = policy_summaries(ROWS)
     with out.capture() as printed:
         out.print(story.to_rich(), width=80)
     text = printed.get()

@@ -13,7 +13,7 @@ SHOWN = 12
 
 
 @dataclass(frozen=True)
-class Certificate:
+class ProvenanceLine:
     """Where the numbers of a figure come from.
 
     weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.

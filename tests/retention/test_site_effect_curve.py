@@ -11,8 +11,8 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.results.results import effects_csv
 from probe_kit.intervene.store.answers import Answers, save
 from probe_kit.intervene.store.settings import FORMAT, key_of
-from probe_kit.retention import retention
-from probe_kit.retention.displays import CausalCurveDisplay, causal_curve, gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import SiteEffectDisplay, collect_figures, site_effect_curve
 from probe_kit.train import ArrayRun, load_results
 from tests.intervene.answers import answers_of, follower, habit
 
@@ -60,7 +60,7 @@ def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
 def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
     answers = answers_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0))
-    display = CausalCurveDisplay.from_run(run, load_results(run), "color").plot()
+    display = SiteEffectDisplay.from_run(run, load_results(run), "color").plot()
     np.testing.assert_allclose(display.readable.percent, [50.0, 90.0])
     assert display.readable.significant.tolist() == [False, True]
     np.testing.assert_allclose(display.passes["all"].percent, [100.0, 0.0])
@@ -69,20 +69,20 @@ def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None
     assert display.ax_ is not None
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert "passes: all" in labels
-    names = [exhibit.name for exhibit in gallery([run], retention([run]))]
+    names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any("causes" in name for name in names)
 
 
 def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
-        CausalCurveDisplay.from_run(run, load_results(run), "color")
+        SiteEffectDisplay.from_run(run, load_results(run), "color")
     with pytest.raises(NoInterventionsError):
-        causal_curve(run, load_results(run))
-    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+        site_effect_curve(run, load_results(run))
+    assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
 
 
 def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
-    rows = {row.category: row for row in retention([run]).rows}
+    rows = {row.category: row for row in retention_table([run]).rows}
     assert (rows["color"].used, rows["shape"].used) == ("used", "encoded, unused")
     assert rows["shape"].used_note == "positive control: color"
     assert (rows["color"].follows, rows["color"].against) == (1.0, 0.0)
@@ -91,7 +91,7 @@ def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
 def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
     answers = answers_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
-    rows = {row.category: row for row in retention([run]).rows}
+    rows = {row.category: row for row in retention_table([run]).rows}
     assert rows["color"].used == "inconclusive"
     assert rows["shape"].used == "encoded, unused"
 
@@ -106,9 +106,9 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     }
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
-    (row,) = (row for row in retention([run]).rows if row.category == "color")
+    (row,) = (row for row in retention_table([run]).rows if row.category == "color")
     assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at memory.00")
-    display = CausalCurveDisplay.from_run(run, load_results(run), "color")
+    display = SiteEffectDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])
 
@@ -118,8 +118,8 @@ def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     answers = answers_of({"color": follower(48)})
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
-    (row,) = (row for row in retention([run]).rows if row.category == "color")
+    (row,) = (row for row in retention_table([run]).rows if row.category == "color")
     assert (row.used, row.used_note) == ("used", "")
-    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+    assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
-        causal_curve(run, load_results(run))
+        site_effect_curve(run, load_results(run))

@@ -13,7 +13,7 @@ from probe_kit.intervene.edits.sites import ALL
 from probe_kit.intervene.kinds.site_effects import Passing
 from probe_kit.intervene.results.site_maps import BACKBONE, stored_passing
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
@@ -36,7 +36,7 @@ class Points:
 
 
 @dataclass
-class CausalCurveDisplay(Panelled):
+class SiteEffectDisplay(Panelled):
     """By backbone layer: held-out accuracy of probes, and how many episodes turn when its tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
@@ -50,7 +50,7 @@ class CausalCurveDisplay(Panelled):
     readable: Points
     passes: dict[str, Points]
     read: Points | None
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -84,7 +84,7 @@ class CausalCurveDisplay(Panelled):
             ),
             passes={role: _points(own) for role, own in by_role.items()},
             read=_points(read) if read else None,
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )  # fmt: skip
 
     @property
@@ -125,11 +125,11 @@ def shown_passing(run: RunReader) -> dict[str, list[Passing]]:
     return {category: rows for category, rows in found.items() if rows}
 
 
-def causal_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
+def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
     """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
     found = shown_passing(run)
     names = [name for name in results.settings.categories if name in found] or ["any"]
-    return in_panels([CausalCurveDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
+    return in_panels([SiteEffectDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
 
 
 def _points(rows: Sequence[Passing]) -> Points:
