@@ -76,24 +76,24 @@ def _folder(out: Path, suite: Suite, scene: SceneSpec, name: str) -> Path:
 
 
 def _cells(row: RetentionRow) -> tuple[str, ...]:
-    acts = row.kind == "acts"
-    low, high = row.sr_ci
+    acts = row.run.mode == "acts"
+    low, high = row.success.ci
     layouts = (
         "–"
-        if None in (row.sr_original, row.sr_swapped)
-        else f"{_percent(row.sr_original)} / {_percent(row.sr_swapped)}"
+        if None in (row.success.sr_original, row.success.sr_swapped)
+        else f"{_percent(row.success.sr_original)} / {_percent(row.success.sr_swapped)}"
     )
     return (
-        row.label or row.model,
-        row.rule if acts else "–",
+        row.run.label or row.run.model,
+        row.rules.rule if acts else "–",
         row.category,
-        str(row.n_episodes),
-        f"{_percent(row.sr)} [{_percent(low)}, {_percent(high)}]",
+        str(row.success.n_episodes),
+        f"{_percent(row.success.sr)} [{_percent(low)}, {_percent(high)}]",
         layouts,
-        _percent(row.share_wrong),
-        _percent(row.share_outside),
-        _percent(row.chance_margin),
-        str(row.regime) if acts else verdict(row),
+        _percent(row.success.share_wrong),
+        _percent(row.success.share_outside),
+        _percent(row.success.chance_margin),
+        str(row.success.regime) if acts else verdict(row),
     )
 
 

@@ -42,9 +42,9 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
     others = scores.drop(index=best).query("stream == 'backbone'")
     assert (others["p_fwe"] >= 0.05).all()
     (row,) = (row for row in retention_table([planted_run]).rows if row.category == "shape")
-    assert row.retention_defined
-    assert row.backbone_layer == PLANTED.layer
-    assert row.random_weights
+    assert row.retention.defined
+    assert row.backbone.layer == PLANTED.layer
+    assert row.run.random_weights
 
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")

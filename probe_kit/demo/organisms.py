@@ -18,7 +18,8 @@ from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import Follow, Source, intervene_on
 from probe_kit.intervene.kinds.image_swap.effects import WORTH
 from probe_kit.retention import RetentionRow, retention_table
-from probe_kit.retention.columns.text import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
+from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
+from probe_kit.retention.columns.text import bounded_value, exceeds, number, percent
 from probe_kit.retention.report.category_summary import CategoryVerdict, verdict
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -190,8 +191,8 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     following would be seen in every other; a policy that nobody trained to act follows nowhere by itself.
     """
     said = verdict(row)
-    bounded = row.follows_net_ci is not None and (row.follows_net_ci[1] or 0.0) < WORTH
-    return "encoded, unused" if said == "inconclusive" and row.backbone_signal and bounded and shown else said
+    bounded = row.image_swap.follows_net_ci is not None and (row.image_swap.follows_net_ci[1] or 0.0) < WORTH
+    return "encoded, unused" if said == "inconclusive" and row.backbone.signal and bounded and shown else said
 
 
 def to_rich(findings: Sequence[Finding]) -> "FittingTable":
@@ -213,7 +214,7 @@ def to_rich(findings: Sequence[Finding]) -> "FittingTable":
             ),
             Part(
                 "What they rest on",
-                ("SR %", "± Δ", "follows / against", "backbone", "p", "beats", "action", "retention [95 %]"),
+                ("SR %", "± Δ", "follows / against", "backbone", "p", "exceeds", "action", "retention [95 %]"),
                 tuple(map(_number_cells, findings)),
             ),
         ),
@@ -232,8 +233,8 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.backbone_accuracy),
-        number(row.backbone_p_fwe, 3),
-        beats(row), percent(row.action_accuracy), bounded_value(row),
+        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.accuracy),
+        number(row.backbone.p_fwe, 3),
+        exceeds(row), percent(row.action.accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

@@ -111,7 +111,8 @@ def ask(
     One run per prompt and picture size, in the scenes that `probe-kit extract` plays with the same --suite,
     --scene and --seed. Every question is asked twice, with the options exchanged, and answered twice: in text, and
     as a choice between the options' logits. Runs are read like any other: `probe-kit retention ASKED… ACTED…` puts
-    both in one table, with --vlm-vla it tests the difference, and `probe-kit stages` says what is known and not used.
+    both in one table, with --vlm-vla it tests the difference, and `probe-kit stages` says what is known and not
+    used.
 
     The same command continues interrupted runs; other settings in the same folder are refused.
     """

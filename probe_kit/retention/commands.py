@@ -66,9 +66,10 @@ def retention(
     html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
     score: Annotated[
-        str, typer.Option(help="Of VLM runs: text, logits, or debiased (no letter bias).", rich_help_panel=ASKED)
+        str,
+        typer.Option(help="Of VLM runs: text, logits, or order-balanced (no letter bias).", rich_help_panel=ASKED),
     ] = "text",
-    gap: Annotated[
+    vlm_vla: Annotated[
         bool,
         typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=ASKED),
     ] = False,
@@ -109,7 +110,7 @@ def retention(
     table = make_table(
         opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii, rule=rule,
         last_steps=last_steps,
-        score=score, gap=gap, with_side_words=with_side_words, against=against,
+        score=score, vlm_vla=vlm_vla, with_side_words=with_side_words, against=against,
     )  # fmt: skip
     if style == "table":
         out.print(table.to_rich())

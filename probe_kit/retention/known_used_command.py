@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def stages(
     asked: Annotated[str, typer.Argument(help="A run of `probe-kit ask`.")],
     acted: Annotated[str, typer.Argument(help="A run of `probe-kit extract` in the same scenes.")],
-    score: Annotated[str, typer.Option(help="Of the VLM run: text, logits, or debiased.")] = "text",
+    score: Annotated[str, typer.Option(help="Of the VLM run: text, logits, or order-balanced.")] = "text",
     view: Annotated[str | None, typer.Option(help="View of the policy run's probes; default the first.")] = None,
     probes: Annotated[str | None, typer.Option(help="Key of these probes; default those asked for last.")] = None,
     with_side_words: Annotated[
@@ -60,7 +60,8 @@ def stages(
 
 
 def _save(joined: "KnownUsedTable", folder: Path) -> None:
-    from probe_kit.retention.displays.report_figures import known_used_figures, save_figures
+    from probe_kit.retention.displays.known_used import known_used_figures
+    from probe_kit.retention.displays.report_figures import save_figures
 
-    for path in save_figures(known_used_figures([joined]), folder):
+    for path in save_figures(list(known_used_figures([joined])), folder):
         say(f"figure: {path}")

@@ -71,21 +71,21 @@ def test_nothing_moved_and_the_run_says_so(heard: Run) -> None:
 
 def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run, tmp_path: Path) -> None:
     table = retention_table([heard, recorded_run])
-    rows = [row for row in json.loads(table.to_json()) if row["listened"]]
+    rows = [row for row in json.loads(table.to_json()) if row["run"]["listened"]]
     assert {row["category"] for row in rows} == {"color", "mean"}
     for row in rows:
-        assert [row[name] for name in ("sr", "sr_ci", "regime", "share_outside", "gap", "normalised_score")] == [
-            None
-        ] * 6
-        assert row["backbone_accuracy"] is not None
-    acting = [row for row in json.loads(table.to_json()) if not row["listened"]]
-    assert all(row["sr"] is not None for row in acting)
+        nothing = ("sr", "ci", "regime", "share_outside", "normalised_score")
+        assert [row["success"][name] for name in nothing] == [None] * 5
+        assert row["controls"]["probe_minus_sr"] is None
+        assert row["backbone"]["accuracy"] is not None
+    acting = [row for row in json.loads(table.to_json()) if not row["run"]["listened"]]
+    assert all(row["success"]["sr"] is not None for row in acting)
     screen = StringIO()
     Console(file=screen, width=240).print(table.to_rich())
     for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
         assert "n/a" in text
         assert "listened to" in text
-    assert table.to_frame()["sr"].isna().sum() == 2
+    assert table.to_frame()["success.sr"].isna().sum() == 2
     assert any("was listened to and did not act" in note for note in table.notes)
     page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text()
     assert "did not act" in page

@@ -56,9 +56,9 @@ def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: 
     for one in runs:
         train_probes(one, permutations=1, jobs=1)
     rows = retention_table(runs).rows
-    assert [row.model for row in rows] == ["spatialvla", "openvla", "pi0-tiny"]
-    assert [row.action_stream for row in rows] == ["action", "action", "expert"]
-    assert all(row.n_items == 12 for row in rows)
+    assert [row.run.model for row in rows] == ["spatialvla", "openvla", "pi0-tiny"]
+    assert [row.run.action_stream for row in rows] == ["action", "action", "expert"]
+    assert all(row.success.n_items == 12 for row in rows)
 
 
 def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path) -> None:

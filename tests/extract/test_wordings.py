@@ -100,7 +100,7 @@ def test_retention_shows_one_wording_and_all_of_them_against_each_other(ladder):
     with pytest.raises(UsageError, match="several wordings"):
         retention_table([ladder])
     table = retention_table([ladder.in_wording("named")])
-    assert {row.n_episodes for row in table.rows} == {4}
+    assert {row.success.n_episodes for row in table.rows} == {4}
     assert [(pair.wording, pair.other, pair.n_episodes) for pair in table.wordings] == [("knowledge", "named", 4)]
     assert any("wording 'named'" in note for note in table.notes)
     assert set(json.loads(table.to_json())) == {"rows", "wordings"}

@@ -181,7 +181,7 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     assert stored_interventions(fewer) == []
     with pytest.raises(NoInterventionsError, match="probe-kit intervene"):
         load_effects(fewer)
-    assert all(row.follows is None for row in retention_table([fewer]).rows)
+    assert all(row.image_swap.follows is None for row in retention_table([fewer]).rows)
 
 
 # -- what retention makes of it ------------------------------------------------------------------------------
@@ -189,11 +189,13 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
 
 def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Effects) -> None:
     table = retention_table([copy])
-    assert {row.category: row.follows for row in table.rows} == {row.category: row.follows for row in effects.rows}
-    assert all(row.used in ("does not follow", "inconclusive") for row in table.rows)
+    assert {row.category: row.image_swap.follows for row in table.rows} == {
+        row.category: row.follows for row in effects.rows
+    }
+    assert all(row.image_swap.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
         assert "ollows / against" in text
-    assert json.loads(table.to_json())[0]["used"] == table.rows[0].used
+    assert json.loads(table.to_json())[0]["image_swap"]["used"] == table.rows[0].image_swap.used
 
 
 def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:

@@ -191,9 +191,9 @@ def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) 
     assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
     assert [cell.bold for cell in success.cells[0]] == [True, True, False], "0.6 is above 0.5 + Δ = 0.569"
     row = table.rows[0]
-    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.sr_left, row.sr_right)
+    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
-    assert color.values == (row.retention_bounded, row.retention)
+    assert color.values == (row.retention.bounded, row.retention.published)
     assert shape.values == (None, None), "no backbone signal"
 
 
@@ -287,14 +287,14 @@ def test_final_positions_need_positions_and_a_scene(tmp_path: Path, outcome_tabl
         FinalPositionsDisplay.from_run(placed_run(tmp_path, outcome_table), "shape")
 
 
-# -- collect_figures ---------------------------------------------------------------------------------------------------
+# -- collect_figures -----------------------------------------------------------------------------------------
 
 
 def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: ProbedRun, tmp_path: Path) -> None:
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
     saved = list(save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"))
     assert [path.stem for path in saved] == [
-        "success", "sides", "knowledge-action", "retention", "pi0-paired-layouts", "pi0-layer-curves",
+        "success", "sides", "retention", "knowledge-action", "pi0-paired-layouts", "pi0-layer-curves",
         "pi0-iteration-maps",
     ]  # fmt: skip
     assert all(path.stat().st_size > 5000 and path.with_suffix(".pdf").is_file() for path in saved)

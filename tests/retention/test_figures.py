@@ -95,7 +95,7 @@ def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Dr
                 assert frame.x0 <= box.x0 < box.x1 <= frame.x1, f"{name}: legend"
                 assert frame.y0 <= box.y0 < box.y1 <= frame.y1, f"{name}: legend"
         assert "\n" not in figure.get_supxlabel(), name
-        suites = {row.suite for row in table.rows}
+        suites = {row.run.suite for row in table.rows}
         assert any(suite in figure.caption for suite in suites), name  # type: ignore[attr-defined]
 
 

@@ -18,9 +18,9 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.displays.report_figures import collect_figures
-from probe_kit.retention.formats.html import behaviour_table, control_table, probe_table
+from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.provenance import citation
@@ -129,24 +129,29 @@ print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name
     assert loaded.stdout.strip() == "[]"
 
 
+def titled(rows: Any, title: str) -> HtmlTable | None:
+    return next((one for one in html_tables(rows) if one.title == title), None)
+
+
 # -- tables and words ------------------------------------------------------------------------------------------
 
 
 def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
-    made = behaviour_table(table.all_rows)
+    made = titled(table.all_rows, "Success rate")
+    assert made is not None
     assert [column.name for column in made.columns][:2] == ["category", "SR\u00a0% [95\u00a0%]"], (
         "one run: no model"
     )
     success = made.body[0][1]
-    assert success.sort == table.rows[0].sr == 0.6
+    assert success.sort == table.rows[0].success.sr == 0.6
     assert success.text.startswith("60.0 [")
     assert success.strong
     assert [row[0].text for row in made.foot] == ["mean"]
 
 
 def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
-    made = probe_table(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows)
+    made = titled(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows, "Retention")
     assert made is not None
     position = [column.name for column in made.columns].index("bounded [95\u00a0%]")
     color, shape = (row[position] for row in made.body)
@@ -157,18 +162,17 @@ def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probe
 def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL})])
     leaking = {"baselines": {"pixels": 0.8}, "leaks": ("pixels",)}
-    rows = [replace(row, **leaking) for row in table.all_rows]
-    made = control_table(rows)
+    rows = [replace(row, controls=replace(row.controls, **leaking)) for row in table.all_rows]
+    made = titled(rows, "Controls")
     assert made is not None
     assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.body[0])
     assert any("pixels" in warning for warning in summarise(rows).warnings)
-    assert control_table(table.all_rows) is None
+    assert titled(table.all_rows, "Controls") is None
 
 
 def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
     rows = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
-    for made in (behaviour_table(rows), probe_table(rows)):
-        assert made is not None
+    for made in html_tables(rows):
         assert all(len(column.explanation) > 10 for column in made.columns)
 
 
@@ -201,7 +205,7 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
     some = replace(results, settings=only, curves=curves, controls=Controls())
     save_results(some, run.path)
     table = retention_table([run])
-    note = {row.category: row.retention_note for row in table.rows}
+    note = {row.category: row.retention.note for row in table.rows}
     assert note["shape"] == f"n/a (probes {some.key} are of color)"
     assert f"1 left out: probes {some.key} are of color)" in " ".join(summarise(table.all_rows).sentences)
     untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
@@ -219,7 +223,7 @@ def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: Pro
     marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
     assert len(marked) > 4
     assert all("every control" in reading for reading in marked)
-    assert "every control" in GLOSSARY["n/a"]
+    assert "every control" in glossary()["n/a"]
 
 
 def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:
@@ -237,7 +241,7 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
 
 
 def test_the_glossary_has_a_sentence_for_every_word() -> None:
-    assert all(meaning.endswith(".") for meaning in GLOSSARY.values())
+    assert all(meaning.endswith(".") for meaning in glossary().values())
 
 
 # -- episodes --------------------------------------------------------------------------------------------------

@@ -46,19 +46,31 @@ def test_doing_nothing_scores_a_half_by_the_released_rule_and_nothing_by_the_oth
     assert result.exit_code == 0
     rows = json.loads(result.stdout)
     for row in rows:
-        assert (row["rule"], row["sr"], row["sr_idle"]) == (rule, sr, sr)
-        assert row["sr_by_rule"] == {"disc": 0.0, "box": 0.5, "released-on-tile": 0.0}
-        assert (row["n_grasped"], row["sr_grasped"]) == (4, sr)
-        assert row["behaviour"]["moved"] == row["behaviour"]["first_choice_made"] == 0
+        assert (row["rules"]["rule"], row["success"]["sr"], row["rules"]["sr_idle"]) == (rule, sr, sr)
+        assert row["rules"]["sr_by_rule"] == {"disc": 0.0, "box": 0.5, "released-on-tile": 0.0}
+        assert (row["rules"]["n_grasped"], row["rules"]["sr_grasped"]) == (4, sr)
+        assert row["rules"]["behaviour"]["moved"] == row["rules"]["behaviour"]["first_choice_made"] == 0
     if rule == "box":
-        assert (rows[0]["sr_left"], rows[0]["sr_right"], rows[0]["share_answered"]) == (0, 1, 1)
-        assert (rows[0]["share_unmoved_answers"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (
+        assert (
+            rows[0]["success"]["sr_left"],
+            rows[0]["success"]["sr_right"],
+            rows[0]["rules"]["share_answered"],
+        ) == (0, 1, 1)
+        assert (
+            rows[0]["rules"]["share_unmoved_answers"],
+            rows[0]["rules"]["idle_side"],
+            rows[0]["rules"]["sr_answered"],
+        ) == (
             1,
             "right",
             0.5,
         )
     else:
-        assert (rows[0]["share_unmoved_answers"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (
+        assert (
+            rows[0]["rules"]["share_unmoved_answers"],
+            rows[0]["rules"]["idle_side"],
+            rows[0]["rules"]["sr_answered"],
+        ) == (
             None,
             "none",
             None,
@@ -70,16 +82,16 @@ def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
         table = retention_table([idle], rule=rule)
         share = "50.0" if rule == "box" else "0.0"
         sentence = f"a policy that does nothing would score {share} %, as the untouched cube {why}"
-        assert sentence in rule_sentence(table.means[0])
+        assert sentence in rule_sentence(table.means[0].rules)
         for text in (table.to_markdown(), table.to_latex().replace(r"\%", "%"), report_html([idle], table)):
             assert sentence in text
-            assert f"outcome rule {rule}" in text
+            assert f"utcome rule {rule}" in text
 
 
 def test_the_mean_over_the_last_steps_is_an_option_of_the_rule(idle: Run) -> None:
     row = retention_table([idle], rule="box", last_steps=11).rows[0]
-    assert (row.sr, row.last_steps) == (0.5, 11)
-    assert "mean of the last 11 control steps (all, where there are fewer)" in rule_sentence(row)
+    assert (row.success.sr, row.rules.last_steps) == (0.5, 11)
+    assert "mean of the last 11 control steps (all, where there are fewer)" in rule_sentence(row.rules)
 
 
 def test_shares_of_an_episode_count_as_shares() -> None:
@@ -146,20 +158,25 @@ def test_a_run_without_trajectories_has_no_rate_by_other_rules(tmp_path: Path) -
     run = ArrayRun(tmp_path / "old", "old", "suite@1#0123456789ab", outcomes(6, 2, 4), {})
     table = retention_table([run], rule="box")
     row = table.rows[0]
-    assert (row.sr, row.regime, row.sr_by_rule, row.n_episodes) == (None, None, {}, 12)
-    assert json.loads(table.to_json())[0]["sr"] is None
+    assert (row.success.sr, row.success.regime, row.rules.sr_by_rule, row.success.n_episodes) == (
+        None,
+        None,
+        {},
+        12,
+    )
+    assert json.loads(table.to_json())[0]["success"]["sr"] is None
     assert "n/a" in table.to_markdown()
     assert any("keeps no trajectories" in note for note in table.notes)
-    assert retention_table([run]).rows[0].sr == 0.5
-    assert retention_table([run]).rows[0].sr_answered == 0.75
+    assert retention_table([run]).rows[0].success.sr == 0.5
+    assert retention_table([run]).rows[0].rules.sr_answered == 0.75
     assert collect_figures([run], table) == []
     with pytest.raises(NoTrajectoryError, match="groups cannot be compared by the rule box"):
         retention_table({"a": [run]}, rule="box")
 
 
 def test_radii_belong_to_the_disc(idle: Run) -> None:
-    assert retention_table([idle], rule="box").rows[0].sr_by_epsilon == {}
-    assert retention_table([idle]).rows[0].sr_by_epsilon
+    assert retention_table([idle], rule="box").rows[0].rules.sr_by_epsilon == {}
+    assert retention_table([idle]).rows[0].rules.sr_by_epsilon
     with pytest.raises(UsageError, match="belong to the outcome rule disc"):
         retention_table([idle], rule="box", epsilons=(0.05,))
     for options in (["--rule", "box", "--epsilons", "0.05"], ["--rule", "boxx"], ["--last-steps", "0"]):

@@ -83,17 +83,17 @@ def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:
 
 def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
     rows = {row.category: row for row in retention_table([run]).rows}
-    assert (rows["color"].used, rows["shape"].used) == ("used", "encoded, unused")
-    assert rows["shape"].used_note == "positive control: color"
-    assert (rows["color"].follows, rows["color"].against) == (1.0, 0.0)
+    assert (rows["color"].image_swap.used, rows["shape"].image_swap.used) == ("used", "encoded, unused")
+    assert rows["shape"].image_swap.used_note == "positive control: color"
+    assert (rows["color"].image_swap.follows, rows["color"].image_swap.against) == (1.0, 0.0)
 
 
 def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
     answers = answers_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
     rows = {row.category: row for row in retention_table([run]).rows}
-    assert rows["color"].used == "inconclusive"
-    assert rows["shape"].used == "encoded, unused"
+    assert rows["color"].image_swap.used == "inconclusive"
+    assert rows["shape"].image_swap.used == "encoded, unused"
 
 
 @pytest.mark.parametrize("is_memory_last", [False, True])
@@ -107,7 +107,7 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at memory.00")
+    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "passes at backbone.00; read at memory.00")
     display = SiteEffectDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])
@@ -119,7 +119,7 @@ def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (row.used, row.used_note) == ("used", "")
+    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "")
     assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
         site_effect_curve(run, load_results(run))

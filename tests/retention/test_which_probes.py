@@ -31,7 +31,7 @@ def test_figures_and_report_draw_the_probes_of_the_table_not_the_newest(probed_r
     newer = probed_again(run, permutations=50)
     table = retention_table([run], keys=[older.key])
     assert table.results[str(run.location)].key == older.key
-    assert {row.probe_settings for row in table.all_rows} == {older.key}
+    assert {row.run.probes for row in table.all_rows} == {older.key}
     (curves,) = [exhibit for exhibit in collect_figures([run], table) if exhibit.name.endswith("layer-curves")]
     with curves.drawn() as figure:
         assert older.key in figure.get_supxlabel()
@@ -62,7 +62,7 @@ def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: Pro
     assert len(table.notes) == 2
     assert f"Run `probe-kit train {bare.path}`." in table.notes[0]
     assert "the policy 'expert' has no streams" in table.notes[1]
-    assert table.rows[1].sr == 0.6
+    assert table.rows[1].success.sr == 0.6
     assert retention_table([probed]).notes == ()
 
 

@@ -45,39 +45,43 @@ class PairedItems:
     p: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
     ci: 95 % interval of `sr`, whole groups of items resampled. sr_original, sr_swapped: per layout, and
-    layout_mean their mean. share_never_moved: share that ended where it started, a failed grasp; part of share_outside, None
-    if it was not recorded. share_invalid_action: share of inferences that put out no action, None for a policy that cannot
-    tell. sr_left, sr_right: per side of the correct picture. chance_margin_episodes: half-width of the band around 0.5 that
-    guessing explains, for N = episodes (the paper's); chance_margin_items: the same for N = items; chance_margin: for as
-    many items as count, fewer where items of a group answer alike, and what `regime` is judged by.
-    side_preference: share placed left among episodes placed in a zone. A rate over no episodes is None.
+    layout_mean their mean. sr_left, sr_right: per side of the correct picture. share_wrong, share_outside: ended
+    on the other picture, or on neither. share_never_moved: share that ended where it started, a failed grasp; part
+    of share_outside, None if it was not recorded. share_invalid_action: share of inferences that put out no
+    action, None for a policy that cannot tell. chance_margin_episodes: half-width of the band around 0.5 that
+    guessing explains, for N = episodes (the paper's); chance_margin_items: the same for N = items; chance_margin:
+    for as many items as count, fewer where items of a group answer alike, and what `regime` is judged by. reason:
+    why that regime, or why there is no rate. side_preference: share placed left among episodes placed in a zone.
+    normalised_score: only of a mean over categories. A rate over no episodes is None, and so is every rate of a
+    model that did not act.
     """
 
     n_episodes: int
     n_items: int
-    sr: float
-    ci: tuple[float, float]
-    sr_original: float | None
-    sr_swapped: float | None
-    layout_mean: float | None
-    sr_left: float | None
-    sr_right: float | None
-    share_wrong: float
-    share_outside: float
-    share_never_moved: float | None
-    share_invalid_action: float | None
-    chance_margin_episodes: float
-    chance_margin_items: float
-    chance_margin: float
-    regime: Regime
-    reason: str
-    side_preference: float | None
-    paired: PairedItems
+    sr: float | None = None
+    ci: tuple[float | None, float | None] | None = None
+    sr_original: float | None = None
+    sr_swapped: float | None = None
+    layout_mean: float | None = None
+    sr_left: float | None = None
+    sr_right: float | None = None
+    share_wrong: float | None = None
+    share_outside: float | None = None
+    share_never_moved: float | None = None
+    share_invalid_action: float | None = None
+    chance_margin_episodes: float | None = None
+    chance_margin_items: float | None = None
+    chance_margin: float | None = None
+    regime: Regime | None = None
+    reason: str = ""
+    side_preference: float | None = None
+    normalised_score: float | None = None
+    paired: PairedItems | None = None
 
 
 def regime(

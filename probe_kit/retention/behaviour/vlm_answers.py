@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 SCORES: Mapping[str, tuple[str, str]] = {
     "text": ("outcome", "side_placed"),
     "logits": ("outcome_logits", "side_logits"),
-    "debiased": ("outcome_debiased", "side_debiased"),
+    "order-balanced": ("outcome_debiased", "side_debiased"),
 }
 """By score, the columns of outcome and side."""
 

@@ -65,9 +65,9 @@ def _share(count: int | None, row: CategoryCounts) -> str:
 
 _SHARES: Columns = [
     ("items (groups)", lambda row: f"{row.n_items} ({row.n_groups})"),
-    ("known", lambda row: _share(row.known, row)),
+    ("answered correctly", lambda row: _share(row.answered_correctly, row)),
     ("encoded", lambda row: _share(row.encoded, row)),
-    ("used", lambda row: _share(row.used, row)),
+    ("acted correctly", lambda row: _share(row.acted_correctly, row)),
     ("signal", lambda row: {True: "yes", False: "no", None: "–"}[row.signal]),
 ]
 _LOST: Columns = [

@@ -1,15 +1,11 @@
-"""Tables of text that look the same in every format: answers, sizes of the picture by prompt, VLM − VLA."""
+"""Tables of text that look the same in every format: sizes of the picture by prompt, VLM − VLA."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 from probe_kit.retention.columns.text import (
-    ANSWER_LEGEND,
-    ANSWER_MEASURES,
-    ANSWER_SCORES,
-    Column,
-    category_name,
+    is_vlm,
     model_name,
     number,
     once_per_category,
@@ -19,8 +15,6 @@ from probe_kit.retention.columns.text import (
 )
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
-
-ANSWERS = "Answers"
 
 
 @dataclass(frozen=True)
@@ -33,47 +27,23 @@ class TextTable:
     cells: tuple[tuple[str, ...], ...]
 
 
-def is_asked(row: RetentionRow) -> bool:
-    """Whether a row is of a VLM run."""
-    return row.kind == "asks"
-
-
-_ANSWERS: Sequence[Column] = [
-    ("model", model_name),
-    ("category", category_name),
-    ("accuracy % [95 %]", success_interval),
-    *((f"{name} %", cell) for name, cell in ANSWER_SCORES),
-    *ANSWER_MEASURES,
-]
-
-
-def answer_table(rows: Sequence[RetentionRow]) -> TextTable | None:
-    """How VLM runs answered, by every score; None if no run was asked."""
-    asked = once_per_category([row for row in rows if is_asked(row)])
-    if not asked:
-        return None
-    scores = ", ".join(dict.fromkeys(str(row.score) for row in asked))
-    return TextTable(
-        ANSWERS,
-        f"accuracy is by {scores}; {ANSWER_LEGEND}",
-        tuple(name for name, _ in _ANSWERS),
-        tuple(tuple(cell(row) for _, cell in _ANSWERS) for row in asked),
-    )
-
-
 def size_table(means: Sequence[RetentionRow]) -> TextTable | None:
     """Mean accuracy by model and prompt, a column per size of the picture; None unless something varies."""
-    asked = [row for row in once_per_category(means) if is_asked(row) and row.category == MEAN]
-    sizes = sorted({str(row.picture_size) for row in asked}, key=lambda size: [int(n) for n in size.split("x")])
+    asked = [row for row in once_per_category(means) if is_vlm(row) and row.category == MEAN]
+    sizes = sorted(
+        {str(row.answers.picture_size) for row in asked}, key=lambda size: [int(n) for n in size.split("x")]
+    )
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for row in asked:
-        name = f"{row.model} (random weights)" if row.random_weights else row.model
-        extras = [str(part) for part in (row.picture, row.asked_for) if part not in ("frame", "target")]
-        prompt = " · ".join([str(row.prompt), *extras])
+        name = f"{row.run.model} (random weights)" if row.run.random_weights else row.run.model
+        extras = [
+            str(part) for part in (row.answers.picture, row.answers.asked_for) if part not in ("frame", "target")
+        ]
+        prompt = " · ".join([str(row.answers.prompt), *extras])
         # Two runs of one model, prompt and size, such as two checkpoints, stand in lines of their own.
-        while str(row.picture_size) in lines.get((name, prompt), {}):
+        while str(row.answers.picture_size) in lines.get((name, prompt), {}):
             name = model_name(row) if name != model_name(row) else f"{name} '"
-        lines.setdefault((name, prompt), {})[str(row.picture_size)] = success_interval(row)
+        lines.setdefault((name, prompt), {})[str(row.answers.picture_size)] = success_interval(row)
     if len(asked) < 2:
         return None
     return TextTable(

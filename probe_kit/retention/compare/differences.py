@@ -89,7 +89,7 @@ def pair_differences(pairs: Sequence[tuple[Side, Side]]) -> list[Difference]:
 
 
 def _compare_sides(here: Side, there: Side) -> list[Difference]:
-    calls = {one.row.call for one in (*here.drawn, *there.drawn)}
+    calls = {one.row.run.call for one in (*here.drawn, *there.drawn)}
     call = calls.pop() if len(calls) == 1 else None
     mine, theirs = _by_view(here.drawn), _by_view(there.drawn)
     shared = [view for view in mine if view in theirs]
@@ -109,7 +109,7 @@ def _outcomes(drawn: Sequence[RowWithDraws]) -> Outcomes:
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for one in drawn:
         if one.outcomes is not None:
-            found.setdefault(one.row.category, {})[one.row.run] = one.outcomes
+            found.setdefault(one.row.category, {})[one.row.run.location] = one.outcomes
     return {category: list(tables.values()) for category, tables in found.items()}
 
 
@@ -182,9 +182,9 @@ def _row(
     sides: tuple[Side, Side], category: str, view: str | None, paired: bool, gap: Estimates, p: float | None
 ) -> Difference:
     sr = _value(gap.get("sr"))
-    prefix, action = (_value(gap.get(f"{part}_accuracy")) for part in ("prefix", "action"))
+    backbone, action = (_value(gap.get(f"{part}_accuracy")) for part in ("backbone", "action"))
     debiased, bounded, area = (_value(gap.get(f"retention_{part}")) for part in ("debiased", "bounded", "area"))
-    numbers = (*sr, *prefix, *action, *debiased, *bounded, *area)
+    numbers = (*sr, *backbone, *action, *debiased, *bounded, *area)
     return Difference(sides[0].name, sides[1].name, category, view, paired, *numbers, p=p)
 
 

@@ -1,8 +1,8 @@
 """Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
 
 known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance, binding
-and untrained. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side is
-right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
+and untrained. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side
+is right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ Bools = NDArray[np.bool_]
 COIN = 0.25
 """Share of items that a coin gets right in both layouts."""
 FRAME = "first_frame_sha256"
-PAIRS = (("known", "used"), ("encoded", "used"), ("known", "encoded"))
+PAIRS = (("answered", "acted"), ("encoded", "acted"), ("answered", "encoded"))
 OVERALL = "all"
 _MOST_NAMED = 3
 
@@ -66,20 +66,21 @@ class Comparison:
 class CategoryCounts:
     """One category, or all of them (`all`).
 
-    counts: items by known, encoded, used, such as `101` for known, not encoded, used; without probes `1-1`.
-    guessed: as many as coins would give. episodes: the same counts of single episodes; nothing is tested there.
-    signal: whether the probes beat chance and every control that was run, without which encoded means nothing;
-    None without probes, or over categories that differ in it. not_used: of the items known and encoded those the
-    action does not follow, with the exact 95 % interval of their share. p_linked: whether known and used go
-    together among encoded items: Fisher's exact test, over categories a permutation within them.
+    answered_correctly, encoded, acted_correctly: items right in both layouts. counts: items by these three, such
+    as `101` for known, not encoded, used; without probes `1-1`. guessed: as many as coins would give. episodes:
+    the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance and every
+    control that was run, without which encoded means nothing; None without probes, or over categories that differ
+    in it. not_used: of the items known and encoded those the action does not follow, with the exact 95 % interval
+    of their share. p_linked: whether known and used go together among encoded items: Fisher's exact test, over
+    categories a permutation within them.
     """
 
     category: str
     n_items: int
     n_groups: int
-    known: int
+    answered_correctly: int
     encoded: int | None
-    used: int
+    acted_correctly: int
     counts: Mapping[str, int]
     guessed: Mapping[str, float]
     episodes: Mapping[str, int]
@@ -117,9 +118,9 @@ class KnownUsedTable:
         return pd.DataFrame(
             {
                 "category": row.category,
-                "known": code[0] == "1",
+                "answered_correctly": code[0] == "1",
                 "encoded": None if code[1] == "-" else code[1] == "1",
-                "used": code[2] == "1",
+                "acted_correctly": code[2] == "1",
                 "items": row.counts[code],
                 "guessed": row.guessed[code],
                 "episodes": row.episodes[code],
@@ -309,9 +310,9 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
         category=category,
         n_items=len(items),
         n_groups=int(items["group"].nunique()),
-        known=int(known.sum()),
+        answered_correctly=int(known.sum()),
         encoded=None if encoded is None else int(encoded.sum()),
-        used=int(used.sum()),
+        acted_correctly=int(used.sum()),
         counts={code: codes.count(code) for code in every},
         guessed={code: len(items) * _by_coin(code) for code in every},
         episodes={code: singles.count(code) for code in every},
@@ -327,7 +328,7 @@ def _by_coin(code: str) -> float:
 
 
 def _comparisons(known: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]) -> list[Comparison]:
-    values = {"known": known, "used": used} | ({} if encoded is None else {"encoded": encoded})
+    values = {"answered": known, "acted": used} | ({} if encoded is None else {"encoded": encoded})
     found = []
     for first, second in PAIRS:
         if first in values and second in values:

@@ -31,12 +31,12 @@ def compare_runs(
     drawn: Sequence[RowWithDraws],
     labels: Mapping[str, str],
     against: str | None = None,
-    gap: bool = False,
+    vlm_vla: bool = False,
 ) -> PairedRuns:
     """The first run minus every other, or every other minus the run `against`; VLM runs and policy runs apart.
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
-    against: a run's name in tables, its folder's name or its location. gap: whether VLM runs are held against
+    against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
     policy runs elsewhere. Only runs on the same suite, items, seed and wording are compared.
     Raises UsageError for a name that is none of the runs, or several.
     """
@@ -55,11 +55,13 @@ def compare_runs(
         if others:
             unpaired.append(f"{both} are not compared in {', '.join(others)}: other episodes.")
         sides = [
-            Side(names[_place(run)], [one for one in drawn if one.row.run == _place(run)], _place(run)).only(alike)
+            Side(names[_place(run)], [d for d in drawn if d.row.run.location == _place(run)], _place(run)).only(
+                alike
+            )
             for run in (here, there)
         ]
         pairs.append((sides[0], sides[1]))
-    if not gap and len({ask_of(run) is None for run in runs}) == 2:
+    if not vlm_vla and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
     return PairedRuns(pair_differences(pairs), tuple(unpaired))
 

@@ -6,6 +6,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 
 from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.displays.dose_response import DoseResponseDisplay, dose_response
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
@@ -22,7 +23,7 @@ from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_c
 from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
 from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
-from probe_kit.retention.displays.report_figures import ReportFigure, collect_figures, save_figures
+from probe_kit.retention.displays.report_figures import collect_figures, save_figures
 from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
 from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_side_by_side
 from probe_kit.retention.displays.site_effect_curve import SiteEffectDisplay, site_effect_curve

@@ -1,6 +1,8 @@
 """What is weighed: by block, how much attention what acts pays to the pictures, the words and itself."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -11,6 +13,7 @@ from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
 from probe_kit.intervene.kinds.attention.attention_mass import CORRECT, OTHER, Axis, Weighed, stored_attention
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -107,3 +110,21 @@ def attention_curve(run: RunReader) -> "Figure":
     if not displays:
         AttentionDisplay.from_run(run, "any")
     return in_panels(displays)
+
+
+PLACE = 15
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if stored_attention(one.run):
+            yield ReportFigure(
+                f"{one.stem}-attention", "What is weighed", "interventions",
+                "How much of the attention that what acts pays lies on the pictures, the words and its own "
+                "tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the most "
+                "of any iteration. It describes and is no cause: what is weighed need not be used, and it "
+                "enters no verdict.",
+                one.position, partial(attention_curve, one.run),
+            )  # fmt: skip

@@ -1,7 +1,8 @@
 """Dose and response: how many episodes turn as more of a direction is added, by side, beside controls."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from probe_kit.intervene.kinds.site_effects import Passing
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREY, series
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -120,3 +122,20 @@ def dose_response(run: RunReader) -> "Figure":
     if not displays:
         DoseResponseDisplay.from_run(run, "any")
     return in_panels(displays, height=2.7, share=False)
+
+
+PLACE = 14
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if stored_steering(one.run):
+            yield ReportFigure(
+                f"{one.stem}-doses", "How much of a direction turns the action", "interventions",
+                "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of "
+                "the direction is added; filled: beyond random directions of the same norm (the band). One side "
+                "may be saturated, and beyond about two norms of the tokens any direction breaks the hand.",
+                one.position, partial(dose_response, one.run),
+            )  # fmt: skip

@@ -1,7 +1,8 @@
 """Where the cube ended, over the tiles, seen from above."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -9,8 +10,10 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour.success_rate import listened
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -187,3 +190,22 @@ def _draw_legend(figure: "Figure", panel: "Axes") -> None:
     zone = Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")
     handles = [*panel.get_legend_handles_labels()[0], zone]
     legend_above(figure, handles)
+
+
+PLACE = 8
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        run = one.judged(source.table)
+        if run is None or listened(run.episodes):
+            continue
+        if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
+            yield ReportFigure(
+                f"{one.stem}-final-positions", "Where the cube ended", "behaviour",
+                "The table from above, the robot below the picture. An episode counts as an answer if the middle "
+                "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried anywhere.",
+                one.position, partial(final_positions, run),
+            )  # fmt: skip

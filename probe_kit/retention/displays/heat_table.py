@@ -1,7 +1,8 @@
 """Tables of numbers on heat colours, as the paper prints them: a model per row, a category per column."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -10,6 +11,7 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import axes_for, caption
 from probe_kit.retention.formats.heat import HEAT, heat_colour
 from probe_kit.retention.rows.row import RetentionRow
@@ -68,7 +70,7 @@ class HeatTableDisplay(Display):
             raise UsageError(f"{cls.title}: the table has no rows to show")
         lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
         for row in rows:
-            lines.setdefault((row.group, row.run, row.view), {})[row.category] = row
+            lines.setdefault((row.group, row.run.location, row.view), {})[row.category] = row
         columns = tuple(dict.fromkeys(row.category for row in rows))
         columns = (*(name for name in columns if name != "mean"), *(["mean"] if "mean" in columns else []))
         blank = Cell((None,) * len(cls.parts))
@@ -146,7 +148,7 @@ class SuccessTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.sr,), row.regime == Regime.KNOWLEDGE))
+        return cls._ruled(table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE))
 
 
 class SideTableDisplay(HeatTableDisplay):
@@ -160,7 +162,7 @@ class SideTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.sr_left, row.sr_right)))
+        return cls._ruled(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
 
 
 class RetentionTableDisplay(HeatTableDisplay):
@@ -176,7 +178,7 @@ class RetentionTableDisplay(HeatTableDisplay):
         """From a retention table with probes. Raises UsageError if no run was probed."""
 
         def cell(row: RetentionRow) -> Cell:
-            values = (row.retention_bounded, row.retention) if row.retention_defined else (None, None)
+            values = (row.retention.bounded, row.retention.published) if row.retention.defined else (None, None)
             return Cell(values)
 
         return cls._of([row for row in table.all_rows if row.view is not None], cell)
@@ -186,3 +188,28 @@ def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> s
     row = next(iter(line.values()))
     views = {other.view for other in rows if other.view is not None}
     return f"{model_name(row)}, {row.view}" if len(views) > 1 and row.view else model_name(row)
+
+
+PLACE = 1
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    table = source.table
+    shown: list[tuple[type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], str, str, str]] = []
+    if any(row.success.sr is not None for row in table.rows):
+        shown.append((SuccessTableDisplay, "success", "Success rate", "behaviour"))
+        shown.append((SideTableDisplay, "sides", "Success rate by side", "behaviour"))
+    if any(row.retention.published is not None for row in table.rows):
+        shown.append((RetentionTableDisplay, "retention", "Retention", "retention"))
+    for display, name, title, subject in shown:
+        yield ReportFigure(
+            name, title, subject, display.note, None, partial(_drawn, display, table), is_table=True
+        )
+
+
+def _drawn(
+    display: type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], table: RetentionTable
+) -> "Figure":
+    return figure_of(display.from_table(table))

@@ -1,7 +1,8 @@
 """Layer × iteration maps: where and when in the action expert the answer can be read."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UnknownSiteError
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, ReportFigure, in_view, view_suffix
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
@@ -187,3 +189,26 @@ def draw_scale(
         bar.set_ticks([low, 100], labels=["chance", "100"])
     else:
         bar.set_ticks([low, *(tick for tick in range(50, 101, 10) if tick > low + 4)])
+
+
+PLACE = 10
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is None:
+            continue
+        views, scores = one.results.settings.views, one.results.scores
+        for view in views:
+            for stream in scores.loc[scores["part"] == "action", "stream"].unique():
+                of_stream = (scores["view"] == view) & (scores["stream"] == stream)
+                if (of_stream & scores["iteration"].notna()).any():
+                    yield ReportFigure(
+                        f"{one.stem}-iteration-maps{view_suffix(view, views)}",
+                        in_view("Layer × iteration", view, views), "probes",
+                        "The action is made in several iterations (flow-matching steps or action tokens). Dark "
+                        f"cells: the answer can be read at that layer and iteration. {DOTS}.",
+                        one.position, partial(iteration_maps, one.results, view, stream),
+                    )  # fmt: skip

@@ -1,6 +1,6 @@
 """The knowledge–action gap: what a probe reads inside the model against what the model does."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
@@ -9,6 +9,7 @@ from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import (
     axes_for,
     caption,
@@ -65,7 +66,7 @@ class KnowledgeActionDisplay(Display):
         shown: dict[tuple[str | None, str], str | None] = {}
         points = []
         for row in table.rows:
-            if row.view is None or shown.setdefault((row.group, row.run), view or row.view) != row.view:
+            if row.view is None or shown.setdefault((row.group, row.run.location), view or row.view) != row.view:
                 continue
             if (point := _point(row, stream)) is not None:
                 points.append(point)
@@ -73,7 +74,9 @@ class KnowledgeActionDisplay(Display):
             raise UsageError(
                 f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
             )
-        means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
+        means = (
+            mean for mean in table.means if shown.get((mean.group, mean.run.location)) == mean.view is not None
+        )
         return cls(stream, tuple(points), tuple(ProvenanceLine.of_row(mean) for mean in means))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -101,17 +104,17 @@ class KnowledgeActionDisplay(Display):
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     prefix = stream == "backbone"
-    accuracy = row.backbone_accuracy if prefix else row.action_accuracy
-    if accuracy is None or row.sr is None or row.sr_ci is None:
+    accuracy = row.backbone.accuracy if prefix else row.action.accuracy
+    if accuracy is None or row.success.sr is None or row.success.ci is None:
         return None
     return GapPoint(
         model=model_name(row),
         category=row.category,
         accuracy=accuracy,
-        accuracy_ci=row.backbone_ci if prefix else row.action_ci,
-        sr=row.sr,
-        sr_ci=row.sr_ci,
-        significant=row.backbone_signal if prefix else row.action_signal,
+        accuracy_ci=row.backbone.ci if prefix else row.action.ci,
+        sr=row.success.sr,
+        sr_ci=row.success.ci,
+        significant=row.backbone.signal if prefix else row.action.signal,
     )
 
 
@@ -157,3 +160,18 @@ def _arms(value: float, limits: Limits) -> list[list[float]] | None:
     if limits is None or limits[0] is None or limits[1] is None:
         return None
     return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]
+
+
+PLACE = 2
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    if any(row.success.sr is not None and row.backbone.accuracy is not None for row in source.table.rows):
+        yield ReportFigure(
+            "knowledge-action", "Knowledge and action", "retention",
+            "Each point is one category: how well the answer can be read inside the model (across) and how often "
+            "the model acts on it (up). Points far below the line are knowledge that does not reach the hand.",
+            None, lambda: figure_of(KnowledgeActionDisplay.from_table(source.table)),
+        )  # fmt: skip

@@ -1,6 +1,6 @@
 """The same episodes by every outcome rule, side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
@@ -10,6 +10,7 @@ from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.behaviour.success_rate import shares_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.rows.outcome_rules import RunUnderRule
 from probe_kit.train.data.run_reader import RunReader
@@ -104,3 +105,20 @@ def _draw_bar(axes: "Axes", place: float, bar: RuleBar) -> None:
         axes.plot(
             [100 * bar.idle] * 2, [place - 0.44, place + 0.44], color="black", lw=2, label="doing nothing scores"
         )
+
+
+PLACE = 4
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    kept = [one.run for one in source.runs if getattr(one.run, "has_trajectories", False)]
+    runs = [run for run in kept if not run.episodes.empty]
+    if runs:
+        yield ReportFigure(
+            "outcome-rules", "The same episodes by every outcome rule", "behaviour",
+            "What counts as an answer decides the success rate. A black mark is what a policy that does nothing "
+            "would score by that rule: where there is one, the untouched cube already counts as put on a picture.",
+            None, lambda: figure_of(OutcomeRulesDisplay.from_runs(runs)),
+        )  # fmt: skip

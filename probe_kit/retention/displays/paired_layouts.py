@@ -1,11 +1,14 @@
 """Paired layouts: how many items are right in both, one or none of their two layouts."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.behaviour.success_rate import PairedItems, paired_items
+from probe_kit.retention.behaviour.success_rate import PairedItems, listened, paired_items
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -13,6 +16,7 @@ from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Name, colour, hatch: told apart without colour too.
 _PARTS = (
@@ -82,3 +86,25 @@ def _draw_bar(axes: "Axes", row: int, paired: PairedItems) -> None:
 
 def _p(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"
+
+
+PLACE = 7
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        run = one.judged(source.table)
+        if run is not None and not listened(run.episodes):
+            yield ReportFigure(
+                f"{one.stem}-paired-layouts", "The same question, pictures swapped", "behaviour",
+                "Every question is asked twice, with the two pictures exchanged. Knowing the answer means right "
+                "both times; always going to one side means right once. Bold p: more items are right twice than "
+                "wrong twice, beyond luck.",
+                one.position, partial(_drawn, run),
+            )  # fmt: skip
+
+
+def _drawn(run: RunReader) -> "Figure":
+    return figure_of(PairedLayoutsDisplay.from_run(run))

@@ -1,7 +1,8 @@
 """Readable, passes, read: by depth, where a probe reads the answer and where changing it turns the action."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -14,6 +15,7 @@ from probe_kit.intervene.kinds.site_effects import Passing
 from probe_kit.intervene.results.site_maps import BACKBONE, stored_passing
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
@@ -146,3 +148,21 @@ def _stream(row: Passing) -> str:
 
 def _layer(row: Passing) -> int:
     return int(row.place.partition(".")[2])
+
+
+PLACE = 13
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is None or not set(shown_passing(one.run)) & set(one.results.settings.categories):
+            continue
+        yield ReportFigure(
+            f"{one.stem}-causes", "Readable and used", "interventions",
+            "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
+            "layer are taken from the same inference before exchanged pictures. A layer that is readable and "
+            "turns nothing is read by nothing behind it.",
+            one.position, partial(site_effect_curve, one.run, one.results, one.results.settings.views[0]),
+        )  # fmt: skip

@@ -53,10 +53,10 @@ class Retention:
 
     plain: (best expert − chance) / (best backbone − chance), the published formula; NaN if the backbone's best is
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
-    means nothing, and than binding and untrained where they were run; `note` then says so. debiased: the same ratio
-    scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two scores
-    it is the ratio of. bounded: the same between that and the plug-in peaks, which are too low and too high on
-    average. area: the ratio of mean scores over all sites, how much of the stack carries the answer.
+    means nothing, and than binding and untrained where they were run; `note` then says so. debiased: the same
+    ratio scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two
+    scores it is the ratio of. bounded: the same between that and the plug-in peaks, which are too low and too high
+    on average. area: the ratio of mean scores over all sites, how much of the stack carries the answer.
     """
 
     chance: float

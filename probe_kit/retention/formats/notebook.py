@@ -5,12 +5,7 @@ from html import escape
 
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import (
-    HtmlCell,
-    HtmlTable,
-    behaviour_table,
-    probe_table,
-)
+from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables
 from probe_kit.retention.rows.row import RetentionRow
 
 _CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
@@ -19,13 +14,15 @@ _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of t
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The report's first tables, without its page: headings explain themselves when pointed at."""
-    found = [behaviour_table(rows, differences), probe_table(rows, differences)]
-    return _heading(rows) + "".join(_table(one) for one in found if one is not None)
+    found = [
+        table for table in html_tables(rows, differences) if table.subject != "controls" and not table.details
+    ]
+    return _heading(rows) + "".join(map(_table, found))
 
 
 def _heading(rows: Sequence[RetentionRow]) -> str:
     """Whose numbers these are, since a table of one model does not repeat its name."""
-    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
+    suites = ", ".join(dict.fromkeys(row.run.suite for row in rows))
     return f"<div>{escape(_models(rows))} on {escape(suites)}</div>" if rows else ""
 
 

@@ -7,19 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
-from probe_kit.retention.columns.glossary import GLOSSARY
+from probe_kit.retention.columns.conditions import wording_tables
+from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.columns.known_used_table import known_used_tables
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.report_figures import ReportFigure, collect_figures
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.heat import heat_key
-from probe_kit.retention.formats.html import (
-    behaviour_table,
-    control_table,
-    more_behaviour_table,
-    plain_tables,
-    probe_table,
-)
+from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report.category_summary import policy_summaries
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
@@ -27,6 +22,7 @@ from probe_kit.retention.report.pictures import data_uri
 from probe_kit.retention.report.provenance import citation, provenance
 from probe_kit.retention.report.summaries import Summary, summarise
 from probe_kit.retention.rows.outcome_rules import under_rule
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.version import __version__
@@ -75,7 +71,7 @@ def report_html(
     if not runs:
         raise UsageError("a report needs at least one run")
     table = table or retention_table(runs)
-    called = {row.run: model_name(row) for row in table.rows}
+    called = {row.run.location: model_name(row) for row in table.rows}
     as_judged = [under_rule(run, table.rule, table.last_steps) for run in runs]
     exhibits = [exhibit for exhibit in collect_figures(runs, table) if not exhibit.is_table]
     names = [called[str(run.location)] for run in runs]
@@ -90,12 +86,8 @@ def report_html(
         policy_summaries=policy_summaries(table.rows),
         summaries=_summaries(table),
         notes=table.notes,
-        behaviour=behaviour_table(rows, table.differences, table.unpaired),
-        more_behaviour=more_behaviour_table(rows),
-        retention=probe_table(rows, table.differences),
-        controls=control_table(rows),
-        rules=rule_sentences(rows),
-        conditions=plain_tables(condition_tables(rows, table.wordings)),
+        tables={subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")},
+        wordings=plain_tables(wording_tables(table.wordings)),
         further=plain_tables(table.further_tables),
         joined=plain_tables([one for joined in joins.found for one in known_used_tables(joined)]),
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
@@ -109,7 +101,7 @@ def report_html(
             provenance(name, run, table.results.get(str(run.location)))
             for name, run in zip(names, runs, strict=True)
         ],
-        glossary=GLOSSARY,
+        glossary=glossary(),
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
@@ -128,12 +120,20 @@ def _render(**content: Any) -> str:
     return environment.get_template("page.html.jinja").render(**assets, **content)
 
 
+def _tables(rows: Sequence[RetentionRow], table: RetentionTable, subject: str) -> list[HtmlTable]:
+    return [one for one in html_tables(rows, table.differences, table.unpaired) if one.subject == subject]
+
+
 def _summaries(table: RetentionTable) -> list[list[Summary]]:
     """Per run, one summary per view."""
     found: dict[tuple[str | None, str], list[Summary]] = {}
     for mean in table.means:
-        own = [r for r in table.rows if (r.group, r.run, r.view) == (mean.group, mean.run, mean.view)]
-        found.setdefault((mean.group, mean.run), []).append(summarise([*own, mean]))
+        own = [
+            r
+            for r in table.rows
+            if (r.group, r.run.location, r.view) == (mean.group, mean.run.location, mean.view)
+        ]
+        found.setdefault((mean.group, mean.run.location), []).append(summarise([*own, mean]))
     return list(found.values())
 
 

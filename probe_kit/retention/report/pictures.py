@@ -3,7 +3,8 @@
 from base64 import b64encode
 from io import BytesIO
 
-from probe_kit.retention.displays.report_figures import ReportFigure, caption_of
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.report_figures import caption_of
 
 SVG_LIMIT = 600_000
 """Bytes; a figure of more is kept as pixels."""

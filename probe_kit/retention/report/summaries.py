@@ -42,7 +42,7 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
     return Summary(
         name=model_name(mean).replace(" (random weights)", ""),
         view=mean.view,
-        random_weights=mean.random_weights,
+        random_weights=mean.run.random_weights,
         headlines=tuple(_headlines(mean, single)),
         sentences=tuple(_sentences(mean, single)),
         warnings=tuple(_warnings(mean, single)),
@@ -51,64 +51,67 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
-    rate = Headline(f"{percent(mean.sr)} %", "success rate", "guessing: 50 %")
-    found = [Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.listened else rate]
-    if mean.backbone_accuracy is not None:
+    rate = Headline(f"{percent(mean.success.sr)} %", "success rate", "guessing: 50 %")
+    found = [
+        Headline(NOT_ACTED, "success rate", "it was listened to and did not act") if mean.run.listened else rate
+    ]
+    if mean.backbone.accuracy is not None:
         found.append(
-            Headline(f"{percent(mean.backbone_accuracy)} %", "backbone", "best probe, mean of categories")
+            Headline(f"{percent(mean.backbone.accuracy)} %", "backbone", "best probe, mean of categories")
         )
-    if mean.action_accuracy is not None:
+    if mean.action.accuracy is not None:
         found.append(
-            Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
+            Headline(f"{percent(mean.action.accuracy)} %", mean.run.action_name, "best probe, mean of categories")
         )
-    if mean.backbone_accuracy is not None and mean.action_accuracy is not None:
+    if mean.backbone.accuracy is not None and mean.action.accuracy is not None:
         found.append(_retention_headline(mean, rows))
     return found
 
 
 def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
-    if not mean.retention_defined or mean.retention_bounded is None:
+    if not mean.retention.defined or mean.retention.bounded is None:
         return Headline("n/a", "retention", _why_not(rows))
-    return Headline(f"{mean.retention_bounded:.2f}", "retention, bounded", _interval_words(mean))
+    return Headline(f"{mean.retention.bounded:.2f}", "retention, bounded", _interval_words(mean))
 
 
 def _interval_words(row: RetentionRow) -> str:
-    if row.retention_bounded_ci is None:
+    if row.retention.bounded_ci is None:
         return "no interval"
-    low, high = row.retention_bounded_ci
+    low, high = row.retention.bounded_ci
     return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
 
 
 def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = [_behaviour(mean, rows)]
-    if any(row.backbone_accuracy is not None for row in rows):
+    if any(row.backbone.accuracy is not None for row in rows):
         found.append(_knowledge(rows))
-    if any(row.retention is not None for row in rows):
+    if any(row.retention.published is not None for row in rows):
         found.append(_retention(mean, rows))
-    if mean.gap is not None and any(row.backbone_signal for row in rows):
+    if mean.controls.probe_minus_sr is not None and any(row.backbone.signal for row in rows):
         found.append(
-            f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
-            f"{'more' if mean.gap >= 0 else 'less'} often than the policy."
+            f"On average the backbone's best probe is right {abs(100 * mean.controls.probe_minus_sr):.0f} points "
+            f"{'more' if mean.controls.probe_minus_sr >= 0 else 'less'} often than the policy."
         )
     return found
 
 
 def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    if mean.listened:
+    if mean.run.listened:
         return "The model was listened to at the first picture of every episode and did not act: no success rate."
-    knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
-    fails = [row for row in rows if row.regime == Regime.FAILURE]
-    text = f"The cube ended on the correct picture in {percent(mean.sr)} % of episodes, averaged over categories. "
+    knows = [row for row in rows if row.success.regime == Regime.KNOWLEDGE]
+    fails = [row for row in rows if row.success.regime == Regime.FAILURE]
+    text = f"The cube ended on the correct picture in {percent(mean.success.sr)} % of episodes, "
+    text += "averaged over categories. "
     text += f"In {_of(knows, rows)} that is more than guessing explains"
     return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
 
 
 def _knowledge(rows: Sequence[RetentionRow]) -> str:
-    backbone = [row for row in rows if row.backbone_signal]
-    expert = [row for row in rows if row.action_signal]
+    backbone = [row for row in rows if row.backbone.signal]
+    expert = [row for row in rows if row.action.signal]
     text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
-    if any(row.action_accuracy is not None for row in rows):
-        text += f", and in the {rows[0].action_name} in {_of(expert, rows)}"
+    if any(row.action.accuracy is not None for row in rows):
+        text += f", and in the {rows[0].run.action_name} in {_of(expert, rows)}"
     return f"{text}."
 
 
@@ -117,83 +120,91 @@ def _judge(rows: Sequence[RetentionRow]) -> str:
     names = [
         name
         for name in ("binding", "untrained")
-        if any(row.backbone_exceeds.get(name) is not None for row in rows)
+        if any(row.backbone.exceeds.get(name) is not None for row in rows)
     ]
     *first, last = ["chance", *names]
     return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
 
 
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    counted = [row for row in rows if row.retention_defined]
-    if not counted or mean.retention_bounded is None:
+    counted = [row for row in rows if row.retention.defined]
+    if not counted or mean.retention.bounded is None:
         return f"Retention is not defined: {_why_not(rows)}."
     left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
     return (
-        f"Of what can be read in the backbone above chance, a share of {mean.retention_bounded:.2f} can still be "
-        f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
+        f"Of what can be read in the backbone above chance, a share of {mean.retention.bounded:.2f} can still be "
+        f"read in the {mean.run.action_name} ({_interval_words(mean)}), "
+        f"over {_of(counted, rows, names=False)}{left}."
     )
 
 
 def _why_not(rows: Sequence[RetentionRow]) -> str:
     """What keeps categories from having a retention, each reason once."""
-    notes = [row.retention_note for row in rows if not row.retention_defined]
+    notes = [row.retention.note for row in rows if not row.retention.defined]
     return "; ".join(dict.fromkeys(note.removeprefix("n/a (").removesuffix(")") for note in notes))
 
 
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = []
-    if mean.random_weights:
+    if mean.run.random_weights:
         found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
-    if (mean.share_never_moved or 0) > _MOSTLY:
+    if (mean.success.share_never_moved or 0) > _MOSTLY:
         found.append(
-            f"The cube never moved in {percent(mean.share_never_moved)} % of episodes: the policy does not grasp, so "
-            "its success rate says nothing about what it knows."
+            f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
+            "the policy does not grasp, so its success rate says nothing about what it knows."
         )
-    elif (mean.share_outside or 0) > _MOSTLY:
-        found.append(f"The cube reached neither picture in {percent(mean.share_outside)} % of episodes.")
-    if mean.share_invalid_action:
+    elif (mean.success.share_outside or 0) > _MOSTLY:
+        found.append(f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes.")
+    if mean.success.share_invalid_action:
         found.append(
-            f"In {percent(mean.share_invalid_action)} % of its steps the policy put out something that is no action."
+            f"In {percent(mean.success.share_invalid_action)} % of its steps the policy put out "
+            "something that is no action."
         )
-    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
+    biased = [
+        row
+        for row in rows
+        if row.success.side_preference is not None and abs(row.success.side_preference - 0.5) > 0.25
+    ]
     if biased:
         found.append(f"The policy has a habit of going to one side in {_of(biased, rows)}.")
-    if mean.leaks:
+    if mean.controls.leaks:
         found.append(
-            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
-            "believing a probe."
+            f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the controls "
+            "before believing a probe."
         )
     return found
 
 
 def read_row(row: RetentionRow) -> list[str]:
     """One category in sentences."""
-    if row.sr is None:
+    if row.success.sr is None:
         found = [
-            f"Listened to in {row.n_episodes} episodes; it did not act."
-            if row.listened
-            else f"Success rate {row.regime_reason}."
+            f"Listened to in {row.success.n_episodes} episodes; it did not act."
+            if row.run.listened
+            else f"Success rate {row.success.reason}."
         ]
     else:
-        right = round(row.sr * row.n_episodes)
-        found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
-    if row.items_both_right is not None:
-        items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
-        found.append(f"{row.items_both_right} of {items} questions right in both layouts.")
-    if row.backbone_accuracy is not None:
+        right = round(row.success.sr * row.success.n_episodes)
+        found = [
+            f"Right in {right} of {row.success.n_episodes} episodes ({row.success.regime}: {row.success.reason})."
+        ]
+    if (paired := row.success.paired) is not None:
+        items = paired.both + paired.one + paired.none
+        found.append(f"{paired.both} of {items} questions right in both layouts.")
+    if row.backbone.accuracy is not None:
         found.append(
-            f"In the backbone a probe is right in {percent(row.backbone_accuracy)} % at best, at depth "
-            f"{row.backbone_depth:.2f}{_ties_words(row.backbone_ties)}: "
-            f"{_clear_words(row.backbone_p_fwe, row.backbone_exceeds)}."
+            f"In the backbone a probe is right in {percent(row.backbone.accuracy)} % at best, at depth "
+            f"{row.backbone.depth:.2f}{_ties_words(row.backbone.ties)}: "
+            f"{_clear_words(row.backbone.p_fwe, row.backbone.exceeds)}."
         )
-    if row.action_accuracy is not None:
-        step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
+    if row.action.accuracy is not None:
+        step = "" if row.action.iteration is None else f", iteration {row.action.iteration}"
         found.append(
-            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}"
-            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_exceeds)}."
+            f"In the {row.run.action_name} {percent(row.action.accuracy)} %, at depth {row.action.depth:.2f}{step}"
+            f"{_ties_words(row.action.ties)}: {_clear_words(row.action.p_fwe, row.action.exceeds)}."
         )
-    if row.retention_defined and row.retention_bounded is not None:
-        found.append(f"Bounded retention {row.retention_bounded:.2f} ({_interval_words(row)}).")
+    if row.retention.defined and row.retention.bounded is not None:
+        found.append(f"Bounded retention {row.retention.bounded:.2f} ({_interval_words(row)}).")
     return found
 
 

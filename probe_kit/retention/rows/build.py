@@ -27,12 +27,11 @@ from probe_kit.retention.rows.parts import (
     ActionPeak,
     AnswerStats,
     BackbonePeak,
-    Behaviour,
     ControlScores,
     RetentionScores,
     RunInfo,
 )
-from probe_kit.retention.rows.row import Part, RetentionRow
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.data.run_reader import RunReader
@@ -100,62 +99,75 @@ def _row(
     view: str | None,
 ) -> RowWithDraws:
     run, heard = judged.run, listened(episodes)
-    parts: list[Part] = [_source(run, results, heard), _asked(run, episodes)]
+    scored = judged.scored and not heard
+    success = _success(run, episodes) if scored else _no_success(episodes, heard)
+    rules = OutcomeRuleScores(rule=judged.rule, rule_words=judged.words)
     estimates: dict[str, Estimate] = {}
-    success = None
-    if judged.scored and not heard:
-        success = success_rate(episodes, units_seed(units_of(episodes), run.suite))
+    if scored:
         radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
-        parts += [judged.part(episodes), _behaviour(success, sensitivity(episodes, radii))]
+        by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
+        rules = replace(judged.part(episodes), sr_by_epsilon=by_radius)
         estimates = {"sr": sr_estimate(episodes, run.suite), **judged.estimates(episodes)}
-    else:
-        parts += [OutcomeRuleScores(rule=judged.rule, rule_words=judged.words), _unmoved(episodes, heard)]
-    curve = None if results is None or view is None else results.curves.get((category, view))
-    if results is not None and view is not None and curve is not None:
-        probed = _ProbePeaks(results.controls, category, view, curve, _peaks(curve, settings.iterations))
-        retention = measure_retention(curve, settings.iterations, settings.seed, probed.beats.get("prefix"))
-        estimates |= probe_estimates(curve, probed.peaks, retention, run.suite)
-        parts += [
-            probed.backbone(estimates),
-            probed.action(estimates),
-            _kept(retention),
-            probed.background(success),
-        ]
-    elif results is not None:
-        parts.append(
-            RetentionScores(
-                retention_note=f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
-            )
-        )
-    return RowWithDraws(
-        RetentionRow.of(category, view, group, *parts), estimates, None if success is None else episodes
+    row = RetentionRow(
+        category=category,
+        view=view,
+        group=group,
+        run=_run_info(run, results, heard),
+        success=success,
+        rules=rules,
+        answers=_answers(run, episodes),
     )
+    if results is not None and view is not None:
+        row, more = _with_probes(row, run, results, settings)
+        estimates |= more
+    return RowWithDraws(row, estimates, episodes if scored else None)
 
 
-def _source(run: RunReader, results: ProbeResults | None, heard: bool) -> RunInfo:
+def _with_probes(
+    row: RetentionRow, run: RunReader, results: ProbeResults, settings: RowSettings
+) -> tuple[RetentionRow, dict[str, Estimate]]:
+    """The row with the parts of its category's probes, and their estimates."""
+    curve = None if row.view is None else results.curves.get((row.category, row.view))
+    if row.view is None or curve is None:
+        note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
+        return replace(row, retention=RetentionScores(note=note)), {}
+    probed = _ProbePeaks(results.controls, row.category, row.view, curve, _peaks(curve, settings.iterations))
+    retention = measure_retention(curve, settings.iterations, settings.seed, probed.beats.get("backbone"))
+    estimates = probe_estimates(curve, probed.peaks, retention, run.suite)
+    row = replace(
+        row,
+        backbone=probed.backbone(estimates),
+        action=probed.action(estimates),
+        retention=_retention_scores(retention),
+        controls=probed.controls_of(row.success),
+    )
+    return row, dict(estimates)
+
+
+def _run_info(run: RunReader, results: ProbeResults | None, heard: bool) -> RunInfo:
     return RunInfo(
-        run=str(run.location),
+        location=str(run.location),
         model=run.model,
         label=run.label,
         random_weights=run.random_weights,
         weights_sha256=run.weights_sha256,
         suite=run.suite,
+        mode="acts" if ask_of(run) is None else "answers",
         action_stream=first_of("action", run.streams.values()),
-        run_settings=run.settings_sha256,
-        probe_settings=None if results is None else results.key,
+        settings=run.settings_sha256,
+        probes=None if results is None else results.key,
         call=None if results is None else results.settings.call,
         listened=heard,
     )
 
 
-def _asked(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
+def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     ask = ask_of(run)
     if ask is None:
         return AnswerStats()
     text = episodes["outcome_text" if "outcome_text" in episodes else "outcome"]
     bias = episodes["letter_bias"].astype(float).mean()
     return AnswerStats(
-        kind="asks",
         prompt=str(ask["prompt"]),
         picture=str(ask["picture"]),
         picture_size=str(ask["picture_size"]),
@@ -171,44 +183,18 @@ def _asked(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     )
 
 
-def _unmoved(episodes: "pd.DataFrame", heard: bool) -> Behaviour:
-    """Of a model that was listened to, or whose run keeps nothing to judge by."""
-    reason = None if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
-    return Behaviour(
-        n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), sr=None, regime_reason=reason
-    )
+def _success(run: RunReader, episodes: "pd.DataFrame") -> SuccessRate:
+    return success_rate(episodes, units_seed(units_of(episodes), run.suite))
 
 
-def _behaviour(success: SuccessRate, by_epsilon: dict[float, float]) -> Behaviour:
-    return Behaviour(
-        n_episodes=success.n_episodes,
-        n_items=success.n_items,
-        sr=success.sr,
-        chance_margin_episodes=success.chance_margin_episodes,
-        chance_margin_items=success.chance_margin_items,
-        chance_margin=success.chance_margin,
-        sr_ci=success.ci,
-        sr_original=success.sr_original,
-        sr_swapped=success.sr_swapped,
-        sr_left=success.sr_left,
-        sr_right=success.sr_right,
-        share_wrong=success.share_wrong,
-        share_outside=success.share_outside,
-        share_never_moved=success.share_never_moved,
-        share_invalid_action=success.share_invalid_action,
-        regime=str(success.regime),
-        regime_reason=success.reason,
-        side_preference=success.side_preference,
-        items_both_right=success.paired.both,
-        items_one_right=success.paired.one,
-        items_none_right=success.paired.none,
-        paired_p=success.paired.p,
-        sr_by_epsilon={f"{radius:g}": rate for radius, rate in by_epsilon.items()},
-    )
+def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
+    """Of a model that did not act, or whose run keeps nothing to judge by."""
+    reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
+    return SuccessRate(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), reason=reason)
 
 
 def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
-    found = {"prefix": best_site(curve, "backbone")}
+    found = {"backbone": best_site(curve, "backbone")}
     if curve.action_stream is not None:
         found["action"] = best_site(curve, curve.action_stream, iterations)
     return {name: peak for name, peak in found.items() if peak is not None}
@@ -216,7 +202,7 @@ def _peaks(curve: Curve, iterations: Iterations) -> dict[str, Peak]:
 
 @dataclass(frozen=True)
 class _ProbePeaks:
-    """The probes of one category in one view, and their best sites: `prefix` and `action`, as far as there are."""
+    """The probes of one category in one view, and their best sites, `backbone` and `action`."""
 
     controls: Controls
     category: str
@@ -234,20 +220,20 @@ class _ProbePeaks:
 
     def backbone(self, estimates: Estimates) -> BackbonePeak:
         """Of the backbone's best site."""
-        peak, untrained = self.peaks.get("prefix"), self._untrained("backbone")
+        peak, untrained = self.peaks.get("backbone"), self._untrained("backbone")
         if peak is None:
             return BackbonePeak()
         return BackbonePeak(
-            backbone_accuracy=peak.accuracy,
-            backbone_ci=estimates["backbone_accuracy"].ci,
-            backbone_layer=peak.site.layer,
-            backbone_depth=self.curve.depth(peak.site),
-            backbone_p_fwe=_number(peak.p_fwe),
-            backbone_selectivity=self._selectivity(peak),
-            backbone_exceeds=self.beats["prefix"],
-            backbone_minus_untrained=None if untrained is None else untrained.difference,
-            backbone_minus_untrained_ci=None if untrained is None else untrained.ci,
-            backbone_ties=peak.ties,
+            accuracy=peak.accuracy,
+            ci=estimates["backbone_accuracy"].ci,
+            layer=peak.site.layer,
+            depth=self.curve.depth(peak.site),
+            p_fwe=_number(peak.p_fwe),
+            selectivity=self._selectivity(peak),
+            exceeds=self.beats["backbone"],
+            minus_untrained=None if untrained is None else untrained.difference,
+            minus_untrained_ci=None if untrained is None else untrained.ci,
+            ties=peak.ties,
         )
 
     def action(self, estimates: Estimates) -> ActionPeak:
@@ -257,29 +243,29 @@ class _ProbePeaks:
             return ActionPeak()
         first = self._first_iteration(peak)
         return ActionPeak(
-            action_accuracy=peak.accuracy,
-            action_ci=estimates["action_accuracy"].ci,
-            action_layer=peak.site.layer,
-            action_depth=self.curve.depth(peak.site),
-            action_iteration=peak.site.iteration,
-            action_p_fwe=_number(peak.p_fwe),
-            action_selectivity=self._selectivity(peak),
-            action_exceeds=self.beats["action"],
-            action_minus_untrained=None if untrained is None else untrained.difference,
-            action_minus_untrained_ci=None if untrained is None else untrained.ci,
-            action_first_accuracy=None if first is None else first.accuracy,
-            action_first_layer=None if first is None else first.site.layer,
-            action_ties=peak.ties,
+            accuracy=peak.accuracy,
+            ci=estimates["action_accuracy"].ci,
+            layer=peak.site.layer,
+            depth=self.curve.depth(peak.site),
+            iteration=peak.site.iteration,
+            p_fwe=_number(peak.p_fwe),
+            selectivity=self._selectivity(peak),
+            exceeds=self.beats["action"],
+            minus_untrained=None if untrained is None else untrained.difference,
+            minus_untrained_ci=None if untrained is None else untrained.ci,
+            first_accuracy=None if first is None else first.accuracy,
+            first_layer=None if first is None else first.site.layer,
+            ties=peak.ties,
         )
 
-    def background(self, success: SuccessRate | None) -> ControlScores:
-        """What the best sites are held against."""
-        baselines, prefix = self.controls.of_category(self.category), self.peaks.get("prefix")
+    def controls_of(self, success: SuccessRate) -> ControlScores:
+        """What the best sites are compared with."""
+        baselines, peak = self.controls.of_category(self.category), self.peaks.get("backbone")
         untrained = [self._untrained(stream) for stream in ("backbone", self.curve.action_stream)]
         return ControlScores(
             n_groups=self.curve.n_groups,
             chance=self.curve.chance,
-            gap=None if prefix is None or success is None else prefix.accuracy - success.sr,
+            probe_minus_sr=None if peak is None or success.sr is None else peak.accuracy - success.sr,
             baselines={name: score.accuracy for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
             untrained=next((untrained.untrained for untrained in untrained if untrained is not None), None),
@@ -298,19 +284,19 @@ class _ProbePeaks:
         return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
 
 
-def _kept(retention: Retention | None) -> RetentionScores:
+def _retention_scores(retention: Retention | None) -> RetentionScores:
     if retention is None:
-        return RetentionScores(retention_note="n/a (one stream only)")
+        return RetentionScores(note="n/a (one stream only)")
     return RetentionScores(
-        retention=_number(retention.plain),
-        retention_defined=retention.defined,
-        retention_note=retention.note,
-        retention_debiased=_number(retention.debiased),
-        retention_ci=_limits(retention.interval),
-        retention_bounded=_number(retention.bounded),
-        retention_bounded_ci=_limits(retention.bounded_interval),
-        retention_area=_number(retention.area),
-        retention_area_ci=_limits(retention.area_interval),
+        published=_number(retention.plain),
+        defined=retention.defined,
+        note=retention.note,
+        debiased=_number(retention.debiased),
+        ci=_limits(retention.interval),
+        bounded=_number(retention.bounded),
+        bounded_ci=_limits(retention.bounded_interval),
+        area=_number(retention.area),
+        area_ci=_limits(retention.area_interval),
     )
 
 

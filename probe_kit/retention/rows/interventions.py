@@ -1,6 +1,6 @@
 """What stored interventions add to a row: does the action follow the pictures, and is what can be read used?
 
-Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing is played.
+Reads what `probe-kit intervene` left in the run; no model is loaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ def add_image_swap(
     located: Mapping[str, Sequence[str]],
     carried: Mapping[str, Sequence[str]],
 ) -> RetentionRow:
-    """The row with what was found of its category, judged by its own probes.
+    """The row with the effect of the image swap on its category, judged by its own probes.
 
     found: by category; may be empty. located: places that carry it, by category, of those that were searched.
     carried: directions that do.
@@ -26,10 +26,10 @@ def add_image_swap(
     own = found.get(row.category)
     if own is None:
         return row
-    encoded = row.backbone_signal if row.backbone_exceeds else None
+    encoded = row.backbone.signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
     judged = judge(encoded, own, control, located.get(category), carried.get(category, ()))
-    part = SwapEffect(
+    effect = SwapEffect(
         follows=own.follows,
         against=own.against,
         follows_net=own.net,
@@ -38,4 +38,4 @@ def add_image_swap(
         used=judged.verdict,
         used_note=judged.reason,
     )
-    return replace(row, **vars(part))
+    return replace(row, image_swap=effect)

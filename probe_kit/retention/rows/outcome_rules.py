@@ -1,8 +1,7 @@
 """By which outcome rule a success rate was made, what else it leaves unsaid, and what the other rules say."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from statistics import fmean
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
@@ -25,14 +24,14 @@ class OutcomeRuleScores:
     """The outcome rule, and what it gives away.
 
     rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
-    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped, sr_grasped:
-    the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of answers whose
-    cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the picture in
-    whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes. share_both_zones: share of
-    episodes whose cube counts for both pictures, which is called correct. sr_by_rule: by every rule, at the last
-    step. behaviour: shares of episodes by what hand and cube did.
-    What is about answers is there for every run with a success rate; the rest is None or empty where the run
-    keeps no trajectories.
+    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped,
+    sr_grasped: the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of
+    answers whose cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the
+    picture in whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes.
+    share_both_zones: share of episodes whose cube counts for both pictures, which is called correct. sr_by_rule:
+    by every rule, at the last step. sr_by_epsilon: by zone radius in metres, for the rule `disc`. behaviour:
+    shares of episodes by what hand and cube did. What is about answers is there for every run with a success rate;
+    the rest is None or empty where the run keeps no trajectories.
     """
 
     rule: str = DEFAULT_RULE
@@ -50,6 +49,7 @@ class OutcomeRuleScores:
     idle_side: str | None = None
     share_both_zones: float | None = None
     sr_by_rule: dict[str, float] = field(default_factory=dict)
+    sr_by_epsilon: dict[str, float] = field(default_factory=dict)
     behaviour: dict[str, float] = field(default_factory=dict)
 
 
@@ -180,57 +180,21 @@ def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
     return found
 
 
-AVERAGED = ("share_answered", "sr_answered", "sr_grasped", "share_unmoved_answers", "sr_idle", "share_both_zones")
-"""Fields of which a row of category means holds the average."""
-
-
-def mean_part(rows: Sequence[OutcomeRuleScores], limits: Mapping[str, Limits | None]) -> OutcomeRuleScores:
-    """The part of a row that averages over categories; limits: of `sr_answered` and `sr_grasped`."""
-    first = rows[0]
-    sides = {row.idle_side for row in rows}
-    averages = {name: _mean([getattr(row, name) for row in rows]) for name in AVERAGED}
-    return OutcomeRuleScores(
-        rule=first.rule,
-        rule_words=first.rule_words,
-        last_steps=first.last_steps,
-        n_answered=_sum([row.n_answered for row in rows]),
-        n_grasped=_sum([row.n_grasped for row in rows]),
-        sr_answered_ci=limits.get("sr_answered"),
-        sr_grasped_ci=limits.get("sr_grasped"),
-        idle_side=sides.pop() if len(sides) == 1 else "both",
-        sr_by_rule=_mean_by_key([row.sr_by_rule for row in rows]),
-        behaviour=_mean_by_key([row.behaviour for row in rows]),
-        **averages,
-    )
-
-
-def _mean(values: Sequence[float | None]) -> Any:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
-
-
-def _sum(values: Sequence[int | None]) -> int | None:
-    known = [value for value in values if value is not None]
-    return sum(known) if known else None
-
-
-def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
-
-
-def rule_sentence(row: OutcomeRuleScores) -> str:
+def rule_sentence(rules: OutcomeRuleScores) -> str:
     """What outcomes were judged by, and what the rule gives away; for captions."""
-    steps = f", mean of the last {row.last_steps} control steps (all, where there are fewer)" * (
-        row.last_steps > 1
+    steps = f", mean of the last {rules.last_steps} control steps (all, where there are fewer)" * (
+        rules.last_steps > 1
     )
-    text = f"outcome rule {row.rule}{f': {row.rule_words}' if row.rule_words else ''}{steps}"
-    if row.sr_idle is None:
+    text = f"outcome rule {rules.rule}{f': {rules.rule_words}' if rules.rule_words else ''}{steps}"
+    if rules.sr_idle is None:
         return text
     where = {
         "none": "the untouched cube lies in neither zone",
         "both": "the untouched cube lies in a zone of some episodes",
-    }.get(row.idle_side or "none", f"the untouched cube already lies in the zone of the {row.idle_side} picture")
-    return f"{text}; a policy that does nothing would score {100 * row.sr_idle:.1f} %, as {where}"
+    }.get(
+        rules.idle_side or "none", f"the untouched cube already lies in the zone of the {rules.idle_side} picture"
+    )
+    return f"{text}; a policy that does nothing would score {100 * rules.sr_idle:.1f} %, as {where}"
 
 
 def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:

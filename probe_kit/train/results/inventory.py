@@ -16,10 +16,10 @@ from probe_kit.train.settings import FORMAT
 class StoredProbes:
     """One set of probe results, or what is known of a set written by another version.
 
-    created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention` reads
-    them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others by now,
-    `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
-    run is in its items' own words.
+    created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention`
+    reads them unless told otherwise, `other` if it does so for their key, `other episodes` if the run has others
+    by now, `other version` if this version cannot read them. wording: which one of the run's they are of, empty
+    where the run is in its items' own words.
     """
 
     key: str

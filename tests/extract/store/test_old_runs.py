@@ -82,7 +82,7 @@ def test_an_old_run_still_makes_a_table(runs: Path) -> None:
     run = open_run(runs / "pooled")
     table = retention_table([run])
     assert {row.category for row in table.rows} == {"color"}
-    assert table.rows[0].n_episodes == len(EXPECTED["pooled"]["outcomes"])
+    assert table.rows[0].success.n_episodes == len(EXPECTED["pooled"]["outcomes"])
 
 
 def test_an_old_run_is_marked_as_not_protected(runs: Path) -> None:
@@ -130,6 +130,6 @@ def test_an_old_run_has_no_success_rate_by_rules_that_need_trajectories(runs: Pa
     run = open_run(runs / "pooled")
     assert not run.has_trajectories
     table = retention_table([run], rule="box")
-    assert (table.rows[0].sr, table.rows[0].rule) == (None, "box")
+    assert (table.rows[0].success.sr, table.rows[0].rules.rule) == (None, "box")
     assert "keeps no trajectories" in " ".join(table.notes)
-    assert retention_table([run], rule="disc").rows[0].sr is not None
+    assert retention_table([run], rule="disc").rows[0].success.sr is not None

@@ -49,7 +49,7 @@ def test_rates_add_up_and_split_by_layout_and_side(outcome_table: Outcomes) -> N
     assert success.sr_right is not None
     assert (success.sr_left + success.sr_right) / 2 == pytest.approx(0.505)
     assert success.ci[0] < 0.505 < success.ci[1]
-    assert success.delta < success.chance_margin_items
+    assert success.chance_margin_episodes < success.chance_margin_items
 
 
 def test_a_policy_that_always_goes_left_is_half_right_but_never_twice(outcome_table: Outcomes) -> None:

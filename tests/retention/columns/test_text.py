@@ -41,12 +41,16 @@ def test_a_baseline_above_chance_is_red_in_every_format(table: RetentionTable) -
 
 def test_json_has_controls_by_name_and_csv_a_column_each(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[0]
-    assert row["baselines"] == {"pixels": 0.75, "instruction": 0.51}
-    assert row["leaks"] == ["pixels"]
-    assert (row["untrained"], row["backbone_minus_untrained"], row["action_minus_untrained"]) == ("twin", 0.3, 0.2)
+    assert row["controls"]["baselines"] == {"pixels": 0.75, "instruction": 0.51}
+    assert row["controls"]["leaks"] == ["pixels"]
+    assert (
+        row["controls"]["untrained"],
+        row["backbone"]["minus_untrained"],
+        row["action"]["minus_untrained"],
+    ) == ("twin", 0.3, 0.2)
     frame = table.to_frame()
-    assert frame["baselines.pixels"].tolist() == [0.75, 0.75]
-    assert frame["action_twin_ci_high"][0] == pytest.approx(0.3)
+    assert frame["controls.baselines.pixels"].tolist() == [0.75, 0.75]
+    assert frame["action.minus_untrained_ci_high"][0] == pytest.approx(0.3)
 
 
 def test_controls_take_no_room_where_there_are_none(probed_run: Callable[..., ArrayRun]) -> None:

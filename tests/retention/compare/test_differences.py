@@ -28,7 +28,7 @@ def test_a_difference_is_the_first_group_minus_the_second(table: RetentionTable)
     assert color.backbone_accuracy == pytest.approx(0.9 - 0.8)
     assert color.action_accuracy == pytest.approx(0.7 - 0.8)
     assert color.retention == pytest.approx(
-        table.rows[0].retention_debiased - table.rows[2].retention_debiased  # type: ignore[operator]
+        table.rows[0].retention.debiased - table.rows[2].retention.debiased  # type: ignore[operator]
     )
     assert mean.backbone_accuracy == pytest.approx((0.1 + 0.35) / 2)
     assert shape.backbone_ci is not None
@@ -69,7 +69,7 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     table = retention_table({"both": [strong, weak], "strong": [alone]})
     assert table.differences[0].backbone_accuracy == pytest.approx((0.9 + 0.8) / 2 - 0.9)
     assert table.differences[0].paired
-    assert [(mean.group, mean.model) for mean in table.means] == [
+    assert [(mean.group, mean.run.model) for mean in table.means] == [
         ("both", "strong"), ("both", "weak"), ("strong", "alone"),
     ]  # fmt: skip
     assert len(table.all_rows) == 2 * 3
@@ -84,7 +84,7 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
     frame = table.differences_frame()
     assert frame["backbone_accuracy"].round(6).tolist() == [0.1, 0.35, 0.225]
-    assert (frame["prefix_ci_low"] < frame["backbone_accuracy"]).all()
+    assert (frame["backbone_ci_low"] < frame["backbone_accuracy"]).all()
 
 
 def test_keys_follow_the_runs_of_all_groups(probed_run: ProbedRun) -> None:

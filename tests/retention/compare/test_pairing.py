@@ -219,7 +219,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     assert retention_table(mixed, vlm_vla=True).unpaired == ()
     accuracy = [(r.episodes["outcome"] == "correct").mean() for r in readers]
     gain = next(row.sr for row in table.differences if row.category == "mean")
-    right = [row.sr for row in table.means if row.kind == "asks"]
+    right = [row.success.sr for row in table.means if row.run.mode == "answers"]
     assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]
     assert accuracy[0] != accuracy[1]
 
@@ -242,7 +242,7 @@ def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
     disguised = run(tmp_path / "e", right, called="pi0 (random weights)")
     names = full_names([*same, random, disguised])
     assert len(set(names)) == 5
-    models = {row.label for row in retention_table(same).rows}
+    models = {row.run.label for row in retention_table(same).rows}
     assert len(models) == 3
 
 
@@ -254,10 +254,10 @@ def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path
     alone = json.loads(retention_table([one]).to_json())
     assert all("differences" not in row for row in alone)
     both = json.loads(retention_table([one, other]).to_json())
-    assert [row["run"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
+    assert [row["run"]["location"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
     assert [{name: row[name] for name in alone[0]} for row in both[:3]] == alone
     (found,) = both[0]["differences"]
     assert found["minus_run"] == str(tmp_path / "other")
     assert found["category"] == both[0]["category"] == "color"
-    assert found["sr"] == pytest.approx(both[0]["sr"] - both[3]["sr"])
+    assert found["sr"] == pytest.approx(both[0]["success"]["sr"] - both[3]["success"]["sr"])
     assert [row["differences"] for row in both[3:]] == [[], [], []]

@@ -29,48 +29,61 @@ def runs(tmp_path: Path) -> list[SaidRun]:
 
 def test_asked_rows_stand_first_and_say_what_they_are(runs: list[SaidRun]) -> None:
     table = retention_table(runs)
-    assert [row.kind for row in table.all_rows] == ["asks"] * 3 + ["acts"] * 3
+    assert [row.run.mode for row in table.all_rows] == ["answers"] * 3 + ["acts"] * 3
     color, _, mean = table.all_rows[:3]
-    assert (color.prompt, color.picture_size, color.asked_for, color.score) == ("p1", "224x224", "target", "text")
-    assert color.accuracy_text == color.sr
-    assert (color.accuracy_logits, color.accuracy_order_balanced, color.letter_bias, color.option_mass) == (
+    answers = color.answers
+    assert (answers.prompt, answers.picture_size, answers.asked_for, answers.score) == (
+        "p1",
+        "224x224",
+        "target",
+        "text",
+    )
+    assert answers.accuracy_text == color.success.sr
+    assert (
+        answers.accuracy_logits,
+        answers.accuracy_order_balanced,
+        answers.letter_bias,
+        answers.option_mass,
+    ) == (
         0.5,
         1,
         1.5,
         0.8,
     )
-    assert color.share_unparsable == color.share_outside > 0
-    assert (mean.kind, mean.prompt, mean.accuracy_logits) == ("asks", "p1", 0.5)
-    assert "no answer could be read" in retention_table([_mostly_silent(runs[1])]).rows[0].regime_reason
+    assert answers.share_unparsable == color.success.share_outside > 0
+    assert (mean.run.mode, mean.answers.prompt, mean.answers.accuracy_logits) == ("answers", "p1", 0.5)
+    assert "no answer could be read" in retention_table([_mostly_silent(runs[1])]).rows[0].success.reason
 
 
 def _mostly_silent(run: SaidRun) -> SaidRun:
     return replace(run, episodes=run.episodes.assign(outcome="oob", side_placed="none"))
 
 
-@pytest.mark.parametrize(("score", "sr"), [("logits", 0.5), ("debiased", 1.0)])
+@pytest.mark.parametrize(("score", "sr"), [("logits", 0.5), ("order-balanced", 1.0)])
 def test_the_score_is_what_the_table_shows(runs: list[SaidRun], score: str, sr: float) -> None:
     table = retention_table(runs, score=score)
-    assert all(row.sr == sr and row.score == score for row in table.rows if row.kind == "asks")
-    assert [row.sr for row in table.rows if row.kind == "acts"] == [
-        row.sr for row in retention_table(runs).rows if row.kind == "acts"
+    assert all(
+        row.success.sr == sr and row.answers.score == score for row in table.rows if row.run.mode == "answers"
+    )
+    assert [row.success.sr for row in table.rows if row.run.mode == "acts"] == [
+        row.success.sr for row in retention_table(runs).rows if row.run.mode == "acts"
     ]
-    assert table.rows[0].accuracy_text == retention_table(runs).rows[0].sr
+    assert table.rows[0].answers.accuracy_text == retention_table(runs).rows[0].success.sr
     with pytest.raises(UsageError, match="score is 'luck'"):
         retention_table(runs, score="luck")
 
 
 def test_a_constant_answer_has_one_right_per_item_and_no_paired_evidence(runs: list[SaidRun]) -> None:
     row = retention_table(runs, score="logits").rows[0]
-    assert (row.sr, row.items_one_right, row.paired_p) == (0.5, 20, 1)
+    assert (row.success.sr, row.success.paired.one, row.success.paired.p) == (0.5, 20, 1)
 
 
 def test_items_with_a_side_in_their_name_are_left_out_unless_asked_for(tmp_path: Path) -> None:
     run = asked(tmp_path, by_chance(1, 0.9), worded=True)
     table = retention_table([run])
-    assert table.rows[0].n_items == 19
+    assert table.rows[0].success.n_items == 19
     assert any("4 episodes are left out because a side stands in the name" in note for note in table.notes)
-    assert retention_table([run], with_side_words=True).rows[0].n_items == 20
+    assert retention_table([run], with_side_words=True).rows[0].success.n_items == 20
 
 
 def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None:
@@ -144,17 +157,23 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     console = Console(width=200, record=True, file=StringIO())
     console.print(table.to_rich())
     shown = console.export_text()
-    for words in ("Accuracy of answers", "asked above, acting below", "VLM − VLA", "560x480", "letter bias"):
+    for words in (
+        "Accuracy of answers",
+        "VLM runs above, policy runs below",
+        "VLM − VLA",
+        "560x480",
+        "letter bias",
+    ):
         assert words in shown
     markdown = table.to_markdown()
-    for words in ("SR / accuracy % [95 %]", "**Answers**", "**VLM − VLA: ", "| qwen3-vl | seen |"):
+    for words in ("accuracy % [95 %]", "**Accuracy of answers", "**VLM − VLA: ", "| qwen3-vl | seen |"):
         assert words in markdown
     latex = table.to_latex()
-    assert "SR / acc." in latex
+    assert "accuracy \\,\\%".replace(" ", "") in latex
     assert "VLM $-$ VLA" in latex
     content = json.loads(table.to_json())
-    assert len(content["gaps"]) == 9
-    assert {"difference", "difference_ci", "p_holm", "paired"} <= content["gaps"][0].keys()
+    assert len(content["vlm_vla"]) == 9
+    assert {"difference", "difference_ci", "p_holm", "paired"} <= content["vlm_vla"][0].keys()
     assert isinstance(json.loads(retention_table(runs).to_json()), list)
     sizes = next(own for own in table.further_tables if own.columns[:2] == ("model", "prompt"))
     assert sizes.columns == ("model", "prompt", "224x224", "560x480")

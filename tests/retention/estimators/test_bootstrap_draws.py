@@ -21,7 +21,7 @@ Outcomes = Callable[..., pd.DataFrame]
 
 
 def estimates_of(curve: Curve, suite: str = "s@1#0") -> dict[str, Estimate]:
-    peaks = {"prefix": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
+    peaks = {"backbone": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
     found = {name: peak for name, peak in peaks.items() if peak is not None}
     return probe_estimates(curve, found, measure_retention(curve), suite)
 
