@@ -240,7 +240,9 @@ class Policy(Model):
         """
         del note
         self.interventions.check("attention", self.card.family)
-        raise NotImplementedError(f"{type(self).__name__} declares attention and does not implement `weighing`")
+        raise NotImplementedError(
+            f"{type(self).__name__} declares attention and does not implement `record_attention`"
+        )
 
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:

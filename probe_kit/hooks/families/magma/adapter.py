@@ -223,7 +223,7 @@ class Magma(Policy, AnswerModel):
         return np.asarray(named & ends)
 
     def _behind(self, decoded: Decoded) -> Tensor:
-        """(B, V) logits behind the seven tokens, from modules on which nobody listens."""
+        """(B, V) logits behind the seven tokens, from modules without hooks."""
         with torch.inference_mode():
             return decoded.decoding.feed(decoded.ids[:, -1], self._unheard)
 

@@ -77,7 +77,7 @@ class AttentionReadout(Intervention):
         if largest:
             raise CaptureChangedActionError(
                 f"with its attention recorded an action differs by {largest:.3g}; expected the same bit for bit. "
-                "The adapter's `weighing` changes the inference, or the model is not deterministic"
+                "The adapter's `record_attention` changes the inference, or the model is not deterministic"
             )
         assert found.mass is not None
         inferences, blocks, iterations, heads, _ = found.mass.shape
