@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         load_effects,
         run_intervention,
     )
-    from probe_kit.retention import retention as retention_table
+    from probe_kit.retention import retention_table
     from probe_kit.retention.displays import (
         FinalPositionsDisplay,
         IterationMapDisplay,
@@ -112,7 +112,7 @@ __getattr__, __dir__ = lazy_names(
         "load_results": "train",
         "load_suite": "suite",
         "open_run": "extract",
-        "retention_table": "retention:retention",
+        "retention_table": "retention",
         "train_probes": "train",
         "write_report": "retention.report",
     },

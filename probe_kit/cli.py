@@ -27,14 +27,14 @@ from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
-from probe_kit.retention.known_used_command import join
+from probe_kit.retention.known_used_command import stages
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.power_commands import power
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "intervene", "retention",
-    "join", "export", "verify",
+    "stages", "export", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -148,7 +148,7 @@ for command in (
     train,
     power,
     retention,
-    join,
+    stages,
     doctor,
 ):
     app.command()(command)

@@ -27,7 +27,7 @@ def blocks(page: str) -> list[str]:
 
 def trained_table(data: Mapping[str, Any]) -> str:
     """What the demo prints of the trained policy, a row per category."""
-    delta = _span(_of(data, TRAINED), "delta_regime")
+    delta = _span(_of(data, TRAINED), "chance_margin")
     heading = ("demo", f"SR % (Δ {delta})", "backbone %, family-wise p", "action %", "bounded retention [95 %]")
     return _table(heading, [_cells(row, "n/a (no backbone signal)") for row in _of(data, TRAINED)])
 
@@ -46,7 +46,7 @@ def organisms_table(data: Mapping[str, Any]) -> str:
         else:
             lines += [_with_verdict(row) for row in rows]
     true = sum(row["expected"] == row["measured"] for row in data["organisms"])
-    margin = _span(data["organisms"], "delta_regime")
+    margin = _span(data["organisms"], "chance_margin")
     note = (
         f"{data['episodes']} episodes per category, Δ of {margin} points by items, {data['permutations']} "
         f"permutations: {true} of {len(data['organisms'])} verdicts are true."

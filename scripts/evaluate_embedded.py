@@ -15,7 +15,7 @@ from probe_kit.demo.organisms import READER, TRAINED, verdict
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
-from probe_kit.retention import RetentionRow, retention
+from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.suite import Suite, build_suite
@@ -63,7 +63,7 @@ def main(
 def _rows(runs: list[Run]) -> list[RetentionRow]:
     """Of every run by itself; those that act by every rule."""
     judged = [(run, rule) for run in runs for rule in (RULES[:1] if ask_of(run) else RULES)]
-    return [row for run, rule in judged for row in retention([run], rule=rule).rows if row.category != MEAN]
+    return [row for run, rule in judged for row in retention_table([run], rule=rule).rows if row.category != MEAN]
 
 
 def _asked(out: Path, suite: Suite, scene: SceneSpec, prompt: str, count: Callable[..., None]) -> Run:
@@ -76,24 +76,24 @@ def _folder(out: Path, suite: Suite, scene: SceneSpec, name: str) -> Path:
 
 
 def _cells(row: RetentionRow) -> tuple[str, ...]:
-    acts = row.kind == "acts"
-    low, high = row.sr_ci
+    acts = row.run.mode == "acts"
+    low, high = row.success.ci
     layouts = (
         "–"
-        if None in (row.sr_original, row.sr_swapped)
-        else f"{_percent(row.sr_original)} / {_percent(row.sr_swapped)}"
+        if None in (row.success.sr_original, row.success.sr_swapped)
+        else f"{_percent(row.success.sr_original)} / {_percent(row.success.sr_swapped)}"
     )
     return (
-        row.label or row.model,
-        row.rule if acts else "–",
+        row.run.label or row.run.model,
+        row.rules.rule if acts else "–",
         row.category,
-        str(row.n_episodes),
-        f"{_percent(row.sr)} [{_percent(low)}, {_percent(high)}]",
+        str(row.success.n_episodes),
+        f"{_percent(row.success.sr)} [{_percent(low)}, {_percent(high)}]",
         layouts,
-        _percent(row.p_wrong),
-        _percent(row.p_oob),
-        _percent(row.delta_regime),
-        str(row.regime) if acts else verdict(row),
+        _percent(row.success.share_wrong),
+        _percent(row.success.share_outside),
+        _percent(row.success.chance_margin),
+        str(row.success.regime) if acts else verdict(row),
     )
 
 

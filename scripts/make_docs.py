@@ -48,21 +48,21 @@ def main() -> None:
 def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
     """Run the demo, and the other organisms unless told not to, and write `docs/demo.json`."""
     made = run_demo(folder, stage)
-    rows = [row for row in made.table.rows if row.category != MEAN and row.kind == "acts"]
+    rows = [row for row in made.table.rows if row.category != MEAN and row.run.mode == "acts"]
     if trained_only:
         stored = json.loads(DATA.read_text(encoding="utf-8"))["organisms"]
         others = [one for one in stored if one["organism"] != TRAINED.name]
         findings = [_finding(_of_trained(row)) for row in rows] + others
     else:
-        acted = [one for one in compare_organisms(folder, stage) if one.row.kind == "acts"]
+        acted = [one for one in compare_organisms(folder, stage) if one.row.run.mode == "acts"]
         findings = [_finding(one) for one in acted]
     content = {
         "suite": made.run.suite,
         "weights": made.run.weights_sha256,
         "run_settings": made.run.settings_sha256,
-        "probes": rows[0].probe_settings,
+        "probes": rows[0].run.probes,
         "permutations": PERMUTATIONS,
-        "episodes": rows[0].n_episodes,
+        "episodes": rows[0].success.n_episodes,
         "organisms": findings,
     }
     DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -79,13 +79,13 @@ def _finding(finding: Finding) -> dict[str, object]:
         "category": finding.category,
         "expected": finding.expected,
         "measured": finding.measured,
-        "sr": row.sr,
-        "delta_regime": row.delta_regime,
-        "backbone": row.prefix_accuracy,
-        "p": row.prefix_p_fwe,
-        "action": row.action_accuracy,
-        "retention": row.retention_bounded if row.retention_defined else None,
-        "retention_ci": _limits(row.retention_bounded_ci) if row.retention_defined else None,
+        "sr": row.success.sr,
+        "chance_margin": row.success.chance_margin,
+        "backbone": row.backbone.accuracy,
+        "p": row.backbone.p_fwe,
+        "action": row.action.accuracy,
+        "retention": row.retention.bounded if row.retention.defined else None,
+        "retention_ci": _limits(row.retention.bounded_ci) if row.retention.defined else None,
     }
 
 

@@ -11,7 +11,7 @@ from nbformat import NotebookNode
 from notebooks.execute import FOLDER, executed, kernel, notebooks
 from probe_kit.extract import open_run
 from probe_kit.intervene import stored_site_effects
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.train import load_results
 
 NAMES = (
@@ -105,16 +105,16 @@ def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     run = open_run(made[0] / "work" / "runs" / "pi0-tiny")
     assert not run.random_weights
     first = min((run.path / "probes").iterdir(), key=lambda folder: load_results(run, folder.name).created)
-    rows = {row.category: row for row in retention([run], keys=[first.name]).rows}
-    assert rows["color"].sr > 0.5 + (rows["color"].delta or 1)
-    assert rows["color"].retention_defined
+    rows = {row.category: row for row in retention_table([run], keys=[first.name]).rows}
+    assert rows["color"].success.sr > 0.5 + (rows["color"].success.chance_margin_episodes or 1)
+    assert rows["color"].retention.defined
 
 
 @pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_random_twin_is_called_one_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
     run = open_run(made[0] / "work" / "runs" / "pi0-tiny-random")
     assert run.random_weights
-    assert not any(row.retention_defined for row in retention([run]).rows)
+    assert not any(row.retention.defined for row in retention_table([run]).rows)
 
 
 def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
@@ -140,7 +140,7 @@ def test_the_readers_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, di
     runs = [open_run(made[0] / "work" / "runs" / name) for name in ("vlm-tiny", "habit", "pi0-tiny-asked")]
     asked, habit, acted = runs
     assert (habit.episodes["side_placed"] == "left").all()
-    assert retention([habit]).rows[0].sr == 0.5
+    assert retention_table([habit]).rows[0].success.sr == 0.5
     assert (asked.episodes["outcome"] == "correct").mean() > 0.75
     assert asked.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
 

@@ -9,7 +9,7 @@ import zarr
 
 from probe_kit.extract import Run, open_run
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.train import train_probes
 from tests.support.rehashing import rehash
 
@@ -41,10 +41,10 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
     assert scores.loc[best, "p_fwe"] < 0.05
     others = scores.drop(index=best).query("stream == 'backbone'")
     assert (others["p_fwe"] >= 0.05).all()
-    (row,) = (row for row in retention([planted_run]).rows if row.category == "shape")
-    assert row.retention_defined
-    assert row.prefix_layer == PLANTED.layer
-    assert row.random_weights
+    (row,) = (row for row in retention_table([planted_run]).rows if row.category == "shape")
+    assert row.retention.defined
+    assert row.backbone.layer == PLANTED.layer
+    assert row.run.random_weights
 
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")

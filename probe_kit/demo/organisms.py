@@ -17,9 +17,10 @@ from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
-from probe_kit.retention import RetentionRow, retention
-from probe_kit.retention.columns.text import FOLLOWED_COLUMNS, beats, bounded_value, margin_value, number, percent
-from probe_kit.retention.report.category_summary import Said, verdict
+from probe_kit.retention import RetentionRow, retention_table
+from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
+from probe_kit.retention.columns.text import bounded_value, exceeds, number, percent
+from probe_kit.retention.report.category_summary import CategoryVerdict, verdict
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
-Truth = Said
+Truth = CategoryVerdict
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def probed(
         permutations=permutations,
         controls=("binding",),
         suite=suite.folder,
-        twin=twin,
+        untrained=twin,
         progress=progress,
     )
     progress = stage(f"exchanging pictures, {organism.name}")
@@ -176,7 +177,7 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
 
 def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
     """What the instrument says of every organism's run, and the truth, a category each."""
-    rows = [(organism, row) for organism, run in runs for row in retention([run]).rows]
+    rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
     shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
         Finding(one.name, row.category, one.expected(row.category), measured(row, shown), row) for one, row in rows
@@ -191,9 +192,10 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     """
     said = verdict(row)
     bounded = (
-        row.net_follow_rate_ci is not None and (row.net_follow_rate_ci[1] or 0.0) < SMALLEST_EFFECT_OF_INTEREST
+        row.image_swap.net_follow_rate_ci is not None
+        and (row.image_swap.net_follow_rate_ci[1] or 0.0) < SMALLEST_EFFECT_OF_INTEREST
     )
-    return "encoded, unused" if said == "inconclusive" and row.prefix_signal and bounded and shown else said
+    return "encoded, unused" if said == "inconclusive" and row.backbone.has_signal and bounded and shown else said
 
 
 def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
@@ -215,7 +217,7 @@ def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
             ),
             Part(
                 "What they rest on",
-                ("SR %", "± Δ", "follows / against", "backbone", "p", "beats", "action", "retention [95 %]"),
+                ("SR %", "± Δ", "follows / against", "backbone", "p", "exceeds", "action", "retention [95 %]"),
                 tuple(map(_number_cells, findings)),
             ),
         ),
@@ -234,8 +236,8 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.sr), margin_value(row), FOLLOWED_COLUMNS[0][1](row), percent(row.prefix_accuracy),
-        number(row.prefix_p_fwe, 3),
-        beats(row), percent(row.action_accuracy), bounded_value(row),
+        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.accuracy),
+        number(row.backbone.p_fwe, 3),
+        exceeds(row), percent(row.action.accuracy), bounded_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

@@ -11,10 +11,10 @@ from probe_kit._terminal.console import marked
 from probe_kit.demo.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
 from probe_kit.extract import Run
 from probe_kit.extract.run_layout import VIDEOS
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
-from probe_kit.retention.report.category_summary import Story, stories
+from probe_kit.retention.report.category_summary import PolicySummary, policy_summaries
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "counting")
@@ -32,9 +32,9 @@ class Demo:
     table: RetentionTable
 
     @property
-    def story(self) -> Story:
+    def story(self) -> PolicySummary:
         """What the reader knows, what can be read in the policy, and what it acts on."""
-        return stories(self.table.rows)[0]
+        return policy_summaries(self.table.rows)[0]
 
     def next_steps(self) -> Text:
         """Where to look, and what to try."""
@@ -71,7 +71,7 @@ def run_demo(folder: Path, stage: NamedProgress) -> Demo:
     suite = _questions(folder, stage)
     asked = answered(READER, suite, folder, stage)
     run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
-    table = retention([asked, run])
+    table = retention_table([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     write_whole(folder / "table.md", table.to_markdown())
     write_report([asked, run], folder / "report.html", table)

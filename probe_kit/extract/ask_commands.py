@@ -47,7 +47,7 @@ def ask(
 
     Makes one run per prompt and picture size. Use the --suite, --scene and --seed of the policy runs to compare
     with. Every question is asked in both orders of the options. Answers are read from the text and from the logits
-    of the options. Then compare with policies: `probe-kit retention ASKED… ACTED…` or `probe-kit join`.
+    of the options. Then compare with policies: `probe-kit retention ASKED… ACTED…` or `probe-kit stages`.
 
     The same command resumes interrupted runs. Other settings in the same folder are an error.
     """
@@ -83,4 +83,4 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         say(f"{run.label}: {counts}{reasons}; option mass {mass:.2f}")
         out.print(str(run.location), soft_wrap=True)
     places = " ".join(str(run.location) for run in runs)
-    say(marked("next: [bold]probe-kit retention {}[/], with acting runs behind", places))
+    say(marked("next: [bold]probe-kit retention {}[/], with policy runs behind", places))

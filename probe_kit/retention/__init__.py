@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from probe_kit.retention.estimators.by_call import event_calls
     from probe_kit.retention.estimators.retention import Peak, Retention, best_site, measure_retention
     from probe_kit.retention.rows.row import RetentionRow
-    from probe_kit.retention.table import RetentionTable, retention
+    from probe_kit.retention.table import RetentionTable, retention_table
     from probe_kit.statistics.significance import chance_margin
 
 __all__ = [
@@ -68,7 +68,7 @@ __all__ = [
     "match_runs",
     "measure_retention",
     "normalised_score",
-    "retention",
+    "retention_table",
     "scored",
     "sensitivity",
     "success_rate",
@@ -106,7 +106,7 @@ __getattr__, __dir__ = lazy_names(
         "layer_curve": "displays",
         "measure_retention": "estimators.retention",
         "normalised_score": "behaviour.success_rate",
-        "retention": "table",
+        "retention_table": "table",
         "sensitivity": "behaviour.success_rate",
         "success_rate": "behaviour.success_rate",
     },

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from probe_kit.train.data.run_reader import RunReader
 
 
-ASKED = "Asked runs"
+ASKED = "VLM runs"
 
 
 def retention(
@@ -66,10 +66,12 @@ def retention(
     html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
     score: Annotated[
-        str, typer.Option(help="Of asked runs: text, logits, or debiased (no letter bias).", rich_help_panel=ASKED)
+        str,
+        typer.Option(help="Of VLM runs: text, logits, or order-balanced (no letter bias).", rich_help_panel=ASKED),
     ] = "text",
-    gap: Annotated[
-        bool, typer.Option("--gap", help="Test VLM − VLA: asked runs against acting ones.", rich_help_panel=ASKED)
+    vlm_vla: Annotated[
+        bool,
+        typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=ASKED),
     ] = False,
     with_side_words: Annotated[
         bool,
@@ -83,7 +85,7 @@ def retention(
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.env.scoring.rules import check_rule
     from probe_kit.extract import open_run
-    from probe_kit.retention import retention as make_table
+    from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons
 
@@ -108,7 +110,7 @@ def retention(
     table = make_table(
         opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii, rule=rule,
         last_steps=last_steps,
-        score=score, gap=gap, with_side_words=with_side_words, against=against,
+        score=score, vlm_vla=vlm_vla, with_side_words=with_side_words, against=against,
     )  # fmt: skip
     if style == "table":
         out.print(table.to_rich())
@@ -206,7 +208,7 @@ _FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
 def _save_figures(runs: "list[RunReader]", table: "RetentionTable", folder: Path) -> None:
-    from probe_kit.retention.displays import gallery, save_figures
+    from probe_kit.retention.displays import collect_figures, save_figures
 
-    for path in save_figures(gallery(runs, table), folder):
+    for path in save_figures(collect_figures(runs, table), folder):
         say(f"figure: {path}")

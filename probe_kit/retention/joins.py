@@ -1,4 +1,4 @@
-"""Every asked run of a table joined with every acting one that began with the same frames."""
+"""Every VLM run of a table joined with every acting one that began with the same frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from itertools import product
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.known_used import KnownUsed, correct_joins, match_runs
-from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged
+from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
+from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
 
@@ -17,12 +17,12 @@ from probe_kit.train.data.run_reader import RunReader
 class Joins:
     """found: what could be joined. refused: why other pairs could not, a sentence each."""
 
-    found: tuple[KnownUsed, ...]
+    found: tuple[KnownUsedTable, ...]
     refused: tuple[str, ...]
 
 
 def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
-    """Known, encoded, used of every pair of an asked and an acting run.
+    """Known, encoded, used of every pair of a VLM run and a policy run.
 
     runs: those that the table is made of, as it reads them; probes and outcome rule are the table's. Tests are
     corrected over all pairs.
@@ -31,7 +31,7 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
     found, refused = [], []
     for reader, policy in product(asked, acted):
-        own = by_rule(policy, table.rule, table.last_steps)
+        own = under_rule(policy, table.rule, table.last_steps)
         try:
             found.append(match_runs(reader, own, table.results.get(str(policy.location))))
         except (UsageError, OtherFramesError) as error:

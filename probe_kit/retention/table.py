@@ -13,16 +13,17 @@ from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
 from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings, wording_pairs
-from probe_kit.retention.columns.text_table import ANSWERS, PlainTable, answer_table, gap_tables, size_table
+from probe_kit.retention.columns.columns import averaged_fields
+from probe_kit.retention.columns.text_table import TextTable, size_table, vlm_vla_tables
 from probe_kit.retention.compare.differences import Difference, group_differences
-from probe_kit.retention.compare.pairing import Compared, compare_runs
-from probe_kit.retention.compare.vlm_vla import VlmGap, vlm_gaps
+from probe_kit.retention.compare.pairing import PairedRuns, compare_runs
+from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
 from probe_kit.retention.estimators.retention import Iterations
-from probe_kit.retention.formats.dataframe import frame_of
+from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
-from probe_kit.retention.rows.build import Drawn, RowSettings, run_rows
+from probe_kit.retention.rows.build import RowSettings, RowWithDraws, run_rows
 from probe_kit.retention.rows.category_mean import mean_row
-from probe_kit.retention.rows.outcome_rules import by_rule, can_be_judged, check_epsilons
+from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
@@ -39,10 +40,11 @@ class RetentionTable:
 
     Runs are never averaged with each other, so no mean mixes suites. differences: between runs, or groups of runs.
     unpaired: which runs of several have none, and why, a sentence each.
-    results: the probes that the rows were made of, by `row.run`; figures and reports of the table draw these.
+    results: the probes that the rows were made of, by `row.run.location`; figures and
+    reports of the table draw these.
     wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
-    which runs have no probes, and which settings the rows mix. gaps: VLM − VLA, if that was asked for.
+    which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested.
     """
 
     rows: list[RetentionRow]
@@ -52,7 +54,7 @@ class RetentionTable:
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
     wordings: list[WordingPair] = field(default_factory=list)
-    gaps: list[VlmGap] = field(default_factory=list)
+    vlm_vla: list[VlmVlaDifference] = field(default_factory=list)
     unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -68,12 +70,12 @@ class RetentionTable:
     @property
     def rule(self) -> str:
         """The outcome rule by which episodes were judged."""
-        return self.rows[0].rule if self.rows else DEFAULT_RULE
+        return self.rows[0].rules.rule if self.rows else DEFAULT_RULE
 
     @property
     def last_steps(self) -> int:
         """How many control steps at the end it judged."""
-        return self.rows[0].last_steps if self.rows else 1
+        return self.rows[0].rules.last_steps if self.rows else 1
 
     @property
     def all_rows(self) -> list[RetentionRow]:
@@ -82,17 +84,53 @@ class RetentionTable:
             row
             for mean in self.means
             for row in [
-                *(r for r in self.rows if (r.group, r.run, r.view) == (mean.group, mean.run, mean.view)),
+                *(r for r in self.rows if (*r.key, r.view) == (*mean.key, mean.view)),
                 mean,
             ]
         ]
 
+    @property
+    def success(self) -> "pd.DataFrame":
+        """Success rates by `run` and `category`, with the fields of `SuccessRate`."""
+        return part_frame(self.all_rows, "success", by_view=False)
+
+    @property
+    def rules(self) -> "pd.DataFrame":
+        """What the outcome rule gives away, by `run` and `category`, with the fields of `OutcomeRuleScores`."""
+        return part_frame(self.all_rows, "rules", by_view=False)
+
+    @property
+    def answers(self) -> "pd.DataFrame":
+        """How VLM runs were asked and answered, by `run` and `category`, with the fields of `AnswerStats`."""
+        return part_frame([row for row in self.all_rows if row.run.mode == "answers"], "answers", by_view=False)
+
+    @property
+    def probes(self) -> "pd.DataFrame":
+        """The best sites by `run`, `category`, `view` and `stream`, with the fields of `ActionPeak`."""
+        return peak_frame(self.all_rows)
+
+    @property
+    def retention(self) -> "pd.DataFrame":
+        """Retention by `run`, `category` and `view`, with the fields of `RetentionScores`."""
+        return part_frame(self.all_rows, "retention")
+
+    @property
+    def controls(self) -> "pd.DataFrame":
+        """What probes are compared with, by `run`, `category` and `view`, with the fields of `ControlScores`."""
+        return part_frame(self.all_rows, "controls")
+
+    @property
+    def interventions(self) -> "pd.DataFrame":
+        """Effects of stored image swaps by `run`, `category` and `view`, with the fields of `SwapEffect`."""
+        return part_frame([row for row in self.all_rows if row.image_swap.follow_rate is not None], "image_swap")
+
     def to_frame(self) -> "pd.DataFrame":
-        """All rows as a data frame with the fields of `RetentionRow`.
+        """All rows as one data frame: the fields of `RetentionRow`, those of its parts as `part.field`.
 
         Shares, ratios and limits are floats, NaN where they are not defined: retention without backbone signal
-        too, whose raw ratio `to_json` keeps. Intervals become two columns, `sr_ci_low` and so on, what is kept by
-        name one column per name, such as `baselines.pixels`, and lists become text.
+        too, whose raw ratio `to_json` keeps. Intervals become two columns, `success.ci_low` and so on, what is
+        kept by name one column per name, such as `controls.baselines.pixels`, and lists become text. The frames
+        `success`, `rules`, `answers`, `probes`, `retention`, `controls` and `interventions` hold one part each.
         """
         return frame_of(self.all_rows)
 
@@ -101,13 +139,14 @@ class RetentionTable:
         return frame_of(self.differences)
 
     def to_json(self) -> str:
-        """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`.
+        """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`,
+        which hold objects for its parts.
 
         Where runs are compared, every row has a list `differences` as well: those of its run minus others. With
-        groups, runs in several wordings or gaps, an object with the lists `rows`, `differences` between groups,
-        `wordings` and `gaps`, as far as there are any.
+        groups, runs in several wordings or VLM − VLA, an object with the lists `rows`, `differences` between
+        groups, `wordings` and `vlm_vla`, as far as there are any.
         """
-        return table_json(self.all_rows, self.differences, {"wordings": self.wordings, "gaps": self.gaps})
+        return table_json(self.all_rows, self.differences, {"wordings": self.wordings, "vlm_vla": self.vlm_vla})
 
     def to_csv(self) -> str:
         """All rows as comma-separated values with a header; differences have `differences_frame`.
@@ -126,28 +165,28 @@ class RetentionTable:
 
     def to_latex(self) -> str:
         """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
-        from probe_kit.retention.columns.conditions import condition_tables
+        from probe_kit.retention.columns.conditions import wording_tables
         from probe_kit.retention.formats.latex import latex
 
-        wordings = condition_tables([], self.wordings)
-        further = [*wordings, *self.further_tables]
+        further = [*wording_tables(self.wordings), *self.further_tables]
         return latex(self.all_rows, self.differences, self.notes, further, self.unpaired)
 
     def to_rich(self) -> "Group":
         """Success rates, retention, controls and differences as tables for a rich console."""
         from probe_kit.retention.formats.terminal import rich_tables
 
-        further = [table for table in self.further_tables if table.title != ANSWERS]  # its blocks say the same
-        return rich_tables(self.all_rows, self.differences, self.notes, self.wordings, further, self.unpaired)
+        return rich_tables(
+            self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
+        )
 
     @property
-    def further_tables(self) -> list[PlainTable]:
-        """Answers, sizes of the picture by prompt, and VLM − VLA, as far as runs were asked."""
-        found = [answer_table(self.all_rows), size_table(self.means)]
-        return [table for table in found if table is not None] + gap_tables(self.gaps)
+    def further_tables(self) -> list[TextTable]:
+        """Sizes of the picture by prompt, and VLM − VLA, as far as there are VLM runs."""
+        sizes = size_table(self.means)
+        return [*([] if sizes is None else [sizes]), *vlm_vla_tables(self.vlm_vla)]
 
 
-def retention(
+def retention_table(
     runs: Sequence[RunReader] | Mapping[str, Sequence[RunReader]],
     views: Sequence[str] | None = None,
     *,
@@ -157,7 +196,7 @@ def retention(
     seed: int = 0,
     score: str = "text",
     with_side_words: bool = False,
-    gap: bool = False,
+    vlm_vla: bool = False,
     rule: str = DEFAULT_RULE,
     last_steps: int = 1,
     against: str | None = None,
@@ -167,17 +206,16 @@ def retention(
     runs: a list, of which the first is compared with every other on the same questions (see `compare_runs`), or
     lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
-    by default. iterations: which expert iterations take part.
-    keys: which stored probe results of each run to use, in order, the newest by default. epsilons: zone radii in
-    metres at which SR is scored again, for the rule `disc`. rule: by which episodes are judged, a name of
-    `probe_kit.env.scoring.rules.RULES`; last_steps: control steps at their end that count. A run that keeps no
-    trajectories has no success rate by another rule than `disc`. A run without activations or probes shows success
-    rates only.
-    score: by which asked runs are read, `text`, `logits` or `debiased`; they stand first. with_side_words: count
-    their items in whose name a side stands. gap: compare every asked run with every acting one, see `vlm_gaps`.
-    Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
-    is not that of the runs, for a run that is given twice, or for `against` where it is none of them; SceneError
-    for overlapping zones.
+    by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
+    in order, the newest by default. epsilons: zone radii in metres at which SR is scored again, for the rule
+    `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps: control
+    steps at their end that count. A run that keeps no trajectories has no success rate by another rule than
+    `disc`. A run without activations or probes shows success rates only. score: by which VLM runs are read,
+    `text`, `logits` or `order-balanced`; they stand first. with_side_words: count their items in whose name a side
+    stands. vlm_vla: compare every VLM run with every acting one, see `vlm_vla_differences`. Raises
+    UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that is not
+    that of the runs, for a run that is given twice, or for `against` where it is none of them; SceneError for
+    overlapping zones.
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
@@ -194,38 +232,47 @@ def retention(
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
     notes += unscored
     settings = RowSettings(views, iterations, epsilons, seed, rule, last_steps)
-    drawn: list[Drawn] = []
+    drawn: list[RowWithDraws] = []
     means: list[RetentionRow] = []
     for name, run in listed:
         found = run_rows(run, results.get(str(run.location)), settings, name)
         drawn += found
         shown = dict.fromkeys(one.row.view for one in found)
-        means += [mean_row([one for one in found if one.row.view == view]) for view in shown]
+        means += [mean_row([one for one in found if one.row.view == view], averaged_fields()) for view in shown]
     names = distinct_labels([run for _, run in listed])
-    compared = Compared([], ())
+    compared = PairedRuns([], ())
     if isinstance(runs, Mapping):
         by_group = {name: [one for one in drawn if one.row.group == name] for name in runs}
-        compared = Compared(group_differences(by_group, against), ())
+        compared = PairedRuns(group_differences(by_group, against), ())
     elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, against, gap)
+        compared = compare_runs([run for _, run in listed], drawn, names, against, vlm_vla)
     notes += [
         f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
     ]
     notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
     notes += [*chosen_wordings([run for _, run in listed]), *left_out([run for _, run in listed])]
     rows, means = (
-        [replace(row, label=names[row.run]) for row in part] for part in ([d.row for d in drawn], means)
+        [replace(row, run=replace(row.run, label=names[row.run.location])) for row in part]
+        for part in ([d.row for d in drawn], means)
     )
-    judged = [by_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
+    judged = [under_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
     pairs = correct_wordings([pair for run in judged for pair in _wordings(run, names[str(run.location)])])
-    gaps = vlm_gaps([run for _, run in listed], names) if gap else []
-    if gap and not gaps:
+    found_differences = vlm_vla_differences([run for _, run in listed], names) if vlm_vla else []
+    if vlm_vla and not found_differences:
         raise UsageError(
-            "--gap compares asked runs with acting ones in the same categories, and these runs have no such pair. "
-            "Make the missing ones with `probe-kit ask` or `probe-kit extract`"
+            "--vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no such "
+            "pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
     return RetentionTable(
-        rows, means, compared.differences, results, iterations, tuple(notes), pairs, gaps, compared.unpaired
+        rows,
+        means,
+        compared.differences,
+        results,
+        iterations,
+        tuple(notes),
+        pairs,
+        found_differences,
+        compared.unpaired,
     )
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
-    from probe_kit.train.results.control_scores import BaselineScore, ControlComparison, Controls, TwinScore
+    from probe_kit.train.results.control_scores import BaselineScore, ControlComparison, Controls, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
@@ -40,7 +40,7 @@ __all__ = [
     "Progress",
     "RunReader",
     "Target",
-    "TwinScore",
+    "UntrainedScore",
     "load_results",
     "load_results_by_call",
     "save_results",
@@ -69,7 +69,7 @@ __getattr__, __dir__ = lazy_names(
         "RunReader": "data.run_reader",
         "TARGETS": "choices",
         "Target": "choices",
-        "TwinScore": "results.control_scores",
+        "UntrainedScore": "results.control_scores",
         "load_results_by_call": "results.by_call",
         "load_results": "results.store",
         "save_results": "results.store",

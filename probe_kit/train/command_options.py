@@ -63,10 +63,10 @@ Controls = Annotated[
         rich_help_panel=CONTROLS,
     ),
 ]
-Twin = Annotated[
+Untrained = Annotated[
     str | None,
     typer.Option(
-        "--twin",
+        "--untrained",
         metavar="RUN",
         help="Run of the same episodes to subtract, usually with untrained weights.",
         rich_help_panel=CONTROLS,

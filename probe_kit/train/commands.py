@@ -29,7 +29,7 @@ def train(
     seed: common.Seed = 0,
     partial: common.Partial = False,
     controls: own.Controls = None,
-    twin: own.Twin = None,
+    untrained: own.Untrained = None,
     suite: own.Suite = None,
     permutations: own.Permutations = 200,
     token_permutations: own.TokenPermutations = 59,
@@ -48,7 +48,7 @@ def train(
     from probe_kit.train import train_probes
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    untrained = None if twin is None else open_run(twin, allow_partial=partial).in_wording(wording)
+    control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     left_out: dict[int, Exception] = {}
     for number in _calls(call, opened):
         try:
@@ -65,7 +65,7 @@ def train(
                     incomplete=incomplete,
                     controls=cast("tuple[Baseline, ...] | None", controls),
                     suite=suite,
-                    twin=untrained,
+                    untrained=control,
                     seed=seed,
                     jobs=jobs,
                     device=device,
@@ -81,7 +81,7 @@ def train(
     for number, reason in left_out.items():
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
     if not results.controls.excess:
-        say("signal is judged against chance only: add the control binding, or a --twin by random weights")
+        say("signal is judged against chance only: add the control binding, or a --untrained by random weights")
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
@@ -187,6 +187,6 @@ def _beats(best: "pd.Series[Any]") -> str:
     from probe_kit.statistics.significance import SIGNIFICANCE
 
     chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
-    tried = {"chance": chance, "binding": best["beats_binding"], "twin": best["beats_twin"]}
+    tried = {"chance": chance, "binding": best["beats_binding"], "untrained": best["beats_untrained"]}
     found = [name if better else f"not {name}" for name, better in tried.items() if not isna(better)]
     return ", ".join(found) or "–"

@@ -30,15 +30,16 @@ _NUMBERS = 200_000
 class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
-    chance: against relabellings. binding, twin: against a control that is right half of the time; it takes more if
-    the control is better than that. spread: standard error of the three, the largest, measured over `SEEDS` seeds.
+    chance: against relabellings. binding, untrained: against a control that is right half of the time; it takes
+    more if the control is better than that. spread: standard error of the three, the largest, measured over
+    `SEEDS` seeds.
     """
 
     items: int
     above: float
     chance: float
     binding: float
-    twin: float
+    untrained: float
     spread: float
 
 
@@ -73,9 +74,9 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
     signal = np.zeros(sites)
     signal[_carriers(sites)] = above
     parts = np.array([_part(items, signal, -(-draws // SEEDS), SEEDS * seed + part) for part in range(SEEDS)])
-    chance, binding, twin = parts.mean(axis=0).tolist()
+    chance, binding, untrained = parts.mean(axis=0).tolist()
     spread = float((parts.std(axis=0, ddof=1) / sqrt(SEEDS)).max())
-    return Power(items, above, chance, binding, twin, spread)
+    return Power(items, above, chance, binding, untrained, spread)
 
 
 def items_needed(above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Needed:
@@ -137,7 +138,7 @@ def _resolution(items: int) -> int:
 
 
 def _least(found: Power) -> float:
-    return min(found.chance, found.binding, found.twin)
+    return min(found.chance, found.binding, found.untrained)
 
 
 def _carriers(sites: int) -> slice:
@@ -155,14 +156,14 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
     limit = _limit(items // ITEMS_PER_GROUP, signal.size, seed)
     seen = []
     for draw in range(draws):
-        here, twin = _right(generator, signal, groups), _right(generator, nothing, groups)
+        here, untrained = _right(generator, signal, groups), _right(generator, nothing, groups)
         layers = _right(generator, np.zeros(5), groups)
         reference = layers[layers.sum(axis=1).argmax()].astype(float)
         seen.append(
             (
                 here.mean(axis=1).max() > limit,
                 better_than_reference(here, reference, groups, draw).min() < SIGNIFICANCE,
-                better_than_best(here, twin, groups, draw).min() < SIGNIFICANCE,
+                better_than_best(here, untrained, groups, draw).min() < SIGNIFICANCE,
             )
         )
     chance, binding, beaten = np.mean(seen, axis=0).tolist()

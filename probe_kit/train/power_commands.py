@@ -111,13 +111,13 @@ def _print(found: "list[Power]") -> None:
         "signal, points",
         "against chance %",
         "against binding %",
-        "against a twin %",
+        "against an untrained network %",
         "± (standard error)",
         "red control from %",
     )
     rows = [
         (
-            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.binding, one.twin)),
+            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.binding, one.untrained)),
             f"{100 * one.spread:.1f}",
             f"{100 * detectable(one.items):.0f}",
         )
@@ -126,8 +126,8 @@ def _print(found: "list[Power]") -> None:
     out.print(
         ResponsiveTable(
             title="Power: how often a signal is seen",
-            caption="binding and twin at chance; ±: of the three, the largest, measured over seeds; a leaking "
-            "control of that accuracy is red in 80 % of suites",
+            caption="binding and the untrained network at chance; ±: of the three, the largest, measured over "
+            "seeds; a leaking control of that accuracy is red in 80 % of suites",
             name="items",
             names=tuple(str(one.items) for one in found),
             styles=("",) * len(found),

@@ -11,7 +11,7 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import Baseline, Incomplete, Target
-from probe_kit.train.controls.fit_controls import add_baselines, add_twin, check_twin, prepare_baselines
+from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.run_reader import RunReader
@@ -43,7 +43,7 @@ def train_probes(
     incomplete: Incomplete = "keep",
     controls: Sequence[Baseline] | None = None,
     suite: Path | None = None,
-    twin: RunReader | None = None,
+    untrained: RunReader | None = None,
     seed: int = 0,
     jobs: int | None = None,
     device: str | None = None,
@@ -61,8 +61,8 @@ def train_probes(
     controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`, which
     need pictures; () for none. By default `binding`; where the pictures cannot be found a warning says that it was
     left out. suite: folder of the run's suite; the embedded one is found or drawn again without it.
-    twin: a run of the same episodes, usually by random weights, to subtract.
-    What is no better than `binding` and the twin is no signal, whatever its p-value.
+    untrained: a run of the same episodes, usually by random weights, to subtract.
+    What is no better than `binding` and the untrained network is no signal, whatever its p-value.
     jobs: processes that probe, this one alone by default; with more than one, a script needs
     `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
     ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
@@ -90,17 +90,26 @@ def train_probes(
     sweep = _Sweep.of(run, asked, crew, progress)
     prepared = prepare_baselines(run, controls, suite, sweep.stored)
     beside = None
-    if twin is not None:
-        twin = restrict_to_call(twin, call)
+    if untrained is not None:
+        untrained = restrict_to_call(untrained, call)
         other = _settings(
-            twin, asked.categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
+            untrained,
+            asked.categories,
+            views,
+            target,
+            folds,
+            incomplete,
+            permutations,
+            token_permutations,
+            seed,
+            call,
         )
-        check_twin(run, twin, other)
-        beside = _Sweep.of(twin, other, crew, progress)
+        check_untrained(run, untrained, other)
+        beside = _Sweep.of(untrained, other, crew, progress)
     results = add_baselines(sweep.results(), run, prepared)
     if beside is not None:
         others = beside.results()
-        results = add_twin(results, others)
+        results = add_untrained(results, others)
         beside.keep(others, asked=False)
     return sweep.keep(results, asked=True)
 

@@ -13,7 +13,7 @@ from probe_kit._terminal.local_paths import without_places
 from probe_kit._terminal.notebook import facts_html, rows_html
 from probe_kit.hooks import load_model
 from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 
@@ -47,7 +47,7 @@ def leaks(page: str, folder: Path) -> list[str]:
 
 def test_no_path_of_this_machine_stands_in_the_report(tmp_path: Path) -> None:
     own = runs(tmp_path)
-    table = retention(own, gap=True)
+    table = retention_table(own, vlm_vla=True)
     assert leaks("\n".join(table.notes), tmp_path), "the notes of this table must name runs by their places"
     page = report_html(own, table)
     assert leaks(page, tmp_path) == []
@@ -58,7 +58,7 @@ def test_no_path_of_this_machine_stands_in_the_report(tmp_path: Path) -> None:
 
 
 def test_no_path_of_this_machine_stands_in_a_notebook(tmp_path: Path) -> None:
-    assert leaks(retention(runs(tmp_path))._repr_html_(), tmp_path) == []
+    assert leaks(retention_table(runs(tmp_path))._repr_html_(), tmp_path) == []
 
 
 def test_no_path_of_this_machine_stands_in_what_notebooks_show_of_runs_and_models(tmp_path: Path) -> None:

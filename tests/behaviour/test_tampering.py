@@ -22,7 +22,7 @@ from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.thumbnails import read_thumbnail, thumbnail_key
 from probe_kit.intervene import stored_image_swaps
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.resume import SweepCheckpoint
@@ -96,7 +96,7 @@ def test_a_changed_plan_is_found(run: Path, change: Callable[[Any], object]) -> 
     edit(run / "plan.json", lambda plan: change(plan["episodes"]))
     assert_found(run, "plan.json")
     with pytest.raises(RunDamagedError, match=r"plan\.json"):
-        retention([open_run(run)])
+        retention_table([open_run(run)])
 
 
 @pytest.mark.parametrize("left", [0, 20, 23])
@@ -429,7 +429,7 @@ def test_changed_settings_of_probes_are_found(run: Path, change: Edit, which: in
     edit(stored_probes(run)[which] / "settings.json", change)
     assert_found(run, "settings.json")
     with pytest.raises(RunDamagedError, match=r"settings\.json"):
-        retention([open_run(run)])
+        retention_table([open_run(run)])
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -437,7 +437,7 @@ def test_lost_settings_are_found_and_no_older_probes_are_read(run: Path, which: 
     (stored_probes(run)[which] / "settings.json").unlink()
     assert_found(run, "settings.json is missing")
     with pytest.raises(RunDamagedError, match="is missing"):
-        retention([open_run(run)])
+        retention_table([open_run(run)])
 
 
 @pytest.mark.parametrize("name", ["decisions", "directions", "controls"])

@@ -24,28 +24,36 @@ from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
 from probe_kit.retention import RetentionRow
-from probe_kit.retention.behaviour.success_rate import regime
+from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
 from probe_kit.retention.report.category_summary import verdict
+from probe_kit.retention.rows.parts import BackbonePeak, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 
 
 def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
     """p: of the backbone's best site against chance."""
     chance = None if p is None else p < 0.05
-    return RetentionRow(
-        run="run", model="pi0-tiny", random_weights=False, weights_sha256="0" * 64, suite="suite@1",
-        run_settings="s", probe_settings="p", category="color", view="mean", n_episodes=48, n_items=24, sr=sr,
-        regime=regime(sr, 0.14, 1 - sr, 0.0)[0], prefix_accuracy=0.9, prefix_p_fwe=p,
-        prefix_beats={"chance": chance, "binding": None, "twin": None} | beats,
+    run = RunInfo(
+        location="run", model="pi0-tiny", random_weights=False, weights_sha256="0" * 64, suite="suite@1",
+        settings="s", probes="p",
     )  # fmt: skip
+    return RetentionRow(
+        category="color",
+        view="mean",
+        run=run,
+        success=SuccessRate(n_episodes=48, n_items=24, sr=sr, regime=regime(sr, 0.14, 1 - sr, 0.0)[0]),
+        backbone=BackbonePeak(
+            accuracy=0.9, p_fwe=p, exceeds={"chance": chance, "binding": None, "untrained": None} | beats
+        ),
+    )
 
 
 @pytest.mark.parametrize(
     ("sr", "p", "expected"),
     [
-        (0.9, 0.005, "used"),
-        (0.64, 0.005, "encoded, unused"),
-        (0.02, 0.005, "encoded, unused"),
+        (0.9, 0.005, "acted on"),
+        (0.64, 0.005, "encoded, not acted on"),
+        (0.02, 0.005, "encoded, not acted on"),
         (0.5, 0.2, "absent"),
         (0.5, None, "absent"),
         (0.9, 0.2, "acted on, not found"),
@@ -57,11 +65,11 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
     assert verdict(row(sr, p)) == expected
 
 
-@pytest.mark.parametrize("control", ["binding", "twin"])
+@pytest.mark.parametrize("control", ["binding", "untrained"])
 def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
     """Color of the random twin had p = 0.005 against chance, and knew nothing."""
     assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
-    assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, unused"
+    assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, not acted on"
 
 
 def test_organisms_differ_in_one_truth_at_a_time() -> None:
@@ -87,9 +95,9 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
 def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
     p: float, limits: tuple[float, float], shown: bool, expected: str
 ) -> None:
-    alone = replace(row(0.4, p), used="inconclusive", net_follow_rate_ci=limits)
+    alone = replace(row(0.4, p), image_swap=SwapEffect(used="inconclusive", net_follow_rate_ci=limits))
     assert measured(alone, shown) == expected
-    assert measured(replace(alone, used="used"), shown) == "used"
+    assert measured(replace(alone, image_swap=SwapEffect(used="used")), shown) == "used"
 
 
 def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
@@ -109,7 +117,9 @@ def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
 
 def test_the_table_shows_the_margin_that_decides() -> None:
     """Over 48 episodes Δ is 14.1 points, over their 24 items 20.0, and that is what the verdict rests on."""
-    shown = replace(row(0.66, 0.3), delta=0.1414, delta_regime=0.2001)
+    one = row(0.66, 0.3)
+    margins = {"chance_margin_episodes": 0.1414, "chance_margin": 0.2001}
+    shown = replace(one, success=replace(one.success, **margins))
     with out.capture() as printed:
         out.print(to_rich([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
     text = printed.get()
@@ -131,6 +141,7 @@ def test_the_table_counts_the_true_verdicts() -> None:
 
 @pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
 def test_a_reader_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
-    assert verdict(replace(row(sr, None), kind="asks")) == expected
+    one = row(sr, None)
+    assert verdict(replace(one, run=replace(one.run, mode="answers"))) == expected
     assert READER.expected("state") == "known"
     assert READER.expected("counting") == "unknown"

@@ -1,4 +1,4 @@
-"""Asked runs: what is stored, what controls say, that they resume, and that they see what policies see."""
+"""VLM runs: what is stored, what controls say, that they resume, and that they see what policies see."""
 
 import hashlib
 from dataclasses import replace

@@ -12,11 +12,11 @@ from rich.console import Console
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.success_rate import success_rate
 from probe_kit.retention.compare.differences import group_differences
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
-from probe_kit.retention.displays.report_figures import gallery
+from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report import write_report
 from probe_kit.retention.rows.build import RowSettings, run_rows
 from probe_kit.suite import Suite
@@ -70,32 +70,34 @@ def test_nothing_moved_and_the_run_says_so(heard: Run) -> None:
 
 
 def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run, tmp_path: Path) -> None:
-    table = retention([heard, recorded_run])
-    rows = [row for row in json.loads(table.to_json()) if row["capture_only"]]
+    table = retention_table([heard, recorded_run])
+    rows = [row for row in json.loads(table.to_json()) if row["run"]["capture_only"]]
     assert {row["category"] for row in rows} == {"color", "mean"}
     for row in rows:
-        assert [row[name] for name in ("sr", "sr_ci", "regime", "p_oob", "gap", "normalised_score")] == [None] * 6
-        assert row["prefix_accuracy"] is not None
-    acting = [row for row in json.loads(table.to_json()) if not row["capture_only"]]
-    assert all(row["sr"] is not None for row in acting)
+        nothing = ("sr", "ci", "regime", "share_outside", "normalised_score")
+        assert [row["success"][name] for name in nothing] == [None] * 5
+        assert row["controls"]["probe_minus_sr"] is None
+        assert row["backbone"]["accuracy"] is not None
+    acting = [row for row in json.loads(table.to_json()) if not row["run"]["capture_only"]]
+    assert all(row["success"]["sr"] is not None for row in acting)
     screen = StringIO()
     Console(file=screen, width=240).print(table.to_rich())
     for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
         assert "n/a" in text
-        assert "captured" in text
-    assert table.to_frame()["sr"].isna().sum() == 2
-    assert any("captured activations only and did not act" in note for note in table.notes)
-    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text(encoding="utf-8")
+        assert "listened to" in text
+    assert table.to_frame()["success.sr"].isna().sum() == 2
+    assert any("was listened to and did not act" in note for note in table.notes)
+    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text()
     assert "did not act" in page
 
 
 def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(heard: Run, recorded_run: Run) -> None:
-    both = retention({"heard": [heard], "acting": [recorded_run]})
-    assert both.differences == []  # the acting run was not probed, and the other has no success rate
+    both = retention_table({"heard": [heard], "acting": [recorded_run]})
+    assert both.differences == []  # the policy run was not probed, and the other has no success rate
     rows = run_rows(heard, load_results(heard), RowSettings(None, "all", (), 0))
     same = group_differences({"one": rows, "other": rows})
     assert {row.category for row in same} == {"color", "mean"}
-    assert all(row.sr is None and row.paired and row.prefix_accuracy == 0 for row in same)
+    assert all(row.sr is None and row.paired and row.backbone_accuracy == 0 for row in same)
 
 
 def test_questions_about_acting_are_refused(heard: Run) -> None:
@@ -148,6 +150,6 @@ def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractS
 
 
 def test_a_report_of_a_listened_run_alone_draws_probes_and_no_behaviour(heard: Run) -> None:
-    subjects = [exhibit.subject for exhibit in gallery([heard], retention([heard]))]
+    subjects = [exhibit.subject for exhibit in collect_figures([heard], retention_table([heard]))]
     assert "probes" in subjects
     assert "behaviour" not in subjects

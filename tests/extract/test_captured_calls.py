@@ -17,8 +17,8 @@ from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
-from probe_kit.retention.displays import gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.estimators.by_call import CallCurves
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
@@ -115,8 +115,8 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
     first = train_probes(run, permutations=5)
     later = train_probes(run, permutations=5, call=1)
     assert load_results(run).key == first.key
-    assert retention([run]).results[str(run.location)].key == first.key
-    table = retention([run], keys=[later.key])
+    assert retention_table([run]).results[str(run.location)].key == first.key
+    table = retention_table([run], keys=[later.key])
     assert any("captured inference 1" in note for note in table.notes)
     assert not any("other episodes" in note for note in table.notes)
 
@@ -131,7 +131,7 @@ def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     line = CallCurves.of(calls, "all", "mean").line("backbone")
     assert line.episodes.tolist() == [int(run.reached(call).sum()) for call in range(CALLS)]
     assert line.accuracy[1] > 0.85 > line.accuracy[0]
-    exhibits = gallery([run], retention([run], keys=[first.key]))
+    exhibits = collect_figures([run], retention_table([run], keys=[first.key]))
     assert f"{run.location.name}-calls" in [exhibit.name for exhibit in exhibits]
 
 

@@ -15,7 +15,7 @@ from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepa
 from probe_kit.extract.store import provenance
 from probe_kit.extract.store.format.hashes import HASH
 from probe_kit.extract.store.locations.locate import locate
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.retention.report import report_html
 from probe_kit.suite import Suite, build_suite
 
@@ -88,7 +88,7 @@ def test_a_mixed_run_says_so(suite: Suite, tmp_path: Path, monkeypatch: pytest.M
     assert run.certificate["mixed"] == ["device", "versions.torch"]
     assert len(run.provenances) == 2
     assert verify_run(run.path, deep=True).ok
-    table = retention([run])
+    table = retention_table([run])
     for text in (table.to_markdown(), table.to_latex(), str(table.notes), report_html([run], table)):
         assert "versions.torch" in text.replace("\\_", "_")
 
@@ -97,7 +97,7 @@ def test_a_copy_of_a_run_does_not_count_beside_it(suite: Suite, tmp_path: Path) 
     run = extract_run(expert(suite), tmp_path / "run")
     copy = open_run(shutil.copytree(run.path, tmp_path / "copy"))
     with pytest.raises(UsageError, match="once as its copy"):
-        retention({"a": [run], "b": [copy]})
+        retention_table({"a": [run], "b": [copy]})
 
 
 def test_other_writers_interpreters_and_processes_are_no_other_numbers(

@@ -9,7 +9,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support.magma_checkpoints import write_checkpoint
@@ -102,12 +102,12 @@ def test_it_stands_in_one_table_beside_another_family_with_its_flagged_steps(
     ]
     for run in runs:
         train_probes(run, permutations=0)
-    table = retention(runs)
-    rows = {row.run: row for row in table.rows if row.category == "color" and row.view == "mean"}
-    shares = [rows[str(run.location)].p_flagged for run in runs]
+    table = retention_table(runs)
+    rows = {row.run.location: row for row in table.rows if row.category == "color" and row.view == "mean"}
+    shares = [rows[str(run.location)].success.share_invalid_action for run in runs]
     assert shares == [0, 1, None]
-    assert [rows[str(run.location)].action_stream for run in runs] == ["action", "action", "expert"]
-    assert all(rows[str(run.location)].prefix_accuracy is not None for run in runs)
+    assert [rows[str(run.location)].run.action_stream for run in runs] == ["action", "action", "expert"]
+    assert all(rows[str(run.location)].backbone.accuracy is not None for run in runs)
     text = table.to_markdown()
-    assert "flagged steps %" in text
+    assert "invalid actions %" in text
     assert "100.0" in text

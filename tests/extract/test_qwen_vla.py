@@ -10,7 +10,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support import internvla_checkpoints, xiaomi_checkpoints
@@ -101,7 +101,11 @@ def test_they_stand_in_one_table_beside_another_family(
         probed = {str(site).partition(".")[0] for site in train_probes(run, permutations=0).scores["site"]}
         assert {"backbone", "expert"} <= probed
         assert "expert_unconditional" not in probed
-    rows = {row.run: row for row in retention(runs).rows if row.category == "color" and row.view == "mean"}
-    assert [rows[str(run.location)].action_stream for run in runs] == ["expert"] * 3
-    assert all(rows[str(run.location)].prefix_accuracy is not None for run in runs)
-    assert all(rows[str(run.location)].action_accuracy is not None for run in runs)
+    rows = {
+        row.run.location: row
+        for row in retention_table(runs).rows
+        if row.category == "color" and row.view == "mean"
+    }
+    assert [rows[str(run.location)].run.action_stream for run in runs] == ["expert"] * 3
+    assert all(rows[str(run.location)].backbone.accuracy is not None for run in runs)
+    assert all(rows[str(run.location)].action.accuracy is not None for run in runs)

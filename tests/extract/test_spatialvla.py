@@ -10,7 +10,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
@@ -55,10 +55,10 @@ def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: 
             assert column.std(axis=0).max() > 0
     for one in runs:
         train_probes(one, permutations=1, jobs=1)
-    rows = retention(runs).rows
-    assert [row.model for row in rows] == ["spatialvla", "openvla", "pi0-tiny"]
-    assert [row.action_stream for row in rows] == ["action", "action", "expert"]
-    assert all(row.n_items == 12 for row in rows)
+    rows = retention_table(runs).rows
+    assert [row.run.model for row in rows] == ["spatialvla", "openvla", "pi0-tiny"]
+    assert [row.run.action_stream for row in rows] == ["action", "action", "expert"]
+    assert all(row.success.n_items == 12 for row in rows)
 
 
 def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path) -> None:

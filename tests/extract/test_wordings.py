@@ -10,7 +10,7 @@ from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.hooks import Site
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import build_suite
 from probe_kit.train.results.inventory import inventory
 
@@ -98,9 +98,9 @@ def test_the_inventory_says_how_many_episodes_each_wording_has(ladder):
 
 def test_retention_shows_one_wording_and_all_of_them_against_each_other(ladder):
     with pytest.raises(UsageError, match="several wordings"):
-        retention([ladder])
-    table = retention([ladder.in_wording("named")])
-    assert {row.n_episodes for row in table.rows} == {4}
+        retention_table([ladder])
+    table = retention_table([ladder.in_wording("named")])
+    assert {row.success.n_episodes for row in table.rows} == {4}
     assert [(pair.wording, pair.other, pair.n_episodes) for pair in table.wordings] == [("knowledge", "named", 4)]
     assert any("wording 'named'" in note for note in table.notes)
     assert set(json.loads(table.to_json())) == {"rows", "wordings"}

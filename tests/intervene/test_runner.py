@@ -30,7 +30,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.replay.rollout import planned_of
 from probe_kit.intervene.replay.session import ReplaySession, open_session
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -180,7 +180,7 @@ def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: Interven
     path = mine.path / "interventions" / effects.key / name
     path.write_bytes(path.read_bytes()[:-3] + b"}\n ")
     with pytest.raises(RunDamagedError, match=name):
-        retention([open_run(mine.path)])
+        retention_table([open_run(mine.path)])
 
 
 def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
@@ -190,25 +190,25 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     assert stored_interventions(fewer) == []
     with pytest.raises(NoInterventionsError, match="probe-kit intervene"):
         load_effects(fewer)
-    assert all(row.follow_rate is None for row in retention([fewer]).rows)
+    assert all(row.image_swap.follow_rate is None for row in retention_table([fewer]).rows)
 
 
 # -- what retention makes of it ------------------------------------------------------------------------------
 
 
 def test_tables_show_it_beside_the_success_rate(copy: Run, effects: InterventionResult) -> None:
-    table = retention([copy])
-    assert {row.category: row.follow_rate for row in table.rows} == {
-        row.category: row.follow_rate for row in effects.effects
+    table = retention_table([copy])
+    assert {row.category: row.image_swap.follow_rate for row in table.rows} == {
+        row.category: row.follow_rate for row in effects.rows
     }
-    assert all(row.used in ("does not follow", "inconclusive") for row in table.rows)
+    assert all(row.image_swap.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
-        assert "ollow / reversal" in text
-    assert json.loads(table.to_json())[0]["used"] == table.rows[0].used
+        assert "ollows / against" in text
+    assert json.loads(table.to_json())[0]["image_swap"]["used"] == table.rows[0].image_swap.used
 
 
 def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:
-    assert "ollows" not in retention([recorded_run]).to_markdown()
+    assert "ollows" not in retention_table([recorded_run]).to_markdown()
 
 
 # -- refusing ------------------------------------------------------------------------------------------------

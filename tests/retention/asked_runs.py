@@ -1,4 +1,4 @@
-"""Asked and acting runs of outcomes made by chance, and probes whose decisions are set by hand."""
+"""VLM runs and policy runs of outcomes made by chance, and probes whose decisions are set by hand."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,7 +55,7 @@ def episodes(right: dict[str, tuple[np.ndarray, ...]], readable: float = 1.0, se
 
 
 def asked(path: Path, right: dict, model: str = "qwen3-vl", called: str = "", **ask: object) -> SaidRun:
-    """An asked run whose text is right where `right` says; its logits always say left, and debiased the truth."""
+    """A VLM run whose text is right where `right` says; its logits always say left, and debiased the truth."""
     table = episodes(right, readable=0.5, seed=1)
     left = table["side_correct"] == "left"
     table = table.assign(
@@ -73,7 +73,7 @@ def asked(path: Path, right: dict, model: str = "qwen3-vl", called: str = "", **
 
 
 def acted(path: Path, right: dict, model: str = "xiaomi-r0", source: str | None = None) -> SaidRun:
-    """An acting run."""
+    """A policy run."""
     card = {"policy": {"source": source}}
     return SaidRun(path / "acted", model, SUITE, episodes(right), {}, certificate=card)
 

@@ -10,8 +10,8 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares
 from probe_kit.intervene.store.answers import ATTENTION_FILE
 from probe_kit.intervene.store.settings import FORMAT
-from probe_kit.retention import retention
-from probe_kit.retention.displays import AttentionDisplay, attention_curve, gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import AttentionDisplay, attention_curve, collect_figures
 from probe_kit.train import ArrayRun
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
@@ -57,7 +57,7 @@ def test_it_shows_means_by_block_and_how_heads_and_iterations_differ(run: ArrayR
     labels = {line.get_label() for line in display.ax_.get_lines()}
     assert {"correct picture's tile", "other picture's tile", "its own tokens", "language"} <= labels
     assert len(attention_curve(run).axes) == 1
-    (shown,) = (one for one in gallery([run], retention([run])) if one.name.endswith("attention"))
+    (shown,) = (one for one in collect_figures([run], retention_table([run])) if one.name.endswith("attention"))
     assert "no verdict" in shown.reading
 
 
@@ -65,4 +65,4 @@ def test_without_attention_there_is_no_such_figure(run: ArrayRun) -> None:
     for draw in (lambda: attention_curve(run), lambda: AttentionDisplay.from_run(run, "color")):
         with pytest.raises(NoInterventionsError, match="--kind attention"):
             draw()
-    assert not any(one.name.endswith("attention") for one in gallery([run], retention([run])))
+    assert not any(one.name.endswith("attention") for one in collect_figures([run], retention_table([run])))

@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
-from probe_kit.retention import layer_curve, retention
+from probe_kit.retention import layer_curve, retention_table
 from probe_kit.retention.displays import (
     FinalPositionsDisplay,
     IterationMapDisplay,
@@ -27,8 +27,8 @@ from probe_kit.retention.displays import (
     RoleCurvesDisplay,
     SideTableDisplay,
     SuccessTableDisplay,
+    collect_figures,
     final_positions,
-    gallery,
     iteration_maps,
     model_depths,
     role_curves,
@@ -185,27 +185,29 @@ def test_models_are_compared_by_accuracy_above_chance_averaged_over_categories(p
 
 
 def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
+    table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     success = SuccessTableDisplay.from_table(table)
     assert success.columns == ("color", "shape", "mean")
     assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
     assert [cell.bold for cell in success.cells[0]] == [True, True, False], "0.6 is above 0.5 + Δ = 0.569"
     row = table.rows[0]
-    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.sr_left, row.sr_right)
+    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
-    assert color.values == (row.retention_bounded, row.retention)
+    assert color.values == (row.retention.bounded, row.retention.published)
     assert shape.values == (None, None), "no backbone signal"
 
 
 def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
-    display = RetentionTableDisplay.from_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})])).plot()
+    display = RetentionTableDisplay.from_table(
+        retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
+    ).plot()
     texts = [text.get_text() for text in display.ax_.texts]
     bounded, published = display.cells[0][0].values
     assert texts[:4] == [f"{bounded:.2f}", f"{published:.2f}", "–", "–"]
 
 
 def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_table: Any) -> None:
-    table = retention([placed_run(tmp_path, outcome_table)])
+    table = retention_table([placed_run(tmp_path, outcome_table)])
     with pytest.raises(UsageError, match="no rows"):
         RetentionTableDisplay.from_table(table)
     with pytest.raises(UsageError, match="no run that acted has probes"):
@@ -224,7 +226,7 @@ def test_black_text_is_readable_on_every_heat_colour(value: float) -> None:
 
 
 def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
+    table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     display = KnowledgeActionDisplay.from_table(table)
     assert [(p.category, p.accuracy, p.sr, p.significant) for p in display.points] == [
         ("color", 0.9, 0.6, True),
@@ -285,14 +287,14 @@ def test_final_positions_need_positions_and_a_scene(tmp_path: Path, outcome_tabl
         FinalPositionsDisplay.from_run(placed_run(tmp_path, outcome_table), "shape")
 
 
-# -- gallery ---------------------------------------------------------------------------------------------------
+# -- collect_figures -----------------------------------------------------------------------------------------
 
 
 def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: ProbedRun, tmp_path: Path) -> None:
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
-    saved = list(save_figures(gallery([run], retention([run])), tmp_path / "figures"))
+    saved = list(save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"))
     assert [path.stem for path in saved] == [
-        "success", "sides", "knowledge-action", "retention", "pi0-paired-layouts", "pi0-layer-curves",
+        "success", "sides", "retention", "knowledge-action", "pi0-paired-layouts", "pi0-layer-curves",
         "pi0-iteration-maps",
     ]  # fmt: skip
     assert all(path.stat().st_size > 5000 and path.with_suffix(".pdf").is_file() for path in saved)
@@ -301,6 +303,6 @@ def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: Pr
 
 def test_runs_whose_folders_have_one_name_get_figures_of_their_own(tmp_path: Path, outcome_table: Any) -> None:
     runs = [placed_run(tmp_path / study / "run", outcome_table) for study in "abc"]
-    names = [exhibit.name for exhibit in gallery(runs, retention(runs))]
+    names = [exhibit.name for exhibit in collect_figures(runs, retention_table(runs))]
     assert len(set(names)) == len(names)
     assert {"run-final-positions", "run-2-final-positions", "run-3-final-positions"} <= set(names)

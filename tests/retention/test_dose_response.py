@@ -9,8 +9,8 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.store.settings import FORMAT
-from probe_kit.retention import retention
-from probe_kit.retention.displays import DoseResponseDisplay, dose_response, gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import DoseResponseDisplay, collect_figures, dose_response
 from probe_kit.train import ArrayRun
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
@@ -61,7 +61,7 @@ def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: Array
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert {"all episodes", "pushed to the left", "pushed to the right"} <= set(labels)
     assert len(display.ax_.collections) == 1
-    names = [exhibit.name for exhibit in gallery([run], retention([run]))]
+    names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any(name.endswith("doses") for name in names)
     assert len(dose_response(run).axes) == 1
 
@@ -70,7 +70,7 @@ def test_without_a_steering_there_is_no_such_figure(run: ArrayRun) -> None:
     for draw in (lambda: dose_response(run), lambda: DoseResponseDisplay.from_run(run, "color")):
         with pytest.raises(NoInterventionsError, match="--kind steer"):
             draw()
-    assert not any(exhibit.name.endswith("doses") for exhibit in gallery([run], retention([run])))
+    assert not any(exhibit.name.endswith("doses") for exhibit in collect_figures([run], retention_table([run])))
     steered(run)
     with pytest.raises(NoInterventionsError, match=r"it has it at backbone\.01 image"):
         DoseResponseDisplay.from_run(run, "color", "backbone.02 image")

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit.errors import UsageError
-from probe_kit.retention import RetentionTable, layer_curve, retention
+from probe_kit.retention import RetentionTable, layer_curve, retention_table
 from probe_kit.retention.displays import (
     IterationMapDisplay,
     LayerCurveDisplay,
     ModelDepthDisplay,
-    gallery,
+    collect_figures,
     save_figures,
 )
 from probe_kit.retention.displays.base.style import FILLED, OPEN
@@ -75,8 +75,8 @@ def drawn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
             in_two_views(probed_run(names, "pi0-with-a-rather-long-name", random_weights=True)),
             in_two_views(probed_run(names, "smolvla", suite="another-suite-with-a-name@1.0.0#ba9876543210")),
         ]
-    table = retention(runs)
-    return table, {exhibit.name: exhibit.draw() for exhibit in gallery(runs, table)}
+    table = retention_table(runs)
+    return table, {exhibit.name: exhibit.draw() for exhibit in collect_figures(runs, table)}
 
 
 def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Drawn) -> None:
@@ -95,13 +95,13 @@ def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Dr
                 assert frame.x0 <= box.x0 < box.x1 <= frame.x1, f"{name}: legend"
                 assert frame.y0 <= box.y0 < box.y1 <= frame.y1, f"{name}: legend"
         assert "\n" not in figure.get_supxlabel(), name
-        suites = {row.suite for row in table.rows}
+        suites = {row.run.suite for row in table.rows}
         assert any(suite in figure.caption for suite in suites), name  # type: ignore[attr-defined]
 
 
 def test_saved_pixels_are_fit_for_print_and_carry_their_caption(probed_run: ProbedRun, tmp_path: Path) -> None:
     run = probed_run({"color": SIGNAL})
-    for path in save_figures(gallery([run], retention([run])), tmp_path / "figures"):
+    for path in save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"):
         with Image.open(path) as picture:
             assert picture.info["dpi"] == pytest.approx((300, 300), abs=0.1)
             assert "settings" in picture.text["Description"]  # type: ignore[attr-defined]
@@ -142,8 +142,8 @@ def test_iterations_choose_the_lines_in_figures_as_they_do_in_tables(
 def test_the_figures_of_a_table_show_the_iterations_of_the_table(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     for iterations, wanted in (("all", 4), ("best", 0), ("last", 0), (2, 0)):
-        table = retention([run], iterations=iterations)  # type: ignore[arg-type]
-        (curves,) = [exhibit for exhibit in gallery([run], table) if exhibit.name == "pi0-layer-curves"]
+        table = retention_table([run], iterations=iterations)  # type: ignore[arg-type]
+        (curves,) = [exhibit for exhibit in collect_figures([run], table) if exhibit.name == "pi0-layer-curves"]
         with curves.drawn() as figure:
             labels = [label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]]
             assert sum(label.startswith("iteration") for label in labels) == wanted
@@ -269,10 +269,10 @@ def test_tables_of_colours_have_a_key(probed_run: ProbedRun) -> None:
     from probe_kit.retention.report import report_html
 
     run = probed_run({"color": SIGNAL})
-    table = retention([run])
+    table = retention_table([run])
     page = report_html([run], table)
     assert page.count('<p class="key">') == 2
-    for exhibit in gallery([run], table):
+    for exhibit in collect_figures([run], table):
         if exhibit.is_table:
             with exhibit.drawn() as figure:
                 assert [len(legend.get_patches()) for legend in figure.legends] == [5], exhibit.name

@@ -16,7 +16,7 @@ from probe_kit.retention import (
     RetentionTable,
     layer_curve,
     measure_retention,
-    retention,
+    retention_table,
 )
 from probe_kit.retention.displays import LayerCurveDisplay
 from probe_kit.retention.estimators.bootstrap_draws import average, probe_estimates, sr_estimate
@@ -24,7 +24,7 @@ from probe_kit.retention.estimators.combined import area_fit, bounded_fit
 from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
-from probe_kit.train.controls.fit_controls import add_twin
+from probe_kit.train.controls.fit_controls import add_untrained
 
 ProbedRun = Callable[..., ArrayRun]
 PERFECT = ([1.0, 1.0], [[1.0, 1.0]])
@@ -46,21 +46,24 @@ def table(request: pytest.FixtureRequest, probed_run: ProbedRun) -> RetentionTab
     """A run of the world against an equal one and against a good one."""
     world = WORLDS[request.param]
     runs = {name: [probed_run(world, name)] for name in ("one", "again")}
-    return retention({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), "other")]})
+    return retention_table({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), "other")]})
 
 
 def intervals(rows: Sequence[RetentionRow] | Sequence[Difference]) -> Iterator[tuple[str, float, float, float]]:
     """Name, value and limits of every interval that has any; unbounded ones are an answer of their own."""
-    values = {"prefix_ci": "prefix_accuracy", "action_ci": "action_accuracy"}
+    values = {
+        "backbone_ci": "backbone_accuracy", "action_ci": "action_accuracy",
+        "success": "sr", "backbone": "accuracy", "action": "accuracy", "retention": "debiased",
+    }  # fmt: skip
     for row in rows:
         fields = asdict(row)
-        for name, limits in fields.items():
-            if not name.endswith("_ci") or limits is None or limits == (None, None):
-                continue
-            of = values.get(name, name.removesuffix("_ci"))
-            if of == "retention":
-                of = "retention_debiased" if "retention_debiased" in fields else of
-            yield f"{row.category} {name}", fields[of], *limits
+        parts = [("", fields), *((name, part) for name, part in fields.items() if isinstance(part, dict))]
+        for part, inner in parts:
+            for name, limits in inner.items():
+                if not (name == "ci" or name.endswith("_ci")) or limits is None or limits == (None, None):
+                    continue
+                of = values[part] if name == "ci" else values.get(name, name.removesuffix("_ci"))
+                yield f"{row.category} {part}.{name}", inner[of], *limits
 
 
 def test_no_interval_is_without_width_and_each_holds_its_number(table: RetentionTable) -> None:
@@ -73,12 +76,12 @@ def test_no_interval_is_without_width_and_each_holds_its_number(table: Retention
 
 def test_one_number_has_one_interval_in_rows_scores_and_curves(table: RetentionTable) -> None:
     for row in table.rows:
-        results = table.results[row.run]
+        results = table.results[row.run.location]
         scores = results.scores[results.scores["category"] == row.category]
         display = LayerCurveDisplay.from_results(results, row.category)
         for stream, layer, step, limits in (
-            ("backbone", row.prefix_layer, None, row.prefix_ci),
-            ("expert", row.action_layer, row.action_iteration, row.action_ci),
+            ("backbone", row.backbone.layer, None, row.backbone.ci),
+            ("expert", row.action.layer, row.action.iteration, row.action.ci),
         ):
             site = scores[(scores["stream"] == stream) & (scores["layer"] == layer)]
             site = site if step is None else site[site["iteration"] == step]
@@ -92,10 +95,10 @@ def test_a_mean_is_as_wide_as_its_only_category_and_never_wider_known_than_its_p
     table: RetentionTable,
 ) -> None:
     for mean in table.means:
-        own = [row for row in table.rows if row.run == mean.run]
-        for name in ("sr_ci", "prefix_ci", "action_ci", "retention_ci"):
-            parts = [getattr(row, name) for row in own if name != "retention_ci" or row.retention_defined]
-            limits = getattr(mean, name)
+        own = [row for row in table.rows if row.run.location == mean.run.location]
+        for name in ("success", "backbone", "action", "retention"):
+            parts = [getattr(row, name).ci for row in own if name != "retention" or row.retention.defined]
+            limits = getattr(mean, name).ci
             if len(parts) == 1:
                 assert limits == parts[0], name
             elif parts and (None, None) in parts:
@@ -106,11 +109,11 @@ def test_a_mean_is_as_wide_as_its_only_category_and_never_wider_known_than_its_p
 
 
 def test_a_mean_of_equal_categories_without_variance_has_a_width(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": PERFECT, "shape": PERFECT})])
+    table = retention_table([probed_run({"color": PERFECT, "shape": PERFECT})])
     (mean,) = table.means
-    low, high = mean.prefix_ci  # type: ignore[misc]
-    assert (mean.prefix_accuracy, high) == (1.0, 1.0)
-    assert table.rows[0].prefix_ci[0] < low < 0.99, "two categories are known better than one"  # type: ignore[index]
+    low, high = mean.backbone.ci  # type: ignore[misc]
+    assert (mean.backbone.accuracy, high) == (1.0, 1.0)
+    assert table.rows[0].backbone.ci[0] < low < 0.99, "two categories are known better than one"  # type: ignore[index]
 
 
 @pytest.mark.parametrize(("value", "count"), [*product([0.0, 0.25, 0.5, 1.0], [1, 2, 12, 150])])
@@ -126,7 +129,7 @@ def test_groups_that_agree_have_an_interval_that_narrows_with_their_number(value
 def test_a_twin_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": PERFECT}, "one"))
     twin = load_results(probed_run({"color": HOPELESS}, "twin", random_weights=True))
-    for score in add_twin(results, twin).controls.twin:
+    for score in add_untrained(results, twin).controls.untrained:
         assert -1 <= score.ci[0] <= score.difference <= score.ci[1] <= 1
         assert score.ci[1] - score.ci[0] > 1e-3
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
-from probe_kit.retention.columns.known_used_table import join_tables
+from probe_kit.retention.columns.known_used_table import known_used_tables
 from probe_kit.retention.compare.known_used import match_runs
-from probe_kit.retention.displays import KnownUsedDisplay, gallery
+from probe_kit.retention.displays import KnownUsedDisplay, collect_figures
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
@@ -36,12 +36,12 @@ def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
 def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Path) -> None:
     reader, policy = pair(tmp_path)
     runs = [reader, policy]
-    table = retention(runs)  # type: ignore[arg-type]
+    table = retention_table(runs)  # type: ignore[arg-type]
     (joined,) = joins_of(runs, table).found  # type: ignore[arg-type]
-    assert [one.name for one in gallery(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
+    assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
     page = report_html(runs, table)  # type: ignore[arg-type]
     section = page.split('<section id="join">')[1].split("</section>")[0]
-    for plain in join_tables(joined):
+    for plain in known_used_tables(joined):
         assert plain.title in section
         for cells in plain.cells:
             assert all(f">{cell}<" in section for cell in cells if "[" not in cell)
@@ -52,7 +52,7 @@ def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_pa
     reader, policy = pair(tmp_path)
     policy.episodes["first_frame_sha256"] = "other"
     runs = [reader, policy]
-    table = retention(runs)  # type: ignore[arg-type]
+    table = retention_table(runs)  # type: ignore[arg-type]
     found = joins_of(runs, table)  # type: ignore[arg-type]
     assert found.found == ()
     assert "begin with another frame" in found.refused[0]

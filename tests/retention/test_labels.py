@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.train import ArrayRun
 
 
@@ -13,14 +13,14 @@ def test_runs_of_one_name_are_told_apart(probed_run: Callable[..., ArrayRun], tm
     one = probed_run({"color": ([0.5, 0.8], [[0.6]])})
     features = {key: np.ones_like(values) for key, values in one.features.items()}
     other = ArrayRun(tmp_path / "other", one.model, one.suite, one.episodes, features)
-    table = retention([one, other])
-    labels = {row.label for row in table.rows}
+    table = retention_table([one, other])
+    labels = {row.run.label for row in table.rows}
     assert len(labels) == 2
     assert all(label.startswith("pi0 · ") for label in labels)
-    assert {row.model for row in table.rows} == {"pi0"}
+    assert {row.run.model for row in table.rows} == {"pi0"}
     assert all(label in table.to_markdown() for label in labels)
 
 
 def test_a_run_alone_keeps_its_name(probed_run: Callable[..., ArrayRun]) -> None:
-    table = retention([probed_run({"color": ([0.5, 0.8], [[0.6]])})])
-    assert {row.label for row in (*table.rows, *table.means)} == {"pi0"}
+    table = retention_table([probed_run({"color": ([0.5, 0.8], [[0.6]])})])
+    assert {row.run.label for row in (*table.rows, *table.means)} == {"pi0"}

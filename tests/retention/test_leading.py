@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import HtmlTable, behaviour_table, retention_table
+from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report.summaries import read_row, summarise
 from probe_kit.train import ArrayRun
 
@@ -21,11 +21,10 @@ FURTHER = ("area", "debiased", "published")
 @pytest.fixture
 def table(probed_run: ProbedRun) -> RetentionTable:
     runs = [probed_run({"color": TIED}, name) for name in ("one", "other")]
-    return retention({"first": [runs[0]], "second": [runs[1]]})
+    return retention_table({"first": [runs[0]], "second": [runs[1]]})
 
 
-def headings(table: HtmlTable | None) -> str:
-    assert table is not None
+def headings(table: HtmlTable) -> str:
     return " | ".join(column.name for column in table.columns).replace("\u00a0", " ")
 
 
@@ -37,13 +36,12 @@ def console(table: RetentionTable) -> str:
 
 def every_form(table: RetentionTable) -> dict[str, str]:
     """Text from the retention table on, by form; the one of a page is its headings and cells."""
-    html = retention_table(table.all_rows, table.differences)
-    assert html is not None
+    html = next(one for one in html_tables(table.all_rows, table.differences) if one.title == "Retention")
     cells = " | ".join(cell.text for cell in html.body[0])
     return {
         "console": console(table).split("Retention, view")[1],
         "markdown": table.to_markdown().split("**Retention")[1],
-        "latex": table.to_latex().split(r"\toprule")[1],
+        "latex": table.to_latex().split(r"\caption{Retention")[1],
         "page": f"{headings(html)}\n{cells}",
     }
 
@@ -66,7 +64,7 @@ def test_every_table_names_the_call_the_first_iteration_and_ties(table: Retentio
 
 def test_ties_stand_in_the_row_and_in_the_reading(table: RetentionTable) -> None:
     row = table.rows[0]
-    assert (row.prefix_ties, row.action_ties) == (1, 2)
+    assert (row.backbone.ties, row.action.ties) == (1, 2)
     words = " ".join(read_row(row))
     assert "and at 1 other site as well" in words
     assert "and at 2 other sites as well" in words
@@ -74,11 +72,11 @@ def test_ties_stand_in_the_row_and_in_the_reading(table: RetentionTable) -> None
 
 def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable) -> None:
     row = table.rows[0]
-    assert row.delta is not None
-    assert row.delta_regime is not None
-    assert row.delta < row.delta_regime
-    deciding, papers = f"{100 * row.delta_regime:.1f}", f"{100 * row.delta:.1f}"
-    page = behaviour_table(table.all_rows)
+    assert row.success.chance_margin_episodes is not None
+    assert row.success.chance_margin is not None
+    assert row.success.chance_margin_episodes < row.success.chance_margin
+    deciding, papers = f"{100 * row.success.chance_margin:.1f}", f"{100 * row.success.chance_margin_episodes:.1f}"
+    page = html_tables(table.all_rows)[0]
     texts = {
         "console": console(table),
         "markdown": table.to_markdown(),
@@ -91,9 +89,9 @@ def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable)
 
 def test_the_summary_quotes_bounded_retention(table: RetentionTable) -> None:
     rows = [row for row in table.all_rows if row.group == "first"]
-    bounded = rows[-1].retention_bounded
+    bounded = rows[-1].retention.bounded
     assert bounded is not None
-    assert bounded != rows[-1].retention_debiased
+    assert bounded != rows[-1].retention.debiased
     headline = summarise(rows).headlines[-1]
     assert (headline.name, headline.value) == ("retention, bounded", f"{bounded:.2f}")
 
@@ -102,7 +100,8 @@ def test_differences_hold_all_three_estimates_and_the_call(table: RetentionTable
     (row, _) = table.differences
     assert isinstance(row, Difference)
     first, second = (one for one in table.rows if one.category == "color")
-    for name in ("retention_bounded", "retention_area"):
-        assert getattr(row, name) == pytest.approx(getattr(first, name) - getattr(second, name))
-        assert getattr(row, f"{name}_ci") is not None
+    for name in ("bounded", "area"):
+        one, other = (getattr(side.retention, name) for side in (first, second))
+        assert getattr(row, f"retention_{name}") == pytest.approx(one - other)
+        assert getattr(row, f"retention_{name}_ci") is not None
     assert row.call == 0

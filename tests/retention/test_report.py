@@ -17,10 +17,10 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
-from probe_kit.retention import RetentionTable, retention
-from probe_kit.retention.columns.glossary import GLOSSARY
-from probe_kit.retention.displays.report_figures import gallery
-from probe_kit.retention.formats.html import behaviour_table, control_table, retention_table
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.columns.glossary import glossary
+from probe_kit.retention.displays.report_figures import collect_figures
+from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.provenance import citation
@@ -129,24 +129,29 @@ print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name
     assert loaded.stdout.strip() == "[]"
 
 
+def titled(rows: Any, title: str) -> HtmlTable | None:
+    return next((one for one in html_tables(rows) if one.title == title), None)
+
+
 # -- tables and words ------------------------------------------------------------------------------------------
 
 
 def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL, "shape": NOISE})])
-    made = behaviour_table(table.all_rows)
+    table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
+    made = titled(table.all_rows, "Success rate")
+    assert made is not None
     assert [column.name for column in made.columns][:2] == ["category", "SR\u00a0% [95\u00a0%]"], (
         "one run: no model"
     )
     success = made.body[0][1]
-    assert success.sort == table.rows[0].sr == 0.6
+    assert success.sort == table.rows[0].success.sr == 0.6
     assert success.text.startswith("60.0 [")
     assert success.strong
     assert [row[0].text for row in made.foot] == ["mean"]
 
 
 def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
-    made = retention_table(retention([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows)
+    made = titled(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows, "Retention")
     assert made is not None
     position = [column.name for column in made.columns].index("bounded [95\u00a0%]")
     color, shape = (row[position] for row in made.body)
@@ -155,25 +160,24 @@ def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probe
 
 
 def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL})])
+    table = retention_table([probed_run({"color": SIGNAL})])
     leaking = {"baselines": {"pixels": 0.8}, "leaks": ("pixels",)}
-    rows = [replace(row, **leaking) for row in table.all_rows]
-    made = control_table(rows)
+    rows = [replace(row, controls=replace(row.controls, **leaking)) for row in table.all_rows]
+    made = titled(rows, "Controls")
     assert made is not None
     assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.body[0])
     assert any("pixels" in warning for warning in summarise(rows).warnings)
-    assert control_table(table.all_rows) is None
+    assert titled(table.all_rows, "Controls") is None
 
 
 def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
-    rows = retention([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
-    for made in (behaviour_table(rows), retention_table(rows)):
-        assert made is not None
+    rows = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
+    for made in html_tables(rows):
         assert all(len(column.explanation) > 10 for column in made.columns)
 
 
 def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL, "shape": NOISE, "time": SIGNAL})])
+    table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE, "time": SIGNAL})])
     summary = summarise(table.all_rows)
     words = " ".join(summary.sentences)
     assert "60.0 % of episodes" in words
@@ -185,8 +189,8 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
 
 
 def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
-    beats = {"chance": True, "binding": False, "twin": False}
-    both = "an untrained conjunction of pictures and words or its twin"
+    beats = {"chance": True, "binding": False, "untrained": False}
+    both = "an untrained conjunction of pictures and words or the untrained network"
     assert _clear_words(0.01, beats) == f"above chance but no better than {both}, p = 0.010"
     assert _clear_words(0.6, beats | {"chance": False}) == f"not above chance nor better than {both}, p = 0.600"
     assert _clear_words(0.6, {"chance": False, "binding": None}) == "not above chance, p = 0.600"
@@ -200,13 +204,13 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
     curves = {place: curve for place, curve in results.curves.items() if place[0] == "color"}
     some = replace(results, settings=only, curves=curves, controls=Controls())
     save_results(some, run.path)
-    table = retention([run])
-    note = {row.category: row.retention_note for row in table.rows}
+    table = retention_table([run])
+    note = {row.category: row.retention.note for row in table.rows}
     assert note["shape"] == f"n/a (probes {some.key} are of color)"
     assert f"1 left out: probes {some.key} are of color)" in " ".join(summarise(table.all_rows).sentences)
     untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
     save_results(replace(results, settings=replace(results.settings, seed=2), curves=untested), run.path)
-    summary = summarise(retention([run]).all_rows)
+    summary = summarise(retention_table([run]).all_rows)
     assert "Retention is not defined: no permutations." in summary.sentences
     assert summary.headlines[-1].gloss == "no permutations"
 
@@ -214,16 +218,18 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
 def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: ProbedRun) -> None:
     """A caption that asks for chance alone calls an untrained conjunction evidence."""
     runs = [probed_run({"color": SIGNAL, "shape": NOISE}, name) for name in ("one", "other")]
-    table = retention(runs)
-    said = [one.reading for one in gallery(runs, table) if one.subject == "probes"]
+    table = retention_table(runs)
+    said = [one.reading for one in collect_figures(runs, table) if one.subject == "probes"]
     marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
     assert len(marked) > 4
     assert all("every control" in reading for reading in marked)
-    assert "every control" in GLOSSARY["n/a"]
+    assert "every control" in glossary()["n/a"]
 
 
 def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:
-    table: RetentionTable = retention([plain_run(tmp_path, outcome_table(0, 2, 10).assign(never_moved=True))])
+    table: RetentionTable = retention_table(
+        [plain_run(tmp_path, outcome_table(0, 2, 10).assign(never_moved=True))]
+    )
     (warning,) = summarise(table.all_rows).warnings
     assert "does not grasp" in warning
 
@@ -235,7 +241,7 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
 
 
 def test_the_glossary_has_a_sentence_for_every_word() -> None:
-    assert all(meaning.endswith(".") for meaning in GLOSSARY.values())
+    assert all(meaning.endswith(".") for meaning in glossary().values())
 
 
 # -- episodes --------------------------------------------------------------------------------------------------

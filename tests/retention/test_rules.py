@@ -15,8 +15,8 @@ from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
 from probe_kit.extract.store.format.trajectories import Trajectories
-from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention, success_rate
-from probe_kit.retention.displays import gallery
+from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention_table, success_rate
+from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.statistics.bootstrap import bootstrap_means, bootstrap_ratios
@@ -46,32 +46,52 @@ def test_doing_nothing_scores_a_half_by_the_released_rule_and_nothing_by_the_oth
     assert result.exit_code == 0
     rows = json.loads(result.stdout)
     for row in rows:
-        assert (row["rule"], row["sr"], row["sr_idle"]) == (rule, sr, sr)
-        assert row["sr_by_rule"] == {"disc": 0.0, "box": 0.5, "released-on-tile": 0.0}
-        assert (row["n_grasped"], row["sr_grasped"]) == (4, sr)
-        assert row["behaviour"]["moved"] == row["behaviour"]["first_choice_made"] == 0
+        assert (row["rules"]["rule"], row["success"]["sr"], row["rules"]["sr_idle"]) == (rule, sr, sr)
+        assert row["rules"]["sr_by_rule"] == {"disc": 0.0, "box": 0.5, "released-on-tile": 0.0}
+        assert (row["rules"]["n_grasped"], row["rules"]["sr_grasped"]) == (4, sr)
+        assert row["rules"]["behaviour"]["moved"] == row["rules"]["behaviour"]["first_choice_made"] == 0
     if rule == "box":
-        assert (rows[0]["sr_left"], rows[0]["sr_right"], rows[0]["p_answered"]) == (0, 1, 1)
-        assert (rows[0]["p_answers_unmoved"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (1, "right", 0.5)
+        assert (
+            rows[0]["success"]["sr_left"],
+            rows[0]["success"]["sr_right"],
+            rows[0]["rules"]["share_answered"],
+        ) == (0, 1, 1)
+        assert (
+            rows[0]["rules"]["share_unmoved_answers"],
+            rows[0]["rules"]["idle_side"],
+            rows[0]["rules"]["sr_answered"],
+        ) == (
+            1,
+            "right",
+            0.5,
+        )
     else:
-        assert (rows[0]["p_answers_unmoved"], rows[0]["idle_side"], rows[0]["sr_answered"]) == (None, "none", None)
+        assert (
+            rows[0]["rules"]["share_unmoved_answers"],
+            rows[0]["rules"]["idle_side"],
+            rows[0]["rules"]["sr_answered"],
+        ) == (
+            None,
+            "none",
+            None,
+        )
 
 
 def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
     for rule, why in (("box", "already lies in the zone of the right picture"), ("disc", "lies in neither zone")):
-        table = retention([idle], rule=rule)
+        table = retention_table([idle], rule=rule)
         share = "50.0" if rule == "box" else "0.0"
         sentence = f"a policy that does nothing would score {share} %, as the untouched cube {why}"
-        assert sentence in rule_sentence(table.means[0])
+        assert sentence in rule_sentence(table.means[0].rules)
         for text in (table.to_markdown(), table.to_latex().replace(r"\%", "%"), report_html([idle], table)):
             assert sentence in text
-            assert f"outcome rule {rule}" in text
+            assert f"utcome rule {rule}" in text
 
 
 def test_the_mean_over_the_last_steps_is_an_option_of_the_rule(idle: Run) -> None:
-    row = retention([idle], rule="box", last_steps=11).rows[0]
-    assert (row.sr, row.last_steps) == (0.5, 11)
-    assert "mean of the last 11 control steps (all, where there are fewer)" in rule_sentence(row)
+    row = retention_table([idle], rule="box", last_steps=11).rows[0]
+    assert (row.success.sr, row.rules.last_steps) == (0.5, 11)
+    assert "mean of the last 11 control steps (all, where there are fewer)" in rule_sentence(row.rules)
 
 
 def test_shares_of_an_episode_count_as_shares() -> None:
@@ -80,7 +100,7 @@ def test_shares_of_an_episode_count_as_shares() -> None:
     episodes["share_wrong"] = [0, 0.5, 1, 1, 0, 0, 0, 0]
     episodes["share_oob"] = 1 - episodes["share_correct"] - episodes["share_wrong"]
     found = success_rate(episodes)
-    assert (found.sr, found.p_wrong, found.p_oob) == (0.25, 0.3125, 0.4375)
+    assert (found.sr, found.share_wrong, found.share_outside) == (0.25, 0.3125, 0.4375)
     assert found.ci[0] < 0.25 < found.ci[1]
     assert (found.paired.both, found.paired.both_wrong) == (1, 1)
 
@@ -105,7 +125,7 @@ def test_a_table_with_its_report_reads_every_trajectory_once(idle: Run, monkeypa
         return at(trajectories, position)
 
     monkeypatch.setattr(Trajectories, "__getitem__", counted)
-    table = retention([run], rule="box")
+    table = retention_table([run], rule="box")
     report_html([run], table)
     OutcomeRulesDisplay.from_runs([run])
     assert read == dict.fromkeys(range(4), 1)
@@ -125,7 +145,7 @@ def test_rules_stand_side_by_side_on_the_same_episodes(idle: Run) -> None:
 
 
 def test_figures_follow_the_rule_of_the_table(idle: Run) -> None:
-    names = {exhibit.name: exhibit for exhibit in gallery([idle], retention([idle], rule="box"))}
+    names = {exhibit.name: exhibit for exhibit in collect_figures([idle], retention_table([idle], rule="box"))}
     assert "outcome-rules" in names
     with names["run-final-positions"].drawn() as figure:
         assert any("2 right · 2 wrong · 0 out" in axes.get_xlabel() for axes in figure.axes)
@@ -136,24 +156,29 @@ def test_figures_follow_the_rule_of_the_table(idle: Run) -> None:
 
 def test_a_run_without_trajectories_has_no_rate_by_other_rules(tmp_path: Path) -> None:
     run = ArrayRun(tmp_path / "old", "old", "suite@1#0123456789ab", outcomes(6, 2, 4), {})
-    table = retention([run], rule="box")
+    table = retention_table([run], rule="box")
     row = table.rows[0]
-    assert (row.sr, row.regime, row.sr_by_rule, row.n_episodes) == (None, None, {}, 12)
-    assert json.loads(table.to_json())[0]["sr"] is None
+    assert (row.success.sr, row.success.regime, row.rules.sr_by_rule, row.success.n_episodes) == (
+        None,
+        None,
+        {},
+        12,
+    )
+    assert json.loads(table.to_json())[0]["success"]["sr"] is None
     assert "n/a" in table.to_markdown()
     assert any("keeps no trajectories" in note for note in table.notes)
-    assert retention([run]).rows[0].sr == 0.5
-    assert retention([run]).rows[0].sr_answered == 0.75
-    assert gallery([run], table) == []
+    assert retention_table([run]).rows[0].success.sr == 0.5
+    assert retention_table([run]).rows[0].rules.sr_answered == 0.75
+    assert collect_figures([run], table) == []
     with pytest.raises(NoTrajectoryError, match="groups cannot be compared by the rule box"):
-        retention({"a": [run]}, rule="box")
+        retention_table({"a": [run]}, rule="box")
 
 
 def test_radii_belong_to_the_disc(idle: Run) -> None:
-    assert retention([idle], rule="box").rows[0].sr_by_epsilon == {}
-    assert retention([idle]).rows[0].sr_by_epsilon
+    assert retention_table([idle], rule="box").rows[0].rules.sr_by_epsilon == {}
+    assert retention_table([idle]).rows[0].rules.sr_by_epsilon
     with pytest.raises(UsageError, match="belong to the outcome rule disc"):
-        retention([idle], rule="box", epsilons=(0.05,))
+        retention_table([idle], rule="box", epsilons=(0.05,))
     for options in (["--rule", "box", "--epsilons", "0.05"], ["--rule", "boxx"], ["--last-steps", "0"]):
         assert CliRunner().invoke(app, ["retention", "nowhere", *options]).exit_code == 2
 

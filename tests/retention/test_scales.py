@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from probe_kit.retention import IterationMapDisplay, LayerCurveDisplay, RoleCurvesDisplay, retention
+from probe_kit.retention import IterationMapDisplay, LayerCurveDisplay, RoleCurvesDisplay, retention_table
 from probe_kit.retention.displays import (
+    collect_figures,
     curves_side_by_side,
-    gallery,
     iteration_maps,
     layer_curve,
     maps_side_by_side,
@@ -95,7 +95,7 @@ def test_depth_and_knowledge_have_fixed_axes(
 ) -> None:
     assert limits(model_depths([guessed])) == limits(model_depths([known, guessed])) == {(-30.0, 51.0)}
     for accuracies in (KNOWS, GUESSES):
-        table = retention([probed_run({"color": accuracies}, "again")])
+        table = retention_table([probed_run({"color": accuracies}, "again")])
         axes = KnowledgeActionDisplay.from_table(table).plot().ax_
         assert axes is not None
         assert axes.get_xlim() == axes.get_ylim() == (-2, 102)
@@ -128,10 +128,10 @@ def test_side_by_side_every_run_has_a_line_and_a_map_of_its_own(
 
 def test_the_gallery_of_several_runs_names_each_apart(probed_run: ProbedRun) -> None:
     runs = [probed_run({"color": KNOWS}, "pi0"), probed_run({"color": GUESSES}, "twin", random_weights=True)]
-    shown = {exhibit.name: exhibit for exhibit in gallery(runs, retention(runs))}
+    shown = {exhibit.name: exhibit for exhibit in collect_figures(runs, retention_table(runs))}
     assert {"curves-side-by-side", "maps-side-by-side", "model-depths"} <= set(shown)
     assert not {"curves-side-by-side", "maps-side-by-side"} & {
-        one.name for one in gallery(runs[:1], retention(runs[:1]))
+        one.name for one in collect_figures(runs[:1], retention_table(runs[:1]))
     }
     with shown["model-depths"].drawn() as figure:
         labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}

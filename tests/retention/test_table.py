@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
@@ -16,78 +16,100 @@ SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
 WEAK = ([0.5, 0.8, 0.6], [[0.5, 0.8]])
 NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
 CONTRACT_KEYS = {
-    "model", "category", "view", "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "p_wrong", "p_oob",
-    "delta", "regime", "chance", "prefix_accuracy", "prefix_layer", "action_accuracy", "action_layer",
-    "action_iteration", "retention", "retention_debiased", "retention_ci", "prefix_p_fwe", "gap",
+    "run": {"model", "mode", "suite"},
+    "success": {
+        "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "share_wrong", "share_outside",
+        "chance_margin_episodes", "regime",
+    },
+    "backbone": {"accuracy", "layer", "p_fwe"},
+    "action": {"accuracy", "layer", "iteration"},
+    "retention": {"published", "debiased", "ci"},
+    "controls": {"chance", "probe_minus_sr"},
 }  # fmt: skip
 
 
 @pytest.fixture
 def table(probed_run: ProbedRun) -> RetentionTable:
-    return retention([probed_run({"color": SIGNAL, "shape": WEAK, "counting": NONE})])
+    return retention_table([probed_run({"color": SIGNAL, "shape": WEAK, "counting": NONE})])
 
 
 def test_a_row_joins_behaviour_peaks_and_retention(table: RetentionTable) -> None:
     row = table.rows[0]
-    assert (row.category, row.view, row.n_episodes, row.n_items, row.n_groups) == ("color", "mean", 200, 100, 100)
-    assert (row.sr, row.p_wrong, row.p_oob) == (0.6, 0.3, 0.1)
-    assert (row.prefix_accuracy, row.prefix_layer, row.prefix_depth) == (0.9, 1, 0.5)
-    assert (row.action_accuracy, row.action_layer, row.action_iteration) == (0.7, 1, 0)
-    assert row.retention == pytest.approx(0.5)
-    assert row.gap == pytest.approx(0.3)
+    assert (row.category, row.view, row.success.n_episodes, row.success.n_items, row.controls.n_groups) == (
+        "color",
+        "mean",
+        200,
+        100,
+        100,
+    )
+    assert (row.success.sr, row.success.share_wrong, row.success.share_outside) == (0.6, 0.3, 0.1)
+    assert (row.backbone.accuracy, row.backbone.layer, row.backbone.depth) == (0.9, 1, 0.5)
+    assert (row.action.accuracy, row.action.layer, row.action.iteration) == (0.7, 1, 0)
+    assert row.retention.published == pytest.approx(0.5)
+    assert row.controls.probe_minus_sr == pytest.approx(0.3)
 
 
 def test_the_mean_averages_ratios_and_names_the_categories_left_out(table: RetentionTable) -> None:
     (mean,) = table.means
-    assert mean.retention == pytest.approx((0.2 / 0.4 + 0.3 / 0.3) / 2)
-    assert mean.prefix_accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
+    assert mean.retention.published == pytest.approx((0.2 / 0.4 + 0.3 / 0.3) / 2)
+    assert mean.backbone.accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
     assert mean.categories == ("color", "shape", "counting")
     assert mean.left_out == ("counting",)
-    assert mean.retention_note == "without counting"
+    assert mean.retention.note == "without counting"
 
 
 def test_an_undefined_ratio_stays_in_the_machine_readable_output(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[2]
-    assert row["retention"] == pytest.approx(0.08 / 0.05)
-    assert row["retention_defined"] is False
-    assert row["retention_note"] == "n/a (no backbone signal)"
+    assert row["retention"]["published"] == pytest.approx(0.08 / 0.05)
+    assert row["retention"]["defined"] is False
+    assert row["retention"]["note"] == "n/a (no backbone signal)"
 
 
 def test_json_rows_have_the_keys_of_the_contract(table: RetentionTable) -> None:
     rows = json.loads(table.to_json())
     assert [row["category"] for row in rows] == ["color", "shape", "counting", "mean"]
-    assert all(set(row) >= CONTRACT_KEYS for row in rows)
+    assert all({"category", "view"} <= set(row) for row in rows)
+    for part, keys in CONTRACT_KEYS.items():
+        assert all(set(row[part]) >= keys for row in rows), part
 
 
 def test_csv_has_one_line_per_row_and_numbers_in_every_interval_column(table: RetentionTable) -> None:
     rows = list(csv.DictReader(io.StringIO(table.to_csv())))
     assert len(rows) == 4
-    assert float(rows[0]["retention_ci_low"]) < float(rows[0]["retention_ci_high"])
-    assert rows[0]["prefix_layer"] == "1"
+    assert float(rows[0]["retention.ci_low"]) < float(rows[0]["retention.ci_high"])
+    assert rows[0]["backbone.layer"] == "1"
     assert rows[3]["categories"] == "color shape counting"
 
 
 def test_a_run_without_activations_shows_success_rates_only(probed_run: ProbedRun) -> None:
     probed = probed_run({"color": SIGNAL})
     scripted = ArrayRun(probed.path.parent / "scripted", "expert", probed.suite, probed.episodes, {})
-    (row,) = retention([scripted]).rows
-    assert (row.sr, row.view, row.prefix_accuracy, row.retention_note) == (0.6, None, None, "n/a (no probes)")
+    (row,) = retention_table([scripted]).rows
+    assert (row.success.sr, row.view, row.backbone.accuracy, row.retention.note) == (
+        0.6,
+        None,
+        None,
+        "n/a (no probes)",
+    )
 
 
 def test_runs_are_never_averaged_with_each_other(probed_run: ProbedRun) -> None:
     first = probed_run({"color": SIGNAL}, "pi0")
     second = probed_run({"color": WEAK}, "smolvla", suite="other@1#ba9876543210")
-    means = retention([first, second]).means
-    assert [(mean.model, mean.suite) for mean in means] == [("pi0", first.suite), ("smolvla", second.suite)]
-    assert [mean.retention for mean in means] == pytest.approx([0.5, 1.0])
+    means = retention_table([first, second]).means
+    assert [(mean.run.model, mean.run.suite) for mean in means] == [
+        ("pi0", first.suite),
+        ("smolvla", second.suite),
+    ]
+    assert [mean.retention.published for mean in means] == pytest.approx([0.5, 1.0])
 
 
 def test_views_and_keys_that_are_not_there_are_errors(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     with pytest.raises(UnknownSiteError, match="has probes of mean, not of last"):
-        retention([run], views=["last"])
+        retention_table([run], views=["last"])
     with pytest.raises(UsageError, match="no probe results"):
-        retention([run], keys=["ffffffffffff"])
+        retention_table([run], keys=["ffffffffffff"])
 
 
 UNDEFINED = ([0.5, 0.5, 0.5], [[0.54, 0.5]])
@@ -98,35 +120,39 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
     probed = probed_run({"color": SIGNAL, "counting": NONE, "shape": UNDEFINED})
     episodes = probed.episodes.assign(outcome="oob", side_placed="none")
     bare = ArrayRun(probed.path.parent / "bare", "expert", probed.suite, episodes, {})
-    table = retention({"probed": [probed], "bare": [bare]})
-    pair = retention({"a": [probed], "b": [probed_run({"color": SIGNAL, "counting": NONE}, "other")]})
-    for frame in (table.to_frame(), retention([bare]).to_frame(), pair.differences_frame()):
+    table = retention_table({"probed": [probed], "bare": [bare]})
+    pair = retention_table({"a": [probed], "b": [probed_run({"color": SIGNAL, "counting": NONE}, "other")]})
+    for frame in (table.to_frame(), retention_table([bare]).to_frame(), pair.differences_frame()):
         floats = [
-            name for name in frame if any(part in str(name) for part in FLOATS) and "defined" not in str(name)
+            name
+            for name in frame
+            if any(part in f".{name}" for part in FLOATS)
+            and "defined" not in str(name)
+            and "exceeds" not in str(name)
         ]
         assert floats
         assert {str(frame[name].dtype) for name in floats if name not in TEXTS} == {"float64"}
     frame = table.to_frame()
-    undefined = frame[~frame["retention_defined"]]
+    undefined = frame[~frame["retention.defined"]]
     assert len(undefined) == 2 + 4, "two categories without signal, and the run without probes"
-    for name in ("retention", "retention_debiased", "retention_ci_low", "retention_ci_high"):
+    for name in ("retention.published", "retention.debiased", "retention.ci_low", "retention.ci_high"):
         assert undefined[name].map(math.isnan).all(), name
         assert frame[name].notna().any()
-    assert math.isnan(frame["delta"][3]), "a mean has none"
-    raw = [row["retention"] for row in json.loads(table.to_json())["rows"][:3]]
+    assert math.isnan(frame["success.chance_margin_episodes"][3]), "a mean has none"
+    raw = [row["retention"]["published"] for row in json.loads(table.to_json())["rows"][:3]]
     assert raw[1] == pytest.approx(0.08 / 0.05), "json keeps the raw ratio"
 
 
-FLOATS = ("sr", "delta", "accuracy", "_ci_", "retention", "p_", "depth", "gap", "chance", "score", "paired_p")
-TEXTS = ("retention_note", "score")
+FLOATS = (".sr", "margin", "accuracy", "ci_", "_ci_", "retention.", "share_", "depth", "minus", "chance", "p_fwe")
+TEXTS = ("retention.note", "minus", "minus_run")
 
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:
     """Late iterations hold the decision itself as a noisy action; the first sees pure noise."""
-    table = retention([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
+    table = retention_table([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
     row, mean = table.all_rows
-    assert row.action_first_accuracy is not None
-    assert row.action_accuracy is not None
-    assert row.action_first_accuracy < row.action_accuracy
-    assert (row.call, mean.call) == (0, 0)
-    assert mean.action_first_accuracy == row.action_first_accuracy
+    assert row.action.first_accuracy is not None
+    assert row.action.accuracy is not None
+    assert row.action.first_accuracy < row.action.accuracy
+    assert (row.run.call, mean.run.call) == (0, 0)
+    assert mean.action.first_accuracy == row.action.first_accuracy

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.retention import RetentionTable, retention
-from probe_kit.retention.displays import gallery
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
 from probe_kit.train.settings import ProbeSettings
@@ -29,41 +29,41 @@ def test_figures_and_report_draw_the_probes_of_the_table_not_the_newest(probed_r
     run = probed_run({"color": SIGNAL})
     older = load_results(run)
     newer = probed_again(run, permutations=50)
-    table = retention([run], keys=[older.key])
+    table = retention_table([run], keys=[older.key])
     assert table.results[str(run.location)].key == older.key
-    assert {row.probe_settings for row in table.all_rows} == {older.key}
-    (curves,) = [exhibit for exhibit in gallery([run], table) if exhibit.name.endswith("layer-curves")]
+    assert {row.run.probes for row in table.all_rows} == {older.key}
+    (curves,) = [exhibit for exhibit in collect_figures([run], table) if exhibit.name.endswith("layer-curves")]
     with curves.drawn() as figure:
         assert older.key in figure.get_supxlabel()
     page = report_html([run], table)
     assert older.key in page
     assert newer.key not in page
-    assert retention([run]).results[str(run.location)].key == newer.key
+    assert retention_table([run]).results[str(run.location)].key == newer.key
 
 
 def test_a_table_is_not_drawn_with_runs_it_was_not_made_of(probed_run: ProbedRun) -> None:
-    table = retention([probed_run({"color": SIGNAL}, "one")])
+    table = retention_table([probed_run({"color": SIGNAL}, "one")])
     with pytest.raises(UsageError, match=r"no rows of .*other"):
-        gallery([probed_run({"color": SIGNAL}, "other")], table)
+        collect_figures([probed_run({"color": SIGNAL}, "other")], table)
 
 
 def test_a_run_given_twice_is_refused(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     for doubled in ([run, run], {"a": [run], "b": [run]}):
         with pytest.raises(UsageError, match="given twice"):
-            retention(doubled)  # type: ignore[arg-type]
+            retention_table(doubled)  # type: ignore[arg-type]
 
 
 def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: ProbedRun) -> None:
     probed = probed_run({"color": SIGNAL})
     bare = replace(probed, path=probed.path.parent / "bare")
     scripted = replace(bare, path=probed.path.parent / "scripted", model="expert", features={})
-    table = retention([probed, bare, scripted])
+    table = retention_table([probed, bare, scripted])
     assert len(table.notes) == 2
     assert f"Run `probe-kit train {bare.path}`." in table.notes[0]
     assert "of 'expert' no stream was stored" in table.notes[1]
-    assert table.rows[1].sr == 0.6
-    assert retention([probed]).notes == ()
+    assert table.rows[1].success.sr == 0.6
+    assert retention_table([probed]).notes == ()
 
 
 MIXTURES = {
@@ -77,9 +77,9 @@ MIXTURES = {
 def test_rows_of_other_settings_are_pointed_out_in_every_format(probed_run: ProbedRun, name: str) -> None:
     value, words = MIXTURES[name]
     one, other = (probed_run({"color": SIGNAL}, model) for model in ("one", "other"))
-    assert retention([one, other]).notes == ()
+    assert retention_table([one, other]).notes == ()
     key = probed_again(other, **{name: value}).key
-    table = retention([one, other], keys=[None, key])
+    table = retention_table([one, other], keys=[None, key])
     assert words in table.notes[-1]
     for text in (table.to_markdown(), table.to_latex(), as_text(table), report_html([one, other], table)):
         assert words in " ".join(text.split())

@@ -45,55 +45,61 @@ class PairedItems:
     p: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
     ci: 95 % interval of `sr`, whole groups of items resampled. sr_original, sr_swapped: per layout, and
-    layout_mean their mean. p_never_moved: share that ended where it started, a failed grasp; part of p_oob, None
-    if it was not recorded. p_flagged: share of inferences that put out no action, None for a policy that cannot
-    tell. sr_left, sr_right: per side of the correct picture. delta: half-width of the band around 0.5 that
-    guessing explains, for N = episodes (the paper's); delta_items: the same for N = items; delta_regime: for as
-    many items as count, fewer where items of a group answer alike, and what `regime` is judged by.
-    side_preference: share placed left among episodes placed in a zone. A rate over no episodes is None.
+    layout_mean their mean. sr_left, sr_right: per side of the correct picture. share_wrong, share_outside: ended
+    on the other picture, or on neither. share_never_moved: share that ended where it started, a failed grasp; part
+    of share_outside, None if it was not recorded. share_invalid_action: share of inferences that put out no
+    action, None for a policy that cannot tell. chance_margin_episodes: half-width of the band around 0.5 that
+    guessing explains, for N = episodes (the paper's); chance_margin_items: the same for N = items; chance_margin:
+    for as many items as count, fewer where items of a group answer alike, and what `regime` is judged by. reason:
+    why that regime, or why there is no rate. side_preference: share placed left among episodes placed in a zone.
+    normalised_score: only of a mean over categories. A rate over no episodes is None, and so is every rate of a
+    model that did not act.
     """
 
     n_episodes: int
     n_items: int
-    sr: float
-    ci: tuple[float, float]
-    sr_original: float | None
-    sr_swapped: float | None
-    layout_mean: float | None
-    sr_left: float | None
-    sr_right: float | None
-    p_wrong: float
-    p_oob: float
-    p_never_moved: float | None
-    p_flagged: float | None
-    delta: float
-    delta_items: float
-    delta_regime: float
-    regime: Regime
-    reason: str
-    side_preference: float | None
-    paired: PairedItems
+    sr: float | None = None
+    ci: tuple[float | None, float | None] | None = None
+    sr_original: float | None = None
+    sr_swapped: float | None = None
+    layout_mean: float | None = None
+    sr_left: float | None = None
+    sr_right: float | None = None
+    share_wrong: float | None = None
+    share_outside: float | None = None
+    share_never_moved: float | None = None
+    share_invalid_action: float | None = None
+    chance_margin_episodes: float | None = None
+    chance_margin_items: float | None = None
+    chance_margin: float | None = None
+    regime: Regime | None = None
+    reason: str = ""
+    side_preference: float | None = None
+    normalised_score: float | None = None
+    paired: PairedItems | None = None
 
 
-def regime(sr: float, delta: float, p_wrong: float, p_oob: float, asked: bool = False) -> tuple[Regime, str]:
+def regime(
+    sr: float, margin: float, share_wrong: float, share_outside: float, asked: bool = False
+) -> tuple[Regime, str]:
     """The regime of a success rate, and why in a few words. asked: it is one of answers, `oob` one not read."""
     share = "accuracy" if asked else "SR"
-    if sr > 0.5 + delta:
-        return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + delta:.3f}"
-    if sr >= 0.5 - delta:
-        return Regime.NO_RELIABLE_KNOWLEDGE, f"{share} {sr:.3f} is within 0.5 ± Δ = {delta:.3f}"
+    if sr > 0.5 + margin:
+        return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + margin:.3f}"
+    if sr >= 0.5 - margin:
+        return Regime.NO_RELIABLE_KNOWLEDGE, f"{share} {sr:.3f} is within 0.5 ± Δ = {margin:.3f}"
     nowhere = "no answer could be read in" if asked else "the cube ends outside both zones in"
     cause = (
-        f"{nowhere} {p_oob:.0%} of episodes"
-        if p_oob >= p_wrong
-        else f"the wrong picture is chosen in {p_wrong:.0%} of episodes"
+        f"{nowhere} {share_outside:.0%} of episodes"
+        if share_outside >= share_wrong
+        else f"the wrong picture is chosen in {share_wrong:.0%} of episodes"
     )
-    return Regime.FAILURE, f"{share} {sr:.3f} is below 0.5 − Δ = {0.5 - delta:.3f}: {cause}"
+    return Regime.FAILURE, f"{share} {sr:.3f} is below 0.5 − Δ = {0.5 - margin:.3f}: {cause}"
 
 
 def normalised_score(success_rates: Sequence[float]) -> float:
@@ -108,7 +114,7 @@ def capture_only(episodes: "pd.DataFrame") -> bool:
     return not episodes.empty and bool((episodes["outcome"] == CAPTURE_ONLY).all())
 
 
-def _check_listened(episodes: "pd.DataFrame") -> None:
+def _check_acted(episodes: "pd.DataFrame") -> None:
     if capture_only(episodes):
         raise UsageError(
             "this run's model was captured (extract --no-act): there is no success rate. Its probes are as ever"
@@ -136,15 +142,15 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     empty or of several wordings, and for episodes in which the model did not act.
     """
     check_several_wordings(episodes)
-    _check_listened(episodes)
+    _check_acted(episodes)
     if episodes.empty:
         raise UsageError("no finished episodes: there is no success rate. Finish the extraction first.")
     correct = _correct(episodes)
-    sr, p_wrong = float(correct.mean()), float(shares_of(episodes, "wrong").mean())
-    p_oob = float(shares_of(episodes, "oob").mean())
+    sr, share_wrong = float(correct.mean()), float(shares_of(episodes, "wrong").mean())
+    share_outside = float(shares_of(episodes, "oob").mean())
     n_items = int(episodes["item_id"].nunique())
-    delta_regime = chance_margin(independent_items(episodes))
-    name, reason = regime(sr, delta_regime, p_wrong, p_oob, "parse" in episodes)
+    margin = chance_margin(independent_items(episodes))
+    name, reason = regime(sr, margin, share_wrong, share_outside, "parse" in episodes)
     low, high = group_bootstrap(correct.to_numpy()[:, None], units_of(episodes), seed)
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
@@ -158,13 +164,13 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
         layout_mean=None if original is None or swapped is None else (original + swapped) / 2,
         sr_left=_rate(correct[episodes["side_correct"] == "left"]),
         sr_right=_rate(correct[episodes["side_correct"] == "right"]),
-        p_wrong=p_wrong,
-        p_oob=p_oob,
-        p_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
-        p_flagged=_flagged(episodes),
-        delta=chance_margin(len(episodes)),
-        delta_items=chance_margin(n_items),
-        delta_regime=delta_regime,
+        share_wrong=share_wrong,
+        share_outside=share_outside,
+        share_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
+        share_invalid_action=_flagged(episodes),
+        chance_margin_episodes=chance_margin(len(episodes)),
+        chance_margin_items=chance_margin(n_items),
+        chance_margin=margin,
         regime=name,
         reason=reason,
         side_preference=_rate(placed == "left"),
@@ -213,7 +219,7 @@ def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_R
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:
     """Items that ran in both layouts, by outcome; others are left out. Raises UsageError if nothing was acted."""
-    _check_listened(episodes)
+    _check_acted(episodes)
     outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
     outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
     right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)

@@ -1,6 +1,6 @@
-"""Asked runs among acting ones: which they are, and by which of their scores they are read.
+"""VLM runs among policy runs: which they are, and by which of their scores they are read.
 
-An asked run holds three outcomes of every episode: of the text, of the options' logits, and of these with the
+A VLM run holds three outcomes of every episode: of the text, of the options' logits, and of these with the
 preference for a letter taken out. A table shows one of them, and the shares of the others beside it.
 """
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 SCORES: Mapping[str, tuple[str, str]] = {
     "text": ("outcome", "side_placed"),
     "logits": ("outcome_logits", "side_logits"),
-    "debiased": ("outcome_debiased", "side_debiased"),
+    "order-balanced": ("outcome_debiased", "side_debiased"),
 }
 """By score, the columns of outcome and side."""
 
@@ -28,8 +28,8 @@ def ask_of(run: RunReader) -> Mapping[str, Any] | None:
     return ask
 
 
-class Scored:
-    """An asked run, read by one of its scores; everything else is the run's own.
+class ScoredAnswers:
+    """A VLM run, read by one of its scores; everything else is the run's own.
 
     with_side_words: keep items in whose name a side stands, such as "no left turn sign": their answers cannot be
     told from their names.
@@ -56,20 +56,20 @@ class Scored:
 
 
 def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
-    """An asked run by a score; an acting one as it is. Raises UsageError for an unknown score."""
+    """A VLM run by a score; a policy run as it is. Raises UsageError for an unknown score."""
     if score not in SCORES:
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
     if ask_of(run) is None:
         return run
-    wrapped: RunReader = Scored(run, score, with_side_words)
+    wrapped: RunReader = ScoredAnswers(run, score, with_side_words)
     return wrapped
 
 
 def left_out(runs: Sequence[RunReader]) -> list[str]:
-    """A sentence per asked run whose items with side words are not counted."""
+    """A sentence per VLM run whose items with side words are not counted."""
     return [
         f"{run.location}: {missing} episodes are left out because a side stands in the name that was asked for, "
         "such as 'no left turn sign' (--with-side-words counts them)."
         for run in runs
-        if isinstance(run, Scored) and (missing := len(run._run.episodes) - len(run.episodes))
+        if isinstance(run, ScoredAnswers) and (missing := len(run._run.episodes) - len(run.episodes))
     ]

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.retention.columns.text import number, percent, with_limits
-from probe_kit.retention.columns.text_table import PlainTable
-from probe_kit.retention.compare.known_used import OVERALL, PAIRS, Comparison, Joined, KnownUsed
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-Columns = Sequence[tuple[str, Callable[[Joined], str]]]
+Columns = Sequence[tuple[str, Callable[[CategoryCounts], str]]]
 _LEGEND = (
     "known: answered right; encoded: the probe's held-out decision right; used: acted right; each in both layouts "
     "of an item, which a coin manages in 25 %"
@@ -20,7 +20,7 @@ _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
 
 
-def rich_join(joined: KnownUsed) -> "Group":
+def rich_known_used(joined: KnownUsedTable) -> "Group":
     """Counts, tests and notes as tables for a rich console."""
     from rich.console import Group
     from rich.text import Text
@@ -37,7 +37,7 @@ def rich_join(joined: KnownUsed) -> "Group":
     return Group(*tables, *(Text(note, style="yellow") for note in joined.notes))
 
 
-def join_tables(joined: KnownUsed) -> list[PlainTable]:
+def known_used_tables(joined: KnownUsedTable) -> list[TextTable]:
     """The same counts and tests as tables of text, for pages."""
     seen = f"probes in view {joined.view}" if joined.view else "no probes: known and used only"
     title = f"Known, encoded, used: {joined.asked} (by {joined.score}) · {joined.acted}"
@@ -49,9 +49,9 @@ def join_tables(joined: KnownUsed) -> list[PlainTable]:
     ]
 
 
-def _plain(title: str, note: str, rows: Sequence[Joined], columns: Columns) -> PlainTable:
+def _plain(title: str, note: str, rows: Sequence[CategoryCounts], columns: Columns) -> TextTable:
     shown = [column for column in columns if any(column[1](row) != "–" for row in rows)]
-    return PlainTable(
+    return TextTable(
         title,
         note,
         ("category", *(name for name, _ in shown)),
@@ -59,15 +59,15 @@ def _plain(title: str, note: str, rows: Sequence[Joined], columns: Columns) -> P
     )
 
 
-def _share(count: int | None, row: Joined) -> str:
+def _share(count: int | None, row: CategoryCounts) -> str:
     return "–" if count is None else f"{count} ({percent(count / row.n_items, 0)} %)"
 
 
 _SHARES: Columns = [
     ("items (groups)", lambda row: f"{row.n_items} ({row.n_groups})"),
-    ("known", lambda row: _share(row.known, row)),
+    ("answered correctly", lambda row: _share(row.answered_correctly, row)),
     ("encoded", lambda row: _share(row.encoded, row)),
-    ("used", lambda row: _share(row.used, row)),
+    ("acted correctly", lambda row: _share(row.acted_correctly, row)),
     ("signal", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
 ]
 _LOST: Columns = [
@@ -77,24 +77,24 @@ _LOST: Columns = [
 ]
 
 
-def _codes(rows: Sequence[Joined]) -> Columns:
+def _codes(rows: Sequence[CategoryCounts]) -> Columns:
     codes = dict.fromkeys(code for row in rows for code in row.counts)
     return [(_spelt(code), _count_of(code)) for code in codes]
 
 
-def _count_of(code: str) -> Callable[[Joined], str]:
-    def cell(row: Joined) -> str:
+def _count_of(code: str) -> Callable[[CategoryCounts], str]:
+    def cell(row: CategoryCounts) -> str:
         return f"{row.counts[code]} ({row.guessed[code]:.1f})" if code in row.counts else "–"
 
     return cell
 
 
-def _episodes(rows: Sequence[Joined]) -> Columns:
+def _episodes(rows: Sequence[CategoryCounts]) -> Columns:
     codes = dict.fromkeys(code for row in rows for code in row.episodes)
     return [(_spelt(code), _episodes_of(code)) for code in codes]
 
 
-def _episodes_of(code: str) -> Callable[[Joined], str]:
+def _episodes_of(code: str) -> Callable[[CategoryCounts], str]:
     return lambda row: str(row.episodes.get(code, "–"))
 
 
@@ -110,8 +110,8 @@ def _tests() -> Columns:
     ]
 
 
-def _test_of(first: str, second: str) -> Callable[[Joined], str]:
-    def cell(row: Joined) -> str:
+def _test_of(first: str, second: str) -> Callable[[CategoryCounts], str]:
+    def cell(row: CategoryCounts) -> str:
         found = [one for one in row.comparisons if (one.first, one.second) == (first, second)]
         return _spell_test(found[0]) if found else "–"
 
@@ -124,7 +124,7 @@ def _spell_test(one: Comparison) -> str:
 
 
 def _table(
-    title: str, caption: str, rows: Sequence[Joined], parts: Sequence[tuple[str, Columns]]
+    title: str, caption: str, rows: Sequence[CategoryCounts], parts: Sequence[tuple[str, Columns]]
 ) -> ResponsiveTable:
     found = []
     for question, columns in parts:

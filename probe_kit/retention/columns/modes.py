@@ -5,11 +5,11 @@ from typing import Literal
 
 from probe_kit.retention.rows.row import RetentionRow
 
-Kind = Literal["acts", "asks", "both"]
+Modes = Literal["acts", "answers", "both"]
 
-RATE: Mapping[Kind, str] = {
+RATE: Mapping[Modes, str] = {
     "acts": "Success rate",
-    "asks": "Accuracy of answers",
+    "answers": "Accuracy of answers",
     "both": "Success rate / accuracy of answers",
 }
 """The share of right episodes at the head of a table or an axis."""
@@ -17,16 +17,16 @@ _HEADINGS: Mapping[str, str] = {"SR": "accuracy", "outside": "unread", "goes lef
 """By the first words of a policy's heading, those of a model that was asked."""
 
 
-def kind_of(rows: Iterable[RetentionRow]) -> Kind:
+def modes_of(rows: Iterable[RetentionRow]) -> Modes:
     """What all rows did, `both` for a mixture."""
-    kinds = {row.kind for row in rows}
-    return "both" if len(kinds) > 1 else "asks" if kinds == {"asks"} else "acts"
+    modes = {row.run.mode for row in rows}
+    return "both" if len(modes) > 1 else "answers" if modes == {"answers"} else "acts"
 
 
-def heading(name: str, kind: Kind) -> str:
-    """A policy's heading, such as `SR % [95 %]`, over rows of `kind`."""
+def heading(name: str, modes: Modes) -> str:
+    """A policy's heading, such as `SR % [95 %]`, over rows of `modes`."""
     for acting, asking in _HEADINGS.items():
-        if kind != "acts" and name.startswith(acting):
-            words = asking if kind == "asks" else f"{acting} / {asking}"
+        if modes != "acts" and name.startswith(acting):
+            words = asking if modes == "answers" else f"{acting} / {asking}"
             return f"{words}{name.removeprefix(acting)}"
     return name

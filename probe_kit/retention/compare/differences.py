@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
 from probe_kit.retention.estimators.bootstrap_draws import Estimate, Estimates, Limits, average
-from probe_kit.retention.rows.build import Drawn
+from probe_kit.retention.rows.build import RowWithDraws
 from probe_kit.retention.rows.category_mean import average_estimates
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.multiple_testing import corrected
@@ -38,8 +38,8 @@ class Difference:
     paired: bool
     sr: float | None = None
     sr_ci: Limits | None = None
-    prefix_accuracy: float | None = None
-    prefix_ci: Limits | None = None
+    backbone_accuracy: float | None = None
+    backbone_ci: Limits | None = None
     action_accuracy: float | None = None
     action_ci: Limits | None = None
     retention: float | None = None
@@ -61,7 +61,7 @@ class Side:
     """One side of a comparison: what it is called, the rows of its runs, and where it lies if it is one run."""
 
     name: str
-    drawn: Sequence[Drawn]
+    drawn: Sequence[RowWithDraws]
     run: str | None = None
 
     def only(self, categories: Sequence[str]) -> "Side":
@@ -69,7 +69,9 @@ class Side:
         return replace(self, drawn=[one for one in self.drawn if one.row.category in categories])
 
 
-def group_differences(groups: Mapping[str, Sequence[Drawn]], against: str | None = None) -> list[Difference]:
+def group_differences(
+    groups: Mapping[str, Sequence[RowWithDraws]], against: str | None = None
+) -> list[Difference]:
     """Every group minus every later one, or minus the group `against`, per view and category and over all.
 
     Raises UsageError for a group that is none of them.
@@ -87,7 +89,7 @@ def pair_differences(pairs: Sequence[tuple[Side, Side]]) -> list[Difference]:
 
 
 def _compare_sides(here: Side, there: Side) -> list[Difference]:
-    calls = {one.row.call for one in (*here.drawn, *there.drawn)}
+    calls = {one.row.run.call for one in (*here.drawn, *there.drawn)}
     call = calls.pop() if len(calls) == 1 else None
     mine, theirs = _by_view(here.drawn), _by_view(there.drawn)
     shared = [view for view in mine if view in theirs]
@@ -102,12 +104,12 @@ Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
 """Per category, a table of outcomes of each run."""
 
 
-def _outcomes(drawn: Sequence[Drawn]) -> Outcomes:
+def _outcomes(drawn: Sequence[RowWithDraws]) -> Outcomes:
     """Once per run, whatever number of views it has."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for one in drawn:
         if one.outcomes is not None:
-            found.setdefault(one.row.category, {})[one.row.run] = one.outcomes
+            found.setdefault(one.row.category, {})[one.row.run.location] = one.outcomes
     return {category: list(tables.values()) for category, tables in found.items()}
 
 
@@ -117,7 +119,7 @@ def _behaviour(views: Mapping[str | None, Mapping[str, Estimates]]) -> dict[str 
     return {None: {name: {"sr": found["sr"]} if "sr" in found else {} for name, found in first.items()}}
 
 
-def _by_view(drawn: Sequence[Drawn]) -> dict[str | None, dict[str, Estimates]]:
+def _by_view(drawn: Sequence[RowWithDraws]) -> dict[str | None, dict[str, Estimates]]:
     """Estimates per view and category, averaged over runs; a quantity that a run lacks is left out."""
     views: dict[str | None, dict[str, list[Estimates]]] = {}
     for one in drawn:
@@ -180,9 +182,9 @@ def _row(
     sides: tuple[Side, Side], category: str, view: str | None, paired: bool, gap: Estimates, p: float | None
 ) -> Difference:
     sr = _value(gap.get("sr"))
-    prefix, action = (_value(gap.get(f"{part}_accuracy")) for part in ("prefix", "action"))
+    backbone, action = (_value(gap.get(f"{part}_accuracy")) for part in ("backbone", "action"))
     debiased, bounded, area = (_value(gap.get(f"retention_{part}")) for part in ("debiased", "bounded", "area"))
-    numbers = (*sr, *prefix, *action, *debiased, *bounded, *area)
+    numbers = (*sr, *backbone, *action, *debiased, *bounded, *area)
     return Difference(sides[0].name, sides[1].name, category, view, paired, *numbers, p=p)
 
 

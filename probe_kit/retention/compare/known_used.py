@@ -1,8 +1,8 @@
 """Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
 
 known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance, binding
-and twin. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side is
-right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
+and untrained. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side
+is right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ Bools = NDArray[np.bool_]
 COIN = 0.25
 """Share of items that a coin gets right in both layouts."""
 FRAME = "first_frame_sha256"
-PAIRS = (("known", "used"), ("encoded", "used"), ("known", "encoded"))
+PAIRS = (("answered", "acted"), ("encoded", "acted"), ("answered", "encoded"))
 OVERALL = "all"
 _MOST_NAMED = 3
 
@@ -64,23 +64,24 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Joined:
+class CategoryCounts:
     """One category, or all of them (`all`).
 
-    counts: items by known, encoded, used, such as `101` for known, not encoded, used; without probes `1-1`.
-    guessed: as many as coins would give. episodes: the same counts of single episodes; nothing is tested there.
-    signal: whether the probes beat chance and every control that was run, without which encoded means nothing;
-    None without probes, or over categories that differ in it. not_used: of the items known and encoded those the
-    action does not follow, with the exact 95 % interval of their share. p_linked: whether known and used go
-    together among encoded items: Fisher's exact test, over categories a permutation within them.
+    answered_correctly, encoded, acted_correctly: items right in both layouts. counts: items by these three, such
+    as `101` for known, not encoded, used; without probes `1-1`. guessed: as many as coins would give. episodes:
+    the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance and every
+    control that was run, without which encoded means nothing; None without probes, or over categories that differ
+    in it. not_used: of the items known and encoded those the action does not follow, with the exact 95 % interval
+    of their share. p_linked: whether known and used go together among encoded items: Fisher's exact test, over
+    categories a permutation within them.
     """
 
     category: str
     n_items: int
     n_groups: int
-    known: int
+    answered_correctly: int
     encoded: int | None
-    used: int
+    acted_correctly: int
     counts: Mapping[str, int]
     guessed: Mapping[str, float]
     episodes: Mapping[str, int]
@@ -94,8 +95,8 @@ class Joined:
 
 
 @dataclass(frozen=True)
-class KnownUsed:
-    """An asked and an acting run joined, item by item. view: of the probes; None without any.
+class KnownUsedTable:
+    """A VLM run and a policy run joined, item by item. view: of the probes; None without any.
 
     notes: what a reader must know, a sentence each.
     """
@@ -104,7 +105,7 @@ class KnownUsed:
     acted: str
     score: str
     view: str | None
-    rows: tuple[Joined, ...]
+    rows: tuple[CategoryCounts, ...]
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -118,9 +119,9 @@ class KnownUsed:
         return pd.DataFrame(
             {
                 "category": row.category,
-                "known": code[0] == "1",
+                "answered_correctly": code[0] == "1",
                 "encoded": None if code[1] == "-" else code[1] == "1",
-                "used": code[2] == "1",
+                "acted_correctly": code[2] == "1",
                 "items": row.counts[code],
                 "guessed": row.guessed[code],
                 "episodes": row.episodes[code],
@@ -136,10 +137,10 @@ def match_runs(
     results: ProbeResults | None = None,
     view: str | None = None,
     seed: int = 0,
-) -> KnownUsed:
-    """Join an asked run (as `scored` reads it) with an acting one and its probes.
+) -> KnownUsedTable:
+    """Join a VLM run (as `scored` reads it) with a policy run and its probes.
 
-    results: probes of the acting run; None joins known and used only. view: one that was probed, by default the
+    results: probes of the policy run; None joins known and used only. view: one that was probed, by default the
     first. seed: of the halves in which sites are chosen, and of permutations.
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
@@ -158,11 +159,11 @@ def match_runs(
         rows.append(_over_all(whole, rows, seed))
     notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *_without_signal(rows)]
     score = str(getattr(asked, "score", "text"))
-    joined = KnownUsed(asked.label, acted.label, score, chosen, tuple(rows), tuple(notes))
+    joined = KnownUsedTable(asked.label, acted.label, score, chosen, tuple(rows), tuple(notes))
     return correct_joins([joined])[0]
 
 
-def correct_joins(joins: Sequence[KnownUsed]) -> list[KnownUsed]:
+def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
     """The same joins, which are shown together, with `p_holm` over the lot.
 
     The tests of all categories are one family; those over all categories are a summary and no part of it.
@@ -170,7 +171,7 @@ def correct_joins(joins: Sequence[KnownUsed]) -> list[KnownUsed]:
     tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
     p_holm = iter(corrected(tests, lambda one: one.p))
 
-    def of_row(row: Joined) -> Joined:
+    def of_row(row: CategoryCounts) -> CategoryCounts:
         if row.category == OVERALL:
             return row
         return replace(row, comparisons=tuple(replace(one, p_holm=next(p_holm)) for one in row.comparisons))
@@ -184,13 +185,13 @@ def correct_joins(joins: Sequence[KnownUsed]) -> list[KnownUsed]:
 def _check_kinds(asked: RunReader, acted: RunReader) -> None:
     if ask_of(asked) is None or ask_of(acted) is not None:
         raise UsageError(
-            f"{asked.location} and {acted.location} are not an asked and an acting run, in this order; make them "
+            f"{asked.location} and {acted.location} are not a VLM run and a policy run, in this order; make them "
             "with `probe-kit ask` and `probe-kit extract`"
         )
 
 
 def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
-    """The episodes of both: columns of the acting run, and `outcome_asked`."""
+    """The episodes of both: columns of the policy run, and `outcome_asked`."""
     for run in (asked, acted):
         if FRAME not in run.episodes or run.episodes[FRAME].isna().any():
             raise OtherFramesError(
@@ -310,7 +311,7 @@ def _mark(known: bool, encoded: float, used: bool) -> str:
     return f"{int(known)}{middle}{int(used)}"
 
 
-def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
+def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> CategoryCounts:
     known, used = items["known"].to_numpy(bool), items["used"].to_numpy(bool)
     values = items["encoded"].to_numpy(float)
     probed = bool(len(values)) and not np.isnan(values).any()
@@ -323,13 +324,13 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Joined:
     ]
     every = ["".join(parts) for parts in product(marks, middle, marks)]
     singles = [mark if probed else f"{mark[0]}-{mark[2]}" for own in items["marks"] for mark in own]
-    return Joined(
+    return CategoryCounts(
         category=category,
         n_items=len(items),
         n_groups=int(items["group"].nunique()),
-        known=int(known.sum()),
+        answered_correctly=int(known.sum()),
         encoded=None if encoded is None else int(encoded.sum()),
-        used=int(used.sum()),
+        acted_correctly=int(used.sum()),
         counts={code: codes.count(code) for code in every},
         guessed={code: len(items) * _by_coin(code) for code in every},
         episodes={code: singles.count(code) for code in every},
@@ -345,7 +346,7 @@ def _by_coin(code: str) -> float:
 
 
 def _comparisons(known: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]) -> list[Comparison]:
-    values = {"known": known, "used": used} | ({} if encoded is None else {"encoded": encoded})
+    values = {"answered": known, "acted": used} | ({} if encoded is None else {"encoded": encoded})
     found = []
     for first, second in PAIRS:
         if first in values and second in values:
@@ -373,7 +374,7 @@ def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
     }
 
 
-def _over_all(items: "pd.DataFrame", rows: Sequence[Joined], seed: int) -> Joined:
+def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) -> CategoryCounts:
     signals = {row.has_signal for row in rows}
     whole = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
     if whole.encoded is None:
@@ -405,7 +406,7 @@ def _of_picture(asked: RunReader) -> list[str]:
     return notes
 
 
-def _without_signal(rows: Sequence[Joined]) -> list[str]:
+def _without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
     dull = [row.category for row in rows if row.has_signal is False and row.category != OVERALL]
     if not dull:
         return []

@@ -8,7 +8,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.differences import Difference, Side, pair_differences
-from probe_kit.retention.rows.build import Drawn
+from probe_kit.retention.rows.build import RowWithDraws
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ OWN_WORDS = "knowledge"
 
 
 @dataclass(frozen=True)
-class Compared:
+class PairedRuns:
     """differences: of every two runs on the same questions. unpaired: why others have none, a sentence each."""
 
     differences: list[Difference]
@@ -28,16 +28,16 @@ class Compared:
 
 def compare_runs(
     runs: Sequence[RunReader],
-    drawn: Sequence[Drawn],
+    drawn: Sequence[RowWithDraws],
     labels: Mapping[str, str],
     against: str | None = None,
-    gap: bool = False,
-) -> Compared:
-    """The first run minus every other, or every other minus the run `against`; asked and acting runs apart.
+    vlm_vla: bool = False,
+) -> PairedRuns:
+    """The first run minus every other, or every other minus the run `against`; VLM runs and policy runs apart.
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
-    against: a run's name in tables, its folder's name or its location. gap: whether asked runs are held against
-    acting ones elsewhere. Only runs on the same suite, items, seed and wording are compared.
+    against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
+    policy runs elsewhere. Only runs on the same suite, items, seed and wording are compared.
     Raises UsageError for a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
@@ -55,13 +55,15 @@ def compare_runs(
         if others:
             unpaired.append(f"{both} are not compared in {', '.join(others)}: other episodes.")
         sides = [
-            Side(names[_place(run)], [one for one in drawn if one.row.run == _place(run)], _place(run)).only(alike)
+            Side(names[_place(run)], [d for d in drawn if d.row.run.location == _place(run)], _place(run)).only(
+                alike
+            )
             for run in (here, there)
         ]
         pairs.append((sides[0], sides[1]))
-    if not gap and len({ask_of(run) is None for run in runs}) == 2:
-        unpaired.append("Asked and acting runs are not compared with each other here; --gap does that.")
-    return Compared(pair_differences(pairs), tuple(unpaired))
+    if not vlm_vla and len({ask_of(run) is None for run in runs}) == 2:
+        unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
+    return PairedRuns(pair_differences(pairs), tuple(unpaired))
 
 
 def _place(run: RunReader) -> str:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VlmGap:
-    """Share right of an asked run minus success rate of an acting one, in one category or over all (`mean`).
+class VlmVlaDifference:
+    """Share right of a VLM run minus success rate of a policy run, in one category or over all (`mean`).
 
     paired: whether both are of the same episodes, whose groups are then drawn together. same_frames: whether every
     one of these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
@@ -37,15 +37,17 @@ class VlmGap:
     n_items: int
     accuracy: float
     sr: float
-    vlm_gap: float
-    vlm_gap_ci: Limits
+    difference: float
+    difference_ci: Limits
     p: float | None = None
     p_holm: float | None = None
     source: Relation = "unknown"
 
 
-def vlm_gaps(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> list[VlmGap]:
-    """Every asked run minus every acting one that it can be compared with, per category and over all of them.
+def vlm_vla_differences(
+    runs: Sequence[RunReader], names: Mapping[str, str] | None = None
+) -> list[VlmVlaDifference]:
+    """Every VLM run minus every acting one that it can be compared with, per category and over all of them.
 
     A policy whose network grew from weights that were asked is not compared with readers of other weights.
     names: what runs are called, by their location; by default their labels. Runs as `retention` reads them.
@@ -53,7 +55,7 @@ def vlm_gaps(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) 
     called = names or {str(run.location): run.label for run in runs}
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None]
-    found: list[VlmGap] = []
+    found: list[VlmVlaDifference] = []
     for reader, policy, source in _chosen(asked, acted):
         found += [replace(row, source=source) for row in _pair(reader, policy, called)]
     p_holm = corrected(found, lambda row: row.p, lambda row: row.category == MEAN)
@@ -67,7 +69,7 @@ def _chosen(asked: Sequence[RunReader], acted: Sequence[RunReader]) -> list[tupl
     return [pair for pair in related if pair[2] != "no" or id(pair[1]) not in grown]
 
 
-def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmGap]:
+def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmVlaDifference]:
     there = dict(list(policy.episodes.groupby("category", sort=False)))
     rows, gaps = [], []
     for category, here in reader.episodes.groupby("category", sort=False):
@@ -87,12 +89,12 @@ def _compare(
     there: "pd.DataFrame",
     runs: tuple[RunReader, RunReader],
     called: Mapping[str, str],
-) -> tuple[VlmGap, Estimate]:
+) -> tuple[VlmVlaDifference, Estimate]:
     reader, policy = runs
     accuracy, sr = sr_estimate(here, reader.suite), sr_estimate(there, policy.suite)
     gap = accuracy - sr
     paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.units == sr.units
-    row = VlmGap(
+    row = VlmVlaDifference(
         asked=called[str(reader.location)],
         acted=called[str(policy.location)],
         category=category,
@@ -101,8 +103,8 @@ def _compare(
         n_items=int(here["item_id"].nunique()),
         accuracy=accuracy.value,
         sr=sr.value,
-        vlm_gap=gap.value,
-        vlm_gap_ci=gap.ci,
+        difference=gap.value,
+        difference_ci=gap.ci,
         p=_p(here, there) if paired else None,
     )
     return row, gap
@@ -122,7 +124,9 @@ def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
     return bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all())
 
 
-def _mean(rows: Sequence[VlmGap], gap: Estimate, reader: RunReader, policy: RunReader) -> VlmGap:
+def _mean(
+    rows: Sequence[VlmVlaDifference], gap: Estimate, reader: RunReader, policy: RunReader
+) -> VlmVlaDifference:
     categories = [row.category for row in rows]
     paired = all(row.paired for row in rows)
     kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (reader, policy)]
@@ -134,7 +138,7 @@ def _mean(rows: Sequence[VlmGap], gap: Estimate, reader: RunReader, policy: RunR
         n_items=sum(row.n_items for row in rows),
         accuracy=sum(row.accuracy for row in rows) / len(rows),
         sr=sum(row.sr for row in rows) / len(rows),
-        vlm_gap=gap.value,
-        vlm_gap_ci=gap.ci,
+        difference=gap.value,
+        difference_ci=gap.ci,
         p=_p(*kept) if paired else None,
     )

@@ -1,13 +1,13 @@
 """Figures in scikit-learn's display idiom: numbers as attributes, `plot(ax=None)` draws and returns the display.
 
 Without `ax` a display makes its own figure, with a legend and a caption that names model, weights and suite.
-`gallery` makes all figures that fit a table of runs.
+`collect_figures` makes all figures that fit a table of runs.
 """
 
 from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
-from probe_kit.retention.displays.causal_curve import CausalCurveDisplay, causal_curve
 from probe_kit.retention.displays.dose_response import DoseResponseDisplay, dose_response
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
 from probe_kit.retention.displays.heat_table import (
@@ -23,17 +23,15 @@ from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_c
 from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
 from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
-from probe_kit.retention.displays.report_figures import Exhibit, gallery, save_figures
+from probe_kit.retention.displays.report_figures import collect_figures, save_figures
 from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
 from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_side_by_side
+from probe_kit.retention.displays.site_effect_curve import SiteEffectDisplay, site_effect_curve
 
 __all__ = [
     "AttentionDisplay",
     "CallCurveDisplay",
-    "CausalCurveDisplay",
-    "Certificate",
     "DoseResponseDisplay",
-    "Exhibit",
     "FinalPositionsDisplay",
     "HeatTableDisplay",
     "IterationMapDisplay",
@@ -43,22 +41,25 @@ __all__ = [
     "ModelDepthDisplay",
     "OutcomeRulesDisplay",
     "PairedLayoutsDisplay",
+    "ProvenanceLine",
+    "ReportFigure",
     "RetentionTableDisplay",
     "RoleCurvesDisplay",
     "SideTableDisplay",
+    "SiteEffectDisplay",
     "SuccessTableDisplay",
     "aligned_curves",
     "attention_curve",
     "call_curves",
-    "causal_curve",
+    "collect_figures",
     "curves_side_by_side",
     "dose_response",
     "final_positions",
-    "gallery",
     "iteration_maps",
     "layer_curve",
     "maps_side_by_side",
     "model_depths",
     "role_curves",
     "save_figures",
+    "site_effect_curve",
 ]

@@ -1,6 +1,8 @@
 """What is weighed: by block, how much attention the acting stream pays to the pictures, the words and itself."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -17,7 +19,8 @@ from probe_kit.intervene.kinds.attention.attention_mass import (
     stored_attention,
 )
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -46,7 +49,7 @@ class AttentionDisplay(Panelled):
     mean: Percent
     iterations: Percent
     heads: Percent
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -58,10 +61,10 @@ class AttentionDisplay(Panelled):
                 f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
                 "--kind attention`"
             )
-        return cls._of(found, category, Certificate.of_run(run))
+        return cls._of(found, category, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, weighed: AttentionShares, category: str, certificate: Certificate) -> Self:
+    def _of(cls, weighed: AttentionShares, category: str, certificate: ProvenanceLine) -> Self:
         left_out = {ALL, "special", *TILE_ROLES}
         blocks = np.unique(weighed.frame(("block",))["block"].to_numpy(np.int64))
         roles = tuple(role for role in weighed.shares() if role not in left_out)
@@ -108,9 +111,26 @@ class AttentionDisplay(Panelled):
 def attention_curve(run: RunReader) -> "Figure":
     """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
     displays = [
-        AttentionDisplay._of(weighed, category, Certificate.of_run(run))
+        AttentionDisplay._of(weighed, category, ProvenanceLine.of_run(run))
         for category, weighed in stored_attention(run).items()
     ]
     if not displays:
         AttentionDisplay.from_run(run, "any")
     return in_panels(displays)
+
+
+PLACE = 15
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if stored_attention(one.run):
+            yield ReportFigure(
+                f"{one.stem}-attention", "Attention by layer", "interventions",
+                "How much of the attention that the acting stream pays lies on the pictures, the words and its "
+                "own tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the "
+                "most of any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
+                one.position, partial(attention_curve, one.run),
+            )  # fmt: skip

@@ -1,14 +1,22 @@
 """Accuracy over the captured calls of an episode, and the same counted from what happens in it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import (
+    ONLY_FILLED,
+    FigureSource,
+    ReportFigure,
+    in_view,
+    view_suffix,
+)
 from probe_kit.retention.displays.base.selection import known_view
 from probe_kit.retention.displays.base.style import (
     PARTS,
@@ -21,8 +29,17 @@ from probe_kit.retention.displays.base.style import (
     plain,
     significance_handles,
 )
-from probe_kit.retention.estimators.by_call import AlignedLine, CallCurves, CallLine, EventCalls, EventTimes
+from probe_kit.retention.estimators.by_call import (
+    AlignedLine,
+    CallCurves,
+    CallLine,
+    EventCalls,
+    EventTimes,
+    event_calls,
+)
 from probe_kit.retention.text import spell
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -36,7 +53,7 @@ _RELABELLED = "best relabelled probe, 95 %"
 
 
 @dataclass
-class CallCurveDisplay(Shown):
+class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run; the
@@ -50,7 +67,7 @@ class CallCurveDisplay(Shown):
     lines: tuple[CallLine, ...]
     events: tuple[EventTimes, ...]
     aligned: Mapping[str, tuple[AlignedLine, ...]]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -78,7 +95,7 @@ class CallCurveDisplay(Shown):
             lines=tuple(map(curves.line, curves.streams)),
             events=tuple(curves.event_times()),
             aligned={event: lines for event, lines in aligned.items() if lines},
-            certificate=Certificate.of_results(first, curves.view),
+            certificate=ProvenanceLine.of_results(first, curves.view),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -182,10 +199,46 @@ def _finish(axes: "Axes", title: str, below: str) -> None:
     axes.set_xlabel(below, fontsize=8.5)
 
 
-def _complete(figure: "Figure", axes: "Axes", certificate: Certificate, tested: bool) -> None:
+def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, tested: bool) -> None:
     """tested: whether markers are filled where something is evidence."""
 
     handles: dict[str, Artist] = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     legend_above(figure, [*handles.values(), *(significance_handles() if tested else ())])
     figure.supylabel("best site, accuracy (%)", fontsize=9)
     caption(figure, replace(certificate, call=None))
+
+
+PLACE = 12
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is not None:
+            yield from _of_run(one.stem, one.position, one.run, one.results)
+
+
+def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> Iterator[ReportFigure]:
+    """Only where a later inference was probed as well."""
+    calls = load_results_by_call(run, results)
+    if len(calls) < 2:
+        return
+    views, events = results.settings.views, event_calls(run)
+    for view in views:
+        yield ReportFigure(
+            f"{name}-calls{view_suffix(view, views)}", in_view("Over the episode", view, views), "probes",
+            f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
+            "dotted: what the best site of relabelled data stays below. An answer that is not there at "
+            "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
+            position, partial(call_curves, calls, view, events),
+        )  # fmt: skip
+    curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
+    for event in EVENTS:
+        if any(one.aligned(stream, event) is not None for one in curves for stream in one.streams):
+            yield ReportFigure(
+                f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
+                "The same, with every episode's inferences counted from its own event: 0 is the last one "
+                "before it.",
+                position, partial(aligned_curves, calls, event, views[0], events),
+            )  # fmt: skip

@@ -1,7 +1,8 @@
 """Dose and response: how many episodes turn as more of a direction is added, by side, beside controls."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -11,7 +12,8 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREY, series
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -46,7 +48,7 @@ class DoseResponseDisplay(Panelled):
     controls: Percent
     relative_change: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -63,10 +65,10 @@ class DoseResponseDisplay(Panelled):
                 f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
             )
         chosen = place or next(iter(found))
-        return cls._of(found[chosen], category, chosen, Certificate.of_run(run))
+        return cls._of(found[chosen], category, chosen, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, rows: Sequence[PatchEffect], category: str, place: str, certificate: Certificate) -> Self:
+    def _of(cls, rows: Sequence[PatchEffect], category: str, place: str, certificate: ProvenanceLine) -> Self:
         own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.coefficient))
         coefficients = np.array([float(row.coefficient) for row in own])
         names = dict.fromkeys(row.direction for row in rows if row.is_control)
@@ -114,10 +116,27 @@ class DoseResponseDisplay(Panelled):
 def dose_response(run: RunReader) -> "Figure":
     """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
     displays = [
-        DoseResponseDisplay._of(rows, category, place, Certificate.of_run(run))
+        DoseResponseDisplay._of(rows, category, place, ProvenanceLine.of_run(run))
         for category, every in stored_steering(run).items()
         for place, rows in every.items()
     ]
     if not displays:
         DoseResponseDisplay.from_run(run, "any")
     return in_panels(displays, height=2.7, share=False)
+
+
+PLACE = 14
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if stored_steering(one.run):
+            yield ReportFigure(
+                f"{one.stem}-doses", "How much of a direction turns the action", "interventions",
+                "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of "
+                "the direction is added; filled: beyond random directions of the same norm (the band). One side "
+                "may be saturated, and beyond about two norms of the tokens any direction breaks the hand.",
+                one.position, partial(dose_response, one.run),
+            )  # fmt: skip

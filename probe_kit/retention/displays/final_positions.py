@@ -1,7 +1,8 @@
 """Where the cube ended, over the tiles, seen from above."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -9,8 +10,10 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.behaviour.success_rate import capture_only
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
@@ -30,7 +33,7 @@ _MANY = 300  # points, above which a vector figure holds them as a picture
 
 
 @dataclass
-class FinalPositionsDisplay(Shown):
+class FinalPositionsDisplay(Display):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
     xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and
@@ -42,7 +45,7 @@ class FinalPositionsDisplay(Shown):
     outcome: NDArray[np.str_]
     never_moved: int
     scene: Mapping[str, Any]
-    certificate: Certificate
+    certificate: ProvenanceLine
     rule: str = DEFAULT_RULE
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
@@ -70,7 +73,7 @@ class FinalPositionsDisplay(Shown):
             outcome=episodes["outcome"].to_numpy(dtype=str),
             never_moved=int(unmoved),
             scene=scene,
-            certificate=Certificate.of_run(run),
+            certificate=ProvenanceLine.of_run(run),
             rule=getattr(run, "rule", DEFAULT_RULE),
         )
 
@@ -187,3 +190,22 @@ def _draw_legend(figure: "Figure", panel: "Axes") -> None:
     zone = Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")
     handles = [*panel.get_legend_handles_labels()[0], zone]
     legend_above(figure, handles)
+
+
+PLACE = 8
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        run = one.judged(source.table)
+        if run is None or capture_only(run.episodes):
+            continue
+        if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
+            yield ReportFigure(
+                f"{one.stem}-final-positions", "Where the cube ended", "behaviour",
+                "The table from above, the robot below the picture. An episode counts as an answer if the middle "
+                "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried anywhere.",
+                one.position, partial(final_positions, run),
+            )  # fmt: skip

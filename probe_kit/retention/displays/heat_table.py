@@ -1,16 +1,18 @@
 """Tables of numbers on heat colours, as the paper prints them: a model per row, a category per column."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.modes import RATE, Kind, kind_of
+from probe_kit.retention.columns.modes import RATE, Modes, modes_of
 from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import axes_for, caption
 from probe_kit.retention.formats.heat import HEAT, heat_colour
 from probe_kit.retention.rows.row import RetentionRow
@@ -35,7 +37,7 @@ class Cell:
 
 
 @dataclass
-class HeatTableDisplay(Shown):
+class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
@@ -45,11 +47,11 @@ class HeatTableDisplay(Shown):
     rows: tuple[str, ...]
     columns: tuple[str, ...]
     cells: tuple[tuple[Cell, ...], ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     parts: ClassVar[tuple[str, ...]] = ("",)
     title = ""
     note = ""
-    notes: ClassVar[Mapping[Kind, str]] = {}
+    notes: ClassVar[Mapping[Modes, str]] = {}
     scale: ClassVar[float] = 100.0
     digits: ClassVar[int] = 1
     ruled: str = ""
@@ -60,9 +62,9 @@ class HeatTableDisplay(Shown):
         """Of success rates, which belong to an outcome rule."""
         rows = once_per_category(table.all_rows)
         found = cls._of(rows, cell)
-        kind, acted = kind_of(rows), [row for row in rows if row.kind == "acts"]
-        found.title = cls.title.replace(RATE["acts"], RATE[kind])
-        found.note = cls.notes.get(kind, cls.note)
+        modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
+        found.title = cls.title.replace(RATE["acts"], RATE[modes])
+        found.note = cls.notes.get(modes, cls.note)
         found.ruled = f", {rule_name(acted)}" if acted else ""
         return found
 
@@ -73,7 +75,7 @@ class HeatTableDisplay(Shown):
             raise UsageError(f"{cls.title}: the table has no rows to show")
         lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
         for row in rows:
-            lines.setdefault((row.group, row.run, row.view), {})[row.category] = row
+            lines.setdefault((row.group, row.run.location, row.view), {})[row.category] = row
         columns = tuple(dict.fromkeys(row.category for row in rows))
         columns = (*(name for name in columns if name != "mean"), *(["mean"] if "mean" in columns else []))
         blank = Cell((None,) * len(cls.parts))
@@ -83,7 +85,7 @@ class HeatTableDisplay(Shown):
             cells=tuple(
                 tuple(cell(line[name]) if name in line else blank for name in columns) for line in lines.values()
             ),
-            certificates=tuple(Certificate.of_row(list(line.values())[-1]) for line in lines.values()),
+            certificates=tuple(ProvenanceLine.of_row(list(line.values())[-1]) for line in lines.values()),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -151,7 +153,7 @@ class SuccessTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.sr,), row.regime == Regime.KNOWLEDGE))
+        return cls._ruled(table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE))
 
 
 class SideTableDisplay(HeatTableDisplay):
@@ -160,16 +162,16 @@ class SideTableDisplay(HeatTableDisplay):
     title = "Success rate (%) where the correct picture is left | right"
     digits = 0
     note = "equal halves: no side is favoured; one blue, one pale: the policy goes to a side, not to an answer"
-    notes: ClassVar[Mapping[Kind, str]] = {
-        "asks": "equal halves: no side is favoured; one blue, one pale: one side is named, whatever the question",
-        "both": "equal halves: no side is favoured; one blue, one pale: one side is chosen, whatever the question",
+    notes: ClassVar[Mapping[Modes, str]] = {
+        "answers": "equal halves: no side is favoured; one blue, one pale: a side is named, whatever the question",
+        "both": "equal halves: no side is favoured; one blue, one pale: a side is chosen, whatever the question",
     }
     parts = ("left", "right")
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.sr_left, row.sr_right)))
+        return cls._ruled(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
 
 
 class RetentionTableDisplay(HeatTableDisplay):
@@ -185,7 +187,7 @@ class RetentionTableDisplay(HeatTableDisplay):
         """From a retention table with probes. Raises UsageError if no run was probed."""
 
         def cell(row: RetentionRow) -> Cell:
-            values = (row.retention_bounded, row.retention) if row.retention_defined else (None, None)
+            values = (row.retention.bounded, row.retention.published) if row.retention.defined else (None, None)
             return Cell(values)
 
         return cls._of([row for row in table.all_rows if row.view is not None], cell)
@@ -195,3 +197,29 @@ def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> s
     row = next(iter(line.values()))
     views = {other.view for other in rows if other.view is not None}
     return f"{model_name(row)}, {row.view}" if len(views) > 1 and row.view else model_name(row)
+
+
+PLACE = 1
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    table = source.table
+    acted = [row for row in table.rows if row.success.sr is not None]
+    modes = modes_of(acted)
+    shown: list[tuple[type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], str, str, str]] = []
+    if acted:
+        shown.append((SuccessTableDisplay, "success", RATE[modes], "behaviour"))
+        shown.append((SideTableDisplay, "sides", f"{RATE[modes]} by side", "behaviour"))
+    if any(row.retention.published is not None for row in table.rows):
+        shown.append((RetentionTableDisplay, "retention", "Retention", "retention"))
+    for display, name, title, subject in shown:
+        note = display.notes.get(modes, display.note)
+        yield ReportFigure(name, title, subject, note, None, partial(_drawn, display, table), is_table=True)
+
+
+def _drawn(
+    display: type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], table: RetentionTable
+) -> "Figure":
+    return figure_of(display.from_table(table))

@@ -1,15 +1,17 @@
 """Layer × iteration maps: where and when in the action expert the answer can be read."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, ReportFigure, in_view, view_suffix
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class IterationMapDisplay(Shown):
+class IterationMapDisplay(Display):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
     accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream, and
@@ -41,7 +43,7 @@ class IterationMapDisplay(Shown):
     iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -71,7 +73,7 @@ class IterationMapDisplay(Shown):
             iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
             significant=grid["signal"].to_numpy(dtype=bool),
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )
 
     @property
@@ -187,3 +189,26 @@ def draw_scale(
         bar.set_ticks([low, 100], labels=["chance", "100"])
     else:
         bar.set_ticks([low, *(tick for tick in range(50, 101, 10) if tick > low + 4)])
+
+
+PLACE = 10
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is None:
+            continue
+        views, scores = one.results.settings.views, one.results.scores
+        for view in views:
+            for stream in scores.loc[scores["part"] == "action", "stream"].unique():
+                of_stream = (scores["view"] == view) & (scores["stream"] == stream)
+                if (of_stream & scores["iteration"].notna()).any():
+                    yield ReportFigure(
+                        f"{one.stem}-iteration-maps{view_suffix(view, views)}",
+                        in_view("Layer × iteration", view, views), "probes",
+                        "The action is made in several iterations (flow-matching steps or action tokens). Dark "
+                        f"cells: the answer can be read at that layer and iteration. {DOTS}.",
+                        one.position, partial(iteration_maps, one.results, view, stream),
+                    )  # fmt: skip

@@ -1,15 +1,16 @@
 """The knowledge–action gap: what a probe reads inside the model against what the model does."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.modes import RATE, Kind, kind_of
+from probe_kit.retention.columns.modes import RATE, Modes, modes_of
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import (
     axes_for,
     caption,
@@ -43,17 +44,17 @@ class GapPoint:
 
 
 @dataclass
-class KnowledgeActionDisplay(Shown):
+class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
     On the diagonal the policy acts on what can be read; below it, it knows more than it does. Both axes run from 0
-    to 100 %, whatever is shown. kind: whether the shares are of policies, of answers or of both.
+    to 100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
     """
 
     stream: str
     points: tuple[GapPoint, ...]
-    certificates: tuple[Certificate, ...]
-    kind: Kind = "acts"
+    certificates: tuple[ProvenanceLine, ...]
+    modes: Modes = "acts"
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -65,20 +66,22 @@ class KnowledgeActionDisplay(Shown):
         Raises UsageError if no run was probed in that stream and view.
         """
         shown: dict[tuple[str | None, str], str | None] = {}
-        points = []
+        points, drawn = [], []
         for row in table.rows:
-            if row.view is None or shown.setdefault((row.group, row.run), view or row.view) != row.view:
+            if row.view is None or shown.setdefault((row.group, row.run.location), view or row.view) != row.view:
                 continue
             if (point := _point(row, stream)) is not None:
                 points.append(point)
+                drawn.append(row)
         if not points:
             raise UsageError(
                 f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
             )
-        means = (mean for mean in table.means if shown.get((mean.group, mean.run)) == mean.view is not None)
-        certificates = tuple(Certificate.of_row(mean) for mean in means)
-        drawn = [row for row in table.rows if (row.group, row.run) in shown]
-        return cls(stream, tuple(points), certificates, kind_of(drawn))
+        means = (
+            mean for mean in table.means if shown.get((mean.group, mean.run.location)) == mean.view is not None
+        )
+        certificates = tuple(ProvenanceLine.of_row(mean) for mean in means)
+        return cls(stream, tuple(points), certificates, modes_of(drawn))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and captions."""
@@ -88,10 +91,10 @@ class KnowledgeActionDisplay(Shown):
         for position, model in enumerate(models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
         plain(axes)
-        made = "answer" if self.kind == "asks" else "action"
+        made = "answer" if self.modes == "answers" else "action"
         place = "in the backbone" if self.stream == "backbone" else f"where the {made} is made"
         axes.set_xlabel(f"best held-out probe {place} (%)", fontsize=9)
-        axes.set_ylabel(f"{RATE[self.kind].lower()} (%)", fontsize=9)
+        axes.set_ylabel(f"{RATE[self.modes].lower()} (%)", fontsize=9)
         if figure is not None:
             legend_above(figure, [*axes.get_legend_handles_labels()[0], *significance_handles()])
         caption(figure, *self.certificates)
@@ -106,17 +109,17 @@ class KnowledgeActionDisplay(Shown):
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     prefix = stream == "backbone"
-    accuracy = row.prefix_accuracy if prefix else row.action_accuracy
-    if accuracy is None or row.sr is None or row.sr_ci is None:
+    accuracy = row.backbone.accuracy if prefix else row.action.accuracy
+    if accuracy is None or row.success.sr is None or row.success.ci is None:
         return None
     return GapPoint(
         model=model_name(row),
         category=row.category,
         accuracy=accuracy,
-        accuracy_ci=row.prefix_ci if prefix else row.action_ci,
-        sr=row.sr,
-        sr_ci=row.sr_ci,
-        significant=row.prefix_signal if prefix else row.action_signal,
+        accuracy_ci=row.backbone.ci if prefix else row.action.ci,
+        sr=row.success.sr,
+        sr_ci=row.success.ci,
+        significant=row.backbone.has_signal if prefix else row.action.has_signal,
     )
 
 
@@ -162,3 +165,23 @@ def _arms(value: float, limits: Limits) -> list[list[float]] | None:
     if limits is None or limits[0] is None or limits[1] is None:
         return None
     return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]
+
+
+_DOES: dict[Modes, str] = {"acts": "acts on it", "answers": "says it", "both": "acts on it or says it"}
+PLACE = 2
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    acted = [row for row in source.table.rows if row.success.sr is not None]
+    modes = modes_of(acted)
+    if any(row.backbone.accuracy is not None for row in acted):
+        answers = modes == "answers"
+        yield ReportFigure(
+            "knowledge-action", f"Knowledge and {'answers' if answers else 'action'}", "retention",
+            "Each point is one category: how well the answer can be read inside the model (across) and how often "
+            f"the model {_DOES[modes]} (up). Points far below the line are knowledge that does not reach the "
+            f"{'answer' if answers else 'hand'}.",
+            None, lambda: figure_of(KnowledgeActionDisplay.from_table(source.table)),
+        )  # fmt: skip

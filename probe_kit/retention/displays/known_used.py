@@ -1,11 +1,13 @@
 """Known, encoded, used: what becomes of the items of each category, as one bar of shares."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.compare.known_used import KnownUsed
-from probe_kit.retention.displays.base.display import Shown
+from probe_kit.retention.compare.known_used import KnownUsedTable
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import (
     BLUE,
     GREEN,
@@ -19,10 +21,12 @@ from probe_kit.retention.displays.base.style import (
     legend_above,
     plain,
 )
+from probe_kit.retention.joins import joins_of
 from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _LOOKS: Mapping[str, tuple[str, str]] = {
     "111": (GREEN, ""),
@@ -43,7 +47,7 @@ _LEAST = 6.0  # percent of a bar that has room for a number
 
 
 @dataclass
-class KnownUsedDisplay(Shown):
+class KnownUsedDisplay(Display):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
     counts: items by category and code, such as `101` for known, not encoded, used (`1-1` without probes). title:
@@ -56,7 +60,7 @@ class KnownUsedDisplay(Shown):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_join(cls, joined: KnownUsed) -> Self:
+    def from_join(cls, joined: KnownUsedTable) -> Self:
         """From what `probe_kit.retention.compare.known_used.join` gives."""
         seen = f"probes in view {joined.view}" if joined.view else "no probes"
         return cls(
@@ -106,3 +110,27 @@ def _draw_bar(axes: "Axes", place: int, counts: Mapping[str, int]) -> None:
             )
         left += width
     axes.text(101, place, f"n {total}", va="center", fontsize=7.5, color=GREY, clip_on=False)
+
+
+PLACE = 6
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    yield from known_used_figures(joins_of([one.run for one in source.runs], source.table).found)
+
+
+def known_used_figures(joins: Sequence[KnownUsedTable]) -> Iterator[ReportFigure]:
+    """A figure per pair of a VLM run and a policy run."""
+    for number, joined in enumerate(joins, 1):
+        yield ReportFigure(
+            f"known-used-{number}", "Known, encoded, used", "join",
+            "Every question once: does the reader know the answer, does a probe read it in the policy, and does "
+            "the action follow, each in both layouts. Red is lost: known and encoded, not used.",
+            None, partial(_known_used, joined),
+        )  # fmt: skip
+
+
+def _known_used(joined: KnownUsedTable) -> "Figure":
+    return figure_of(KnownUsedDisplay.from_join(joined))

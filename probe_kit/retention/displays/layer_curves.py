@@ -1,15 +1,23 @@
 """Layer curves: accuracy by layer, the backbone beside where the action is made, a line per iteration."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import (
+    ONLY_FILLED,
+    FigureSource,
+    ReportFigure,
+    in_view,
+    view_suffix,
+)
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import (
     DPI,
@@ -41,11 +49,11 @@ _PEAK = "best of its stream (all, where several tie)"
 
 
 @dataclass
-class LayerCurveDisplay(Shown):
+class LayerCurveDisplay(Display):
     """Held-out accuracy by layer, for one category in one view.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above binding
-    and twin where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
+    and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
     relabelling; None below 20 relabellings.
     """
 
@@ -54,7 +62,7 @@ class LayerCurveDisplay(Shown):
     chance: float
     null_band: tuple[float, float] | None
     streams: tuple[StreamCurve, ...]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -77,7 +85,7 @@ class LayerCurveDisplay(Shown):
             chance=curve.chance,
             null_band=None if band is None else (float(band[0]), float(band[1])),
             streams=tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False)),
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -115,8 +123,8 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
 
     Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
     for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only where
-    there are several lines. Filled markers are above chance against the best site of their stream (family-wise
-    p < 0.05), and above binding and twin where those were run. Grey: chance, and the band that holds 95 % of the
+    there are several lines. Filled markers are above chance against the best site of their stream (family-wise p <
+    0.05), and above binding and untrained where those were run. Grey: chance, and the band that holds 95 % of the
     accuracies under relabelling. view: the first probed one by default. Raises UnknownSiteError for a view that
     was not probed, UsageError for an iteration.
     """
@@ -277,3 +285,24 @@ def _peak_handle() -> "Line2D":
     from matplotlib.lines import Line2D
 
     return Line2D([], [], color="black", ls="none", marker=_MARK, ms=5, label=_PEAK)
+
+
+PLACE = 9
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        views = () if one.results is None else one.results.settings.views
+        for view in views:
+            assert one.results is not None
+            yield ReportFigure(
+                f"{one.stem}-layer-curves{view_suffix(view, views)}", in_view("Layer curves", view, views),
+                "probes",
+                "How often a linear probe names the side of the correct picture in episodes it has not seen, "
+                f"layer by layer; the part that makes the action has a line per iteration. {ONLY_FILLED}, against "
+                "the best layer of relabelled data. The grey band is what no knowledge looks like; a caret "
+                "marks the best layer, or all that tie.",
+                one.position, partial(layer_curve, one.results, view, source.table.iterations),
+            )  # fmt: skip

@@ -1,7 +1,8 @@
 """Several models on one axis: depth as a fraction makes 18 and 32 layers comparable."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_name
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import known_view, of_iterations, scores_of
 from probe_kit.retention.displays.base.style import (
     ABOVE_CHANCE,
@@ -43,7 +45,7 @@ class ModelCurve:
 
 
 @dataclass
-class ModelDepthDisplay(Shown):
+class ModelDepthDisplay(Display):
     """Held-out accuracy above chance against depth, averaged over categories, one line per model.
 
     At each layer the best of the iterations counts, in each category by itself. Lines have no markers: a mean over
@@ -52,7 +54,7 @@ class ModelDepthDisplay(Shown):
 
     stream: str
     models: tuple[ModelCurve, ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -78,7 +80,7 @@ class ModelDepthDisplay(Shown):
         return cls(
             stream=stream,
             models=tuple(_curve(one, stream, shown, iterations, name) for one, shown, name in kept),
-            certificates=tuple(Certificate.of_results(one, shown) for one, shown, _ in kept),
+            certificates=tuple(ProvenanceLine.of_results(one, shown) for one, shown, _ in kept),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -170,3 +172,20 @@ def _curve(results: ProbeResults, stream: str, view: str, iterations: Iterations
     return ModelCurve(
         name, layers, depth, np.mean([curve.to_numpy(dtype=float) for curve in curves], axis=0), len(curves)
     )
+
+
+PLACE = 3
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    results = [run.results for run in source.runs if run.results is not None]
+    if len(results) > 1:
+        names = [run.name for run in source.probed]
+        yield ReportFigure(
+            "model-depths", "Models by depth", "probes",
+            "How far above chance the answer can be read, against depth as a fraction, so that models with "
+            "different numbers of layers can be compared.",
+            None, partial(model_depths, results, iterations=source.table.iterations, names=names),
+        )  # fmt: skip

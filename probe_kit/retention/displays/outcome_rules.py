@@ -1,6 +1,6 @@
 """The same episodes by every outcome rule, side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
@@ -8,10 +8,11 @@ from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.behaviour.success_rate import shares_of
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
-from probe_kit.retention.rows.outcome_rules import Judged
+from probe_kit.retention.rows.outcome_rules import RunUnderRule
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -35,11 +36,11 @@ class RuleBar:
 
 
 @dataclass
-class OutcomeRulesDisplay(Shown):
+class OutcomeRulesDisplay(Display):
     """A bar per run and outcome rule: how often the same episodes are called right, wrong or neither."""
 
     bars: tuple[RuleBar, ...]
-    certificates: tuple[Certificate, ...]
+    certificates: tuple[ProvenanceLine, ...]
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -48,7 +49,7 @@ class OutcomeRulesDisplay(Shown):
         if not runs or any(run.episodes.empty for run in runs):
             raise UsageError("there are no episodes to judge; give runs that have some")
         bars = [bar for run, name in zip(runs, full_names(runs), strict=True) for bar in _bars(run, name)]
-        return cls(tuple(bars), tuple(Certificate.of_run(run) for run in runs))
+        return cls(tuple(bars), tuple(ProvenanceLine.of_run(run) for run in runs))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
@@ -75,7 +76,7 @@ class OutcomeRulesDisplay(Shown):
 
 
 def _bars(run: RunReader, name: str) -> list[RuleBar]:
-    judged = Judged.of(run, DEFAULT_RULE)
+    judged = RunUnderRule.of(run, DEFAULT_RULE)
     if judged.verdicts is None:
         stored = {part: float(shares_of(run.episodes, part).mean()) for part, *_ in _PARTS}
         return [RuleBar(name, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
@@ -104,3 +105,20 @@ def _draw_bar(axes: "Axes", place: float, bar: RuleBar) -> None:
         axes.plot(
             [100 * bar.idle] * 2, [place - 0.44, place + 0.44], color="black", lw=2, label="doing nothing scores"
         )
+
+
+PLACE = 4
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    kept = [one.run for one in source.runs if getattr(one.run, "has_trajectories", False)]
+    runs = [run for run in kept if not run.episodes.empty]
+    if runs:
+        yield ReportFigure(
+            "outcome-rules", "The same episodes by every outcome rule", "behaviour",
+            "What counts as an answer decides the success rate. A black mark is what a policy that does nothing "
+            "would score by that rule: where there is one, the untouched cube already counts as put on a picture.",
+            None, lambda: figure_of(OutcomeRulesDisplay.from_runs(runs)),
+        )  # fmt: skip

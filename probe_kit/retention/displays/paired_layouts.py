@@ -1,11 +1,14 @@
 """Paired layouts: how many items are right in both, one or none of their two layouts."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.behaviour.success_rate import PairedItems, paired_items
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.behaviour.success_rate import PairedItems, capture_only, paired_items
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -13,6 +16,7 @@ from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Name, colour, hatch: told apart without colour too.
 _PARTS = (
@@ -24,7 +28,7 @@ _PARTS = (
 
 
 @dataclass
-class PairedLayoutsDisplay(Shown):
+class PairedLayoutsDisplay(Display):
     """Items by outcome of their two layouts, per category.
 
     Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its
@@ -32,7 +36,7 @@ class PairedLayoutsDisplay(Shown):
     """
 
     items: dict[str, PairedItems]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -40,7 +44,7 @@ class PairedLayoutsDisplay(Shown):
         """From the episodes of a run; items that ran in one layout are left out."""
         by_category = run.episodes.groupby("category", sort=False)
         items = {str(category): paired_items(episodes) for category, episodes in by_category}
-        return cls(items, Certificate.of_run(run))
+        return cls(items, ProvenanceLine.of_run(run))
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
@@ -82,3 +86,25 @@ def _draw_bar(axes: "Axes", row: int, paired: PairedItems) -> None:
 
 def _p(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"
+
+
+PLACE = 7
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        run = one.judged(source.table)
+        if run is not None and not capture_only(run.episodes):
+            yield ReportFigure(
+                f"{one.stem}-paired-layouts", "The same question, pictures swapped", "behaviour",
+                "Every question is asked twice, with the two images swapped. Knowing the answer means right "
+                "both times; always choosing one side means right once. Bold p: more items are right twice than "
+                "wrong twice, beyond luck.",
+                one.position, partial(_drawn, run),
+            )  # fmt: skip
+
+
+def _drawn(run: RunReader) -> "Figure":
+    return figure_of(PairedLayoutsDisplay.from_run(run))

@@ -1,13 +1,15 @@
 """Role-resolved curves: whose tokens carry the answer, by depth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
 from probe_kit.retention.displays.base.style import (
     accuracy_axis,
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class RoleCurvesDisplay(Shown):
+class RoleCurvesDisplay(Display):
     """Held-out accuracy by layer, one line per view of one stream, for one category.
 
     curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
@@ -42,7 +44,7 @@ class RoleCurvesDisplay(Shown):
     stream: str
     chance: float
     curves: dict[str, StreamCurve]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -74,7 +76,7 @@ class RoleCurvesDisplay(Shown):
             stream=stream,
             chance=curve_of(results, category, shown).chance,
             curves=found,
-            certificate=Certificate.of_results(results, shown),
+            certificate=ProvenanceLine.of_results(results, shown),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -122,3 +124,22 @@ def _label(stream: str) -> str:
 def _draw_legend(figure: "Figure", panel: "Axes") -> None:
     handles = [*panel.get_legend_handles_labels()[0], *significance_handles()]
     legend_above(figure, handles)
+
+
+PLACE = 11
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is None:
+            continue
+        for stream, rows in one.results.scores.groupby("stream", sort=False):
+            if rows["view"].nunique() > 1:
+                yield ReportFigure(
+                    f"{one.stem}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
+                    "The same probes on the mean of one kind of token at a time.",
+                    one.position,
+                    partial(role_curves, one.results, str(stream), iterations=source.table.iterations),
+                )  # fmt: skip

@@ -1,13 +1,22 @@
 """Several runs beside each other on one scale: layer curves in the same panels, maps in a row."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import (
+    DOTS,
+    ONLY_FILLED,
+    FigureSource,
+    ReportFigure,
+    in_view,
+    view_suffix,
+)
 from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import (
     accuracy_axis,
@@ -67,7 +76,7 @@ def curves_side_by_side(
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
     figure.supylabel(f"held-out accuracy (%), view {view}", fontsize=9)
-    caption(figure, *(Certificate.of_results(one, view) for _, one in known))
+    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in known))
     return figure
 
 
@@ -140,7 +149,7 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
     figure.supylabel("iteration", fontsize=9)
     draw_scale(figure, grid, drawn, displays)
     draw_legend(figure)
-    caption(figure, *(Certificate.of_results(one, view) for _, one in shown))
+    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in shown))
     return figure
 
 
@@ -148,3 +157,34 @@ def has_maps(results: ProbeResults, view: str) -> bool:
     """Whether the action of a run is made in iterations that were probed in that view."""
     scores = results.scores
     return bool(((scores["view"] == view) & (scores["part"] == "action") & scores["iteration"].notna()).any())
+
+
+PLACE = 5
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    probed = [(run.results, run.name) for run in source.runs if run.results is not None]
+    views = list(dict.fromkeys(view for one, _ in probed for view in one.settings.views))
+    for view in views:
+        own = [(one, name) for one, name in probed if view in one.settings.views]
+        if len(own) < 2:
+            continue
+        known, called = [one for one, _ in own], [name for _, name in own]
+        yield ReportFigure(
+            f"curves-side-by-side{view_suffix(view, views)}", in_view("Layer curves side by side", view, views),
+            "probes",
+            "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
+            f"on one scale; of several iterations the best of every layer. {ONLY_FILLED}. "
+            "Bars are 95 % intervals at each line's best layer; the table says whether two runs differ.",
+            None, partial(curves_side_by_side, known, called, view, source.table.iterations),
+        )  # fmt: skip
+        if sum(has_maps(one, view) for one in known) > 1:
+            yield ReportFigure(
+                f"maps-side-by-side{view_suffix(view, views)}",
+                in_view("Layer × iteration side by side", view, views), "probes",
+                "Where and when the answer can be read while the action is made, a column per run. Colours "
+                f"run from chance to 100 % in every map. {DOTS}.",
+                None, partial(maps_side_by_side, known, called, view),
+            )  # fmt: skip

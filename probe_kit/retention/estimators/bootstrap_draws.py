@@ -108,7 +108,7 @@ class Estimate:
 
 
 Estimates = Mapping[str, Estimate]
-"""Estimates by quantity: `sr`, `prefix_accuracy`, `action_accuracy`, `retention_debiased`, `_bounded`, `_area`."""
+"""By quantity: `sr`, `backbone_accuracy`, `action_accuracy`, `retention_debiased`, `_bounded`, `_area`."""
 
 
 def average(estimates: Sequence[Estimate]) -> Estimate:

@@ -10,9 +10,9 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.estimators.cross_fit import (
     Crossfit,
     GroupScores,
+    add_unobserved_variance,
     crossfit,
     scoring_covariance,
-    with_unseen,
 )
 
 Matrix = NDArray[np.float64]
@@ -64,5 +64,5 @@ def area_fit(backbone: GroupScores, expert: GroupScores, chance: float) -> Cross
     held_out = np.array([stream.sums.mean(axis=0) for stream in (expert, backbone)])
     above = held_out.sum(axis=1) / backbone.sizes.sum() - chance
     covariance = scoring_covariance(held_out, backbone.sizes)
-    covariance = with_unseen(covariance, held_out, backbone.sizes)
+    covariance = add_unobserved_variance(covariance, held_out, backbone.sizes)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, backbone.sizes)

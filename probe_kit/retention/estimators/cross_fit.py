@@ -74,7 +74,7 @@ def scoring_covariance(held_out: Matrix, sizes: Matrix) -> Matrix:
     return covariance
 
 
-def with_unseen(covariance: Matrix, held_out: Matrix, sizes: Matrix) -> Matrix:
+def add_unobserved_variance(covariance: Matrix, held_out: Matrix, sizes: Matrix) -> Matrix:
     """`covariance` of two shares, neither of them known better than what groups allow that nobody has seen.
 
     held_out, sizes: (2, G) correct decisions and (G,) episodes. Where all groups agree the share t of those that
@@ -112,7 +112,7 @@ def crossfit(
     held_out = (1 - peak_share) * chosen + peak_share * peaks
     above = held_out.sum(axis=1) / sizes.sum() - chance
     covariance = _covariance_by_halving((expert, backbone), splits_of_halves)
-    covariance = with_unseen(covariance, held_out, sizes)
+    covariance = add_unobserved_variance(covariance, held_out, sizes)
     return Crossfit(float(above[0]), float(above[1]), covariance, held_out, sizes)
 
 

@@ -16,7 +16,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.estimators.combined import area_fit, bounded_fit
 from probe_kit.retention.estimators.cross_fit import HALVINGS, Crossfit, GroupScores, crossfit
 from probe_kit.statistics.fieller import Interval, fieller_interval
-from probe_kit.train.results.control_scores import BINDING, TWIN, Beats, Controls, has_signal
+from probe_kit.train.results.control_scores import BINDING, UNTRAINED, Beats, Controls, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 
 Iterations = Literal["all", "best", "last"] | int
@@ -53,10 +53,10 @@ class Retention:
 
     plain: (best expert − chance) / (best backbone − chance), the published formula; NaN if the backbone's best is
     exactly chance. defined: whether the backbone's best is above chance (family-wise), without which the ratio
-    means nothing, and than binding and twin where they were run; `note` then says so. debiased: the same ratio
-    scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two scores
-    it is the ratio of. bounded: the same between that and the plug-in peaks, which are too low and too high on
-    average. area: the ratio of mean scores over all sites, how much of the stack carries the answer.
+    means nothing, and than binding and untrained where they were run; `note` then says so. debiased: the same
+    ratio scored on episodes that had no part in choosing the sites, with its 95 % Fieller interval; fit: the two
+    scores it is the ratio of. bounded: the same between that and the plug-in peaks, which are too low and too high
+    on average. area: the ratio of mean scores over all sites, how much of the stack carries the answer.
     """
 
     chance: float
@@ -163,7 +163,7 @@ def _note(beats: Beats) -> str:
         return "n/a (no permutations)"
     if not beats["chance"]:
         return "n/a (no backbone signal)"
-    equals = [name for name in (BINDING, TWIN) if beats[name] is False]
+    equals = [name for name in (BINDING, UNTRAINED) if beats[name] is False]
     return f"n/a (backbone no better than {' and '.join(equals)})" if equals else ""
 
 

@@ -13,9 +13,9 @@ def table_json(
     rows: Sequence[RetentionRow], differences: Sequence[Difference], beside: Mapping[str, Sequence[Any]]
 ) -> str:
     """See `RetentionTable.to_json`. beside: further lists of dataclasses by their name, shown if not empty."""
-    between_runs = [row for row in differences if row.run is not None]
-    between_groups = [row for row in differences if row.run is None]
-    several = len({row.run for row in rows}) > 1 and not any(row.group for row in rows)
+    between_runs = [one for one in differences if one.run is not None]
+    between_groups = [one for one in differences if one.run is None]
+    several = len({row.run.location for row in rows}) > 1 and not any(row.group for row in rows)
     lines = [asdict(row) | (_own(row, between_runs) if several else {}) for row in rows]
     lists = {"differences": between_groups, **beside}
     shown = {name: [asdict(one) for one in found] for name, found in lists.items() if found}
@@ -28,6 +28,6 @@ def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]
     found = [
         asdict(one)
         for one in differences
-        if (one.run, one.category) == (row.run, row.category) and one.view in (row.view, None)
+        if (one.run, one.category) == (row.run.location, row.category) and one.view in (row.view, None)
     ]
     return {"differences": found}

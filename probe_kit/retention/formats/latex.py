@@ -1,37 +1,14 @@
-"""The retention table in LaTeX: booktabs rules, and five heat colours for retention."""
+"""The retention tables in LaTeX: booktabs rules, and five heat colours."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
-from probe_kit.retention.columns.conditions import rule_sentences
-from probe_kit.retention.columns.lines import Line, cell_of, compared, difference_legend
-from probe_kit.retention.columns.modes import RATE, Kind, kind_of
-from probe_kit.retention.columns.text import (
-    ABOVE_CHANCE,
-    CONTROL_COLUMNS,
-    DIFFERENCE_TEST,
-    FOLLOWED_COLUMNS,
-    FURTHER_RETENTION,
-    action_place,
-    action_share,
-    beats,
-    call_value,
-    category_name,
-    controlled,
-    first_iteration,
-    followed,
-    margin_value,
-    model_name,
-    paper_margin,
-    prefix_place,
-    prefix_share,
-    probed,
-    retention_value,
-    rule_name,
-    success_value,
-    title,
-    view_name,
-)
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.columns import Column
+from probe_kit.retention.columns.lines import TableRow
+from probe_kit.retention.columns.row_names import named_cells, row_headings, titled
+from probe_kit.retention.columns.tables import Table, cell_text, tables_of
+from probe_kit.retention.columns.text import ABOVE_CHANCE
+from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import HEAT
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -41,6 +18,7 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "Δ": r"$\Delta$",
+    "±": r"$\pm$",
     "–": "--",
     "−": "$-$",
     "<": "$<$",
@@ -53,34 +31,47 @@ def latex(
     rows: Sequence[RetentionRow],
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
-    further: Sequence[PlainTable] = (),
+    further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> str:
-    """Complete `table` environments: retention with differences between runs, then controls where there are any.
+    """Complete `table` environments: success rates with differences between runs, retention, then controls.
 
     further: tables behind these. notes: sentences for the author, as comments. unpaired: why runs have no
     differences, a part of the caption.
     Needs the packages booktabs and xcolor with its option `table`.
     """
-    parts = [_retention_table(rows, differences, unpaired)]
-    if controlled(rows):
-        columns = [("Model", model_name), ("view", view_name), ("call", call_value), *CONTROL_COLUMNS]
-        cells = [[cell_of(cell, line) for _, cell in columns] for line in compared(probed(rows))]
-        parts.append(_plain_table(title("Controls", rows), [name for name, _ in columns], cells))
-    parts += [_plain_table(f"{own.title} ({own.note})", own.columns, own.cells) for own in further]
-    return "\n".join([*parts, *(f"% {note}" for note in (*rule_sentences(rows), *notes))])
+    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
+    parts = ["% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}", *colours]
+    parts += [_table(table.without_details()) for table in tables_of(rows, differences, unpaired)]
+    parts += [
+        _environment(f"{own.title} ({own.note})", own.columns, [_line(map(_marked, cells)) for cells in own.cells])
+        for own in further
+    ]
+    return "\n".join([*parts, *(f"% {note}" for note in notes)])
 
 
-def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _table(table: Table) -> str:
+    columns = (*row_headings(table), *(column.heading for column in table.columns))
+    lines: list[str] = []
+    for before, row in pairwise([None, *table.rows]):
+        assert row is not None
+        if before is not None and (before.category == MEAN) != (row.category == MEAN):
+            lines.append(r"\midrule")
+        names = map(escape, named_cells(table, row))
+        lines.append(_line([*names, *(_cell(column, row) for column in table.columns)]))
+    return _environment(" ".join([f"{titled(table)}.", *table.captions]), columns, lines)
+
+
+def _environment(caption: str, columns: Sequence[str], lines: Sequence[str]) -> str:
     return "\n".join(
         [
             r"\begin{table}",
             rf"\caption{{{escape(caption)}}}",
             rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
             r"\toprule",
-            " & ".join(map(escape, columns)) + r" \\",
+            _line(map(_heading, columns)),
             r"\midrule",
-            *(" & ".join(map(_coloured, cells)) + r" \\" for cells in rows),
+            *lines,
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{table}",
@@ -89,52 +80,23 @@ def _plain_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[s
     )
 
 
-def _coloured(cell: str) -> str:
+def _line(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _cell(column: Column, row: TableRow) -> str:
+    text = _marked(cell_text(column, row))
+    heat = column.sort_value(row) if column.heat and isinstance(row, RetentionRow) else None
+    return text if heat is None else rf"\cellcolor{{{heat_colour(heat)}}}{text}"
+
+
+def _marked(cell: str) -> str:
     return rf"\textcolor{{red}}{{{escape(cell)}}}" if cell.endswith(ABOVE_CHANCE) else escape(cell)
 
 
-def _retention_table(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference], unpaired: Sequence[str]
-) -> str:
-    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
-    kind = kind_of(rows)
-    acted = [row for row in rows if not is_asked(row)]
-    judged = f" ({rule_name(acted)})" if acted else ""
-    caption = title(f"{RATE[kind]} and retention{judged}", rows)
-    said = [sentence for sentence in (difference_legend(differences), *unpaired) if sentence]
-    columns = _columns(rows, differences)
-    return "\n".join(
-        [
-            "% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}",
-            *colours,
-            r"\begin{table}",
-            rf"\caption{{{escape('. '.join([caption, *said]))}}}",
-            rf"\begin{{tabular}}{{{''.join(kind for _, _, kind in columns)}}}",
-            r"\toprule",
-            " & ".join(_RATE[kind] if name == "SR" else name for name, _, _ in columns) + r" \\",
-            r"\midrule",
-            *_body(rows, differences, columns),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
-
-
-def _body(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference], columns: "Sequence[_Column]"
-) -> list[str]:
-    """Lines with a rule around means and between asked and acting runs."""
-    body: list[str] = []
-    for kind in dict.fromkeys(row.kind for row in rows):
-        of_kind = [row for row in rows if row.kind == kind]
-        body += [r"\midrule"] * bool(body and body[-1] != r"\midrule")
-        lines = compared(of_kind, differences)
-        for before, line in zip([None, *lines], lines, strict=False):
-            new = before is None or (before.category == MEAN) != (line.category == MEAN)
-            body += [r"\midrule"] * bool(body and new and body[-1] != r"\midrule") + [_line(line, columns)]
-    return body
+def _heading(text: str) -> str:
+    """Percent close to its number."""
+    return escape(text).replace(r" \%", r"\,\%")
 
 
 def escape(text: str) -> str:
@@ -142,57 +104,6 @@ def escape(text: str) -> str:
     return "".join(_SPECIAL.get(character, character) for character in text)
 
 
-_RATE: dict[Kind, str] = {"acts": "SR", "asks": "Accuracy", "both": "SR / acc."}
-
-
-def _heading(text: str) -> str:
-    """With a capital, and percent close to its number."""
-    return escape(text[:1].upper() + text[1:]).replace(r" \%", r"\,\%")
-
-
-_Column = tuple[str, Callable[[RetentionRow], str], str]
-_COLUMNS: list[_Column] = [
-    ("Model", model_name, "l"),
-    ("View", view_name, "l"),
-    ("Call", call_value, "r"),
-    ("Category", category_name, "l"),
-    ("$n$", lambda row: str(row.n_episodes), "r"),
-    ("SR", success_value, "r"),
-    ("$p$ (Holm)", DIFFERENCE_TEST[1], "r"),
-    (r"$\Delta$", margin_value, "r"),
-    (r"$\Delta$ (paper)", paper_margin, "r"),
-    ("Prefix", prefix_share, "r"),
-    ("Layer", prefix_place, "r"),
-    ("Action", action_share, "r"),
-    ("Layer", action_place, "r"),
-    ("First it.", first_iteration, "r"),
-    ("Prefix beats", beats, "l"),
-    (r"Retention, bounded [95\,\%]", retention_value, "l"),
-    *((_heading(heading), cell, "l") for heading, cell in FURTHER_RETENTION),
-]
-"""Heading in LaTeX, content as text, alignment."""
-
-
-def _columns(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[_Column]:
-    """Behind the SR, tests of differences and what interventions say, as far as there are any."""
-    more = [(_heading(heading), cell, "l") for heading, cell in FOLLOWED_COLUMNS]
-    place = next(number for number, column in enumerate(_COLUMNS) if column[1] is DIFFERENCE_TEST[1]) + 1
-    columns = [*_COLUMNS[:place], *(more if followed(rows) else []), *_COLUMNS[place:]]
-    return [column for column in columns if differences or column[1] is not DIFFERENCE_TEST[1]]
-
-
-def _line(line: Line, columns: Sequence[_Column]) -> str:
-    return " & ".join(_coloured_retention(cell, line) for _, cell, _ in columns) + r" \\"
-
-
-def _coloured_retention(cell: Callable[[RetentionRow], str], line: Line) -> str:
-    text = escape(cell_of(cell, line))
-    heated = cell is retention_value and isinstance(line, RetentionRow) and line.retention_defined
-    if not heated or line.retention_bounded is None:
-        return text
-    return rf"\cellcolor{{{heat_colour(line.retention_bounded)}}}{text}"
-
-
 def heat_colour(value: float) -> str:
-    """Name of the colour of a retention value."""
+    """Name of the colour of a share or ratio."""
     return next(name for bound, name, _ in HEAT if value < bound)

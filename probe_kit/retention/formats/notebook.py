@@ -6,12 +6,7 @@ from html import escape
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import (
-    HtmlCell,
-    HtmlTable,
-    behaviour_table,
-    retention_table,
-)
+from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables
 from probe_kit.retention.rows.row import RetentionRow
 
 _CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
@@ -20,8 +15,10 @@ _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of t
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The report's first tables, without its page: headings explain themselves when pointed at."""
-    found = [behaviour_table(rows, differences), retention_table(rows, differences)]
-    return _heading(rows) + "".join(_table(one) for one in found if one is not None)
+    found = [
+        table for table in html_tables(rows, differences) if table.subject != "controls" and not table.details
+    ]
+    return _heading(rows) + "".join(map(_table, found))
 
 
 def _safe(text: str) -> str:
@@ -31,7 +28,7 @@ def _safe(text: str) -> str:
 
 def _heading(rows: Sequence[RetentionRow]) -> str:
     """Whose numbers these are, since a table of one model does not repeat its name."""
-    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
+    suites = ", ".join(dict.fromkeys(row.run.suite for row in rows))
     return f"<div>{_safe(_models(rows))} on {_safe(suites)}</div>" if rows else ""
 
 

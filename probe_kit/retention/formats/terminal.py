@@ -1,64 +1,24 @@
-"""Retention tables on a console: one block per run, whole at any width."""
+"""Retention tables on a console: one block per table, whole at any width."""
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
-from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.behaviour.wordings import WordingPair
-from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
-from probe_kit.retention.columns.lines import (
-    Line,
-    behaviour_lines,
-    cell_of,
-    compared,
-    difference_legend,
-    probe_lines,
-)
-from probe_kit.retention.columns.text import (
-    ABOVE_CHANCE,
-    ANSWER_LEGEND,
-    ANSWER_MEASURES,
-    ANSWER_SCORES,
-    CONTROL_PARTS,
-    DIFFERENCE_TEST,
-    FOLLOWED_COLUMNS,
-    FURTHER_RETENTION,
-    RULE_COLUMNS,
-    Column,
-    action_place,
-    action_value,
-    beats,
-    bounded_value,
-    call_words,
-    controlled,
-    first_iteration,
-    margin_value,
-    model_name,
-    number,
-    once_per_category,
-    paper_margin,
-    percent,
-    prefix_place,
-    prefix_value,
-    probed,
-    success_interval,
-)
-from probe_kit.retention.columns.text_table import PlainTable, is_asked
+from probe_kit.retention.columns.conditions import wording_tables
+from probe_kit.retention.columns.lines import TableRow
+from probe_kit.retention.columns.tables import Table, cell_text, tables_of, views_of
+from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, is_vlm, model_name, percent
+from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
-from probe_kit.statistics.significance import detectable
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-_REGIMES: dict[str | None, str] = {
-    Regime.KNOWLEDGE: "knowledge",
-    Regime.NO_RELIABLE_KNOWLEDGE: "not reliable",
-    Regime.FAILURE: "failure",
-}
+_Letters = Mapping[tuple[str | None, str], str]
+"""By group and run, what it is called in a table of several."""
 
 
 def rich_tables(
@@ -66,12 +26,12 @@ def rich_tables(
     differences: Sequence[Difference] = (),
     notes: Sequence[str] = (),
     wordings: Sequence[WordingPair] = (),
-    further: Sequence[PlainTable] = (),
+    further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> "Group":
     """Success rates of all runs in one table, retention and controls in one per view; wordings, more and notes.
 
-    Several runs go by letters, under each other, with their differences below them. Asked runs stand above a rule.
+    Several runs go by letters, under each other, with their differences below them. VLM runs stand above a rule.
     further: tables behind these. unpaired: why runs have no differences.
     """
     from rich.console import Group
@@ -79,42 +39,49 @@ def rich_tables(
     from rich.text import Text
 
     called = _letters(rows)
-    tables: list[ResponsiveTable | Rule | Text] = []
-    for kind, of_kind in groupby(rows, key=lambda row: row.kind):
-        if tables and kind != "asks":
-            tables.append(Rule("asked above, acting below", style="dim"))
-        tables += _of_kind(list(of_kind), differences, called)
-    tables += [Text(sentence, style="yellow") for sentence in unpaired]
-    conditions = condition_tables([], wordings)  # outcome rules are columns of their own here
-    plain = map(_plain, [*conditions, *further])
-    return Group(*tables, *plain, *(Text(note, style="yellow") for note in notes))
+    blocks: list[ResponsiveTable | Rule | Text] = []
+    for of_mode in ([row for row in rows if is_vlm(row)], [row for row in rows if not is_vlm(row)]):
+        if blocks and of_mode:
+            blocks.append(Rule("VLM runs above, policy runs below", style="dim"))
+        tables = [part for table in tables_of(of_mode, differences) for part in views_of(table)]
+        blocks += [_block(table.without_details(), called) for table in tables]
+    blocks += [Text(sentence, style="yellow") for sentence in unpaired]
+    plain = map(_plain, [*wording_tables(wordings), *further])
+    return Group(*blocks, *plain, *(Text(note, style="yellow") for note in notes))
 
 
-def _of_kind(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference], called: "_Letters"
-) -> "list[ResponsiveTable]":
-    """Of asked, or of acting runs."""
-    once = once_per_category(rows)
-    lines = behaviour_lines(once, differences)
-    if is_asked(rows[0]):
-        what, parts, notes = "Accuracy of answers", _ANSWERS, [_ANSWER_LEGEND, ANSWER_LEGEND]
+def _block(table: Table, called: _Letters) -> ResponsiveTable:
+    """One run by its name, several by their letters."""
+    rows = table.run_rows
+    what = f"{table.title}, view {rows[0].view}" if table.by_view else table.title
+    runs = {row.key: row for row in reversed(rows)}
+    suites = ", ".join(dict.fromkeys(row.run.suite for row in rows))
+    if len(called) == 1:
+        name, names = "category", [row.category for row in rows]
+        title, sizes = f"{what}: {model_name(rows[0])} on {suites}", f"{_folder(rows)}, {_sizes(rows)}"
     else:
-        what, parts, notes = "Success rate", _SUCCESS, [_OUTCOME_LEGEND, *rule_sentences(once)]
-    tables = [_of_runs(what, lines, parts, notes, called)]
-    for view in dict.fromkeys(row.view for row in probed(rows)):
-        shown = [row for row in rows if row.view == view]
-        reasons = dict.fromkeys(row.retention_note for row in shown if row.retention_note)
-        legend = [_SITE_LEGEND, *reasons, *_judged(shown)]
-        tables.append(
-            _of_runs(f"Retention, view {view}", probe_lines(shown, differences), _RETENTION, legend, called)
-        )
-        if controlled(shown):
-            legend = [_control_legend(shown)]
-            tables.append(_of_runs(f"Controls, view {view}", compared(shown), _CONTROLS, legend, called))
-    return tables
+        shown = [key for key in called if key in runs]
+        title = f"{what}: {', '.join(f'{called[key]} {model_name(runs[key])}' for key in shown)} on {suites}"
+        name, names = "category · run", [f"{row.category} {_short(row, rows, called)}" for row in table.rows]
+        sizes = _sizes_of({called[key]: [row for row in rows if row.key == key] for key in shown})
+    return ResponsiveTable(
+        title=title,
+        caption=" ".join([f"{sizes}.", *table.captions]),
+        name=name,
+        names=tuple(names),
+        styles=tuple(map(_style, table.rows)),
+        parts=tuple(
+            Part(
+                part.title,
+                tuple(column.heading for column in part.columns),
+                tuple(tuple(_coloured(cell_text(column, row)) for column in part.columns) for row in table.rows),
+            )
+            for part in table.parts
+        ),
+    )
 
 
-def _plain(table: PlainTable) -> ResponsiveTable:
+def _plain(table: TextTable) -> ResponsiveTable:
     """Its first columns name the rows."""
     fixed = 1 if table.columns[0] == "category" else 2
     return ResponsiveTable(
@@ -133,95 +100,19 @@ def _plain(table: PlainTable) -> ResponsiveTable:
     )
 
 
-def _judged(rows: Sequence[RetentionRow]) -> list[str]:
-    """A warning where nothing but chance was beaten, because nothing else was tried."""
-    found = [row.prefix_beats for row in rows if row.prefix_beats]
-    tried = any(better is not None for beats in found for name, better in beats.items() if name != "chance")
-    mark = "signal is judged against chance only: add the controls binding and twin"
-    return [mark] if found and not tried else []
+def _style(row: TableRow) -> str:
+    return " ".join(["bold"] * (row.category == MEAN) + ["italic"] * isinstance(row, Difference))
 
 
-def _regime(row: RetentionRow) -> str:
-    if row.sr is None:
-        return "did not act" if row.capture_only else "n/a"
-    return f"score {number(row.normalised_score, 1)}" if row.regime is None else _REGIMES[row.regime]
+def _coloured(cell: str) -> Cell:
+    return Cell(cell, "bold red" if cell.endswith(ABOVE_CHANCE) else "")
 
 
-def _sides(row: RetentionRow) -> str:
-    return f"{percent(row.sr_left, 0)} / {percent(row.sr_right, 0)}"
-
-
-_OUTCOME_LEGEND = (
-    "Δ decides the regime, over as many items as count; wrong, outside, never moved (part of outside): each in % "
-    "of all episodes"
-)
-_SITE_LEGEND = (
-    "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
-    "of which the first sees no action yet; p family-wise"
-)
-
-_ANSWER_LEGEND = "wrong, unread (no answer, or several): each in % of all"
-
-_ANSWERS: dict[str, Sequence[Column]] = {
-    "Does it know the answer?": [
-        ("accuracy % [95 %]", success_interval),
-        DIFFERENCE_TEST,
-        ("± Δ", margin_value),
-        ("regime", _regime),
-        ("left / right", _sides),
-    ],
-    "How it answered": [
-        ("wrong", lambda row: percent(row.p_wrong)),
-        ("unread", lambda row: percent(row.p_oob)),
-        *(column for column in ANSWER_SCORES if column[0] != "unreadable"),  # that is: unread
-        *ANSWER_MEASURES,
-    ],
-}
-_SUCCESS: dict[str, Sequence[Column]] = {
-    "Does it act on the answer?": [
-        ("SR % [95 %]", success_interval),
-        DIFFERENCE_TEST,
-        ("± Δ", margin_value),
-        ("paper's Δ", paper_margin),
-        ("regime", _regime),
-        ("left / right", _sides),
-        *FOLLOWED_COLUMNS,
-    ],
-    "Where the cube ended": [
-        ("wrong", lambda row: percent(row.p_wrong)),
-        ("outside", lambda row: percent(row.p_oob)),
-        ("never moved", lambda row: percent(row.p_never_moved)),
-    ],
-    "What the outcome rule makes of it": RULE_COLUMNS,
-}
-_RETENTION: dict[str, Sequence[Column]] = {
-    "In the backbone": [
-        ("backbone % [95 %]", prefix_value),
-        ("layer", prefix_place),
-        ("p", lambda row: number(row.prefix_p_fwe, 3)),
-        ("beats", beats),
-    ],
-    "Where the action is made": [
-        ("action % [95 %]", action_value),
-        ("layer", action_place),
-        ("p", lambda row: number(row.action_p_fwe, 3)),
-        ("first iteration %", first_iteration),
-    ],
-    "What is retained": [
-        ("bounded [95 %]", bounded_value),
-        *FURTHER_RETENTION,
-        ("gap", lambda row: percent(row.gap)),
-    ],
-}
-_CONTROLS: dict[str, Sequence[Column]] = CONTROL_PARTS
-
-
-_Letters = Mapping[tuple[str | None, str], str]
-"""By group and run, what it is called in a table of several."""
+# -- names of several runs -----------------------------------------------------------------------------------
 
 
 def _letters(rows: Sequence[RetentionRow]) -> _Letters:
-    runs = dict.fromkeys((row.group, row.run) for row in rows)
+    runs = dict.fromkeys(row.key for row in rows)
     return {run: _letter(at) for at, run in enumerate(runs)}
 
 
@@ -231,81 +122,18 @@ def _letter(at: int) -> str:
     return chr(ord("A") + place) + (str(round_ + 1) if round_ else "")
 
 
-def _of_runs(
-    what: str,
-    lines: Sequence[Line],
-    parts: Mapping[str, Sequence[Column]],
-    notes: Sequence[str],
-    called: _Letters,
-) -> ResponsiveTable:
-    """One run by its name, several by their letters."""
-    rows = [line for line in lines if isinstance(line, RetentionRow)]
-    runs = {(row.group, row.run): row for row in reversed(rows)}
-    suites = ", ".join(dict.fromkeys(row.suite for row in rows))
-    if len(called) == 1:
-        name, names = "category", [row.category for row in rows]
-        title, sizes = f"{what}: {model_name(rows[0])} on {suites}", f"{_folder(rows)}, {_sizes(rows)}"
-    else:
-        shown = [key for key in called if key in runs]
-        title = f"{what}: {', '.join(f'{called[key]} {model_name(runs[key])}' for key in shown)} on {suites}"
-        name, names = "category · run", [f"{line.category} {_short(line, rows, called)}" for line in lines]
-        sizes = _sizes_of({called[key]: [r for r in rows if (r.group, r.run) == key] for key in shown})
-    tested = any(DIFFERENCE_TEST in columns for columns in parts.values())
-    legend = difference_legend([line for line in lines if isinstance(line, Difference)], tested)
-    return _fitting(title, "; ".join(filter(None, [sizes, *notes, legend])), name, names, lines, parts)
-
-
-def _short(line: Line, rows: Sequence[RetentionRow], called: _Letters) -> str:
+def _short(row: TableRow, rows: Sequence[RetentionRow], called: _Letters) -> str:
     """A run's letter, or those of two; a group of several runs by its name."""
-    if isinstance(line, RetentionRow):
-        return called[line.group, line.run]
+    if isinstance(row, RetentionRow):
+        return called[row.key]
     letters: dict[str, list[str]] = {}
-    for row in rows:
-        letters.setdefault(model_name(row) if row.group is None else row.group, []).append(
-            called[row.group, row.run]
-        )
-    sides = ["".join(dict.fromkeys(letters[side])) for side in (line.group, line.minus)]
-    return " − ".join(sides) + ("" if line.paired else ", other items")
+    for one in rows:
+        letters.setdefault(model_name(one) if one.group is None else one.group, []).append(called[one.key])
+    sides = ["".join(dict.fromkeys(letters[side])) for side in (row.group, row.minus)]
+    return " − ".join(sides) + ("" if row.paired else ", other items")
 
 
-def _fitting(
-    title: str,
-    caption: str,
-    name: str,
-    names: Sequence[str],
-    lines: Sequence[Line],
-    parts: Mapping[str, Sequence[Column]],
-) -> ResponsiveTable:
-    """Columns in which no line has anything to show are left out."""
-    found = []
-    for question, columns in parts.items():
-        shown = [column for column in columns if any(cell_of(column[1], line) not in ("–", "") for line in lines)]
-        cells = tuple(tuple(_coloured(cell_of(cell, line)) for _, cell in shown) for line in lines)
-        if shown:
-            found.append(Part(question, tuple(heading for heading, _ in shown), cells))
-    return ResponsiveTable(
-        title=title,
-        caption=caption,
-        name=name,
-        names=tuple(names),
-        styles=tuple(_style(line) for line in lines),
-        parts=tuple(found),
-    )
-
-
-def _style(line: Line) -> str:
-    return " ".join(["bold"] * (line.category == MEAN) + ["italic"] * isinstance(line, Difference))
-
-
-def _coloured(cell: str) -> Cell:
-    return Cell(cell, "bold red" if cell.endswith(ABOVE_CHANCE) else "")
-
-
-def _control_legend(rows: Sequence[RetentionRow]) -> str:
-    twin = f"; twin: {rows[0].twin}" if rows[0].twin else ""
-    fewest = min(row.n_items for row in rows if row.category != MEAN)
-    seen = f"with {fewest} items a leak of {percent(detectable(fewest))} % is found in 4 of 5 suites"
-    return f"held-out accuracy % without the model, {seen}; selectivity: accuracy above random labels{twin}"
+# -- sizes ---------------------------------------------------------------------------------------------------
 
 
 def _sizes_of(runs: Mapping[str, Sequence[RetentionRow]]) -> str:
@@ -317,24 +145,21 @@ def _sizes_of(runs: Mapping[str, Sequence[RetentionRow]]) -> str:
 
 
 def _folder(rows: Sequence[RetentionRow]) -> str:
-    return f"run {Path(rows[0].run).name}"
+    return f"run {Path(rows[0].run.location).name}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> str:
     """What is the same, or nearly so, in all rows."""
     single = [row for row in rows if row.category != MEAN]
     parts = [
-        f"per category {_span([row.n_episodes for row in single])} episodes",
-        f"{_span([row.n_items for row in single])} items",
+        f"per category {_span([row.success.n_episodes for row in single])} episodes",
+        f"{_span([row.success.n_items for row in single])} items",
     ]
-    if groups := [row.n_groups for row in single if row.n_groups is not None]:
+    if groups := [row.controls.n_groups for row in single if row.controls.n_groups is not None]:
         parts.append(f"{_span(groups)} groups")
-    flags = [percent(row.p_flagged) for row in single if row.p_flagged is not None]
-    if flags:
-        parts.append(f"no action in {' / '.join(dict.fromkeys(flags))} % of steps (flagged)")
-    if calls := sorted({row.call for row in single if row.call is not None}):
+    if calls := sorted({row.run.call for row in single if row.run.call is not None}):
         parts.append("; ".join(map(call_words, calls)))
-    if chances := {percent(row.chance) for row in single if row.chance is not None}:
+    if chances := {percent(row.controls.chance) for row in single if row.controls.chance is not None}:
         parts.append(f"chance {' or '.join(sorted(chances))} %")
     return ", ".join(parts)
 

@@ -13,53 +13,56 @@ from probe_kit.retention.text import spell
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import ResponsiveTable
 
-Said = Verdict | Literal["known", "unknown"]
+CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, not acted on"]
+"""A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
 
 _READ = {True: "can be read in the policy's backbone", False: "cannot be read in its backbone"}
-_ACTED: dict[Said, str] = {
+_ACTED: dict[CategoryVerdict, str] = {
     "used": "the policy acts on it",
     "encoded, unused": "the policy does not act on it",
+    "acted on": "the policy acts on it",
+    "encoded, not acted on": "the policy does not act on it",
     "absent": "the policy does not act on it",
     "does not follow": "the policy does not act on it",
     "encoded, acted against": "the policy does the opposite",
-    "acted against, not found": "the policy does the opposite all the same",
+    "acted against, not found": "the policy does the opposite",
     "acts against": "the policy does the opposite",
-    "acted on, not found": "the policy acts on it all the same, so that the probes missed it",
+    "acted on, not found": "the policy acts on it although the probes did not find it",
     "follows": "the policy acts on it",
     "inconclusive": "whether the policy acts on it remains open",
 }
 
 
-def verdict(row: RetentionRow) -> Said:
+def verdict(row: RetentionRow) -> CategoryVerdict:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
-    In the backbone: its best site beats chance, family-wise, and every control that was run. Acted on: the action
-    follows the pictures when these are exchanged; without a stored intervention, the SR is in the regime of
-    knowledge. *Acted on, not found* is a contradiction, and true of no policy: the instrument missed what the
-    policy plainly reads. A model that was asked knows a category in which it answers in the regime of knowledge.
+    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored image
+    swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says *acted
+    on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed what the
+    policy acts on. A VLM knows a category in which it answers in the regime of knowledge.
     """
-    if row.kind == "asks":
-        return "known" if row.regime == Regime.KNOWLEDGE else "unknown"
-    if row.used is not None:
-        return cast("Verdict", row.used)
-    if row.regime == Regime.KNOWLEDGE:
-        return "used" if row.prefix_signal else "acted on, not found"
-    return "encoded, unused" if row.prefix_signal else "absent"
+    if row.run.mode == "answers":
+        return "known" if row.success.regime == Regime.KNOWLEDGE else "unknown"
+    if row.image_swap.used is not None:
+        return cast("Verdict", row.image_swap.used)
+    if row.success.regime == Regime.KNOWLEDGE:
+        return "acted on" if row.backbone.has_signal else "acted on, not found"
+    return "encoded, not acted on" if row.backbone.has_signal else "absent"
 
 
 @dataclass(frozen=True)
-class Chapter:
-    """One category: of the reader that was asked (None where nobody was), of the probes, and of the action.
+class CategorySummary:
+    """One category: of the VLM (None without one), of the probes, and of the action.
 
-    sr, known_sr, backbone: shares of right episodes, answers and held-out probe decisions.
+    sr, reader_sr, backbone: shares of right episodes, answers and held-out probe decisions.
     """
 
     category: str
-    known: bool | None
-    known_sr: float | None
+    reader_above_chance: bool | None
+    reader_sr: float | None
     encoded: bool
     backbone: float | None
-    used: Said
+    verdict: CategoryVerdict
     sr: float | None
 
     @property
@@ -71,29 +74,31 @@ class Chapter:
     @property
     def outcome(self) -> str:
         """The three in a few words."""
-        known = {True: "known; ", False: "not known; ", None: ""}[self.known]
-        return known + str(self.used)
+        known = {True: "known; ", False: "not known; ", None: ""}[self.reader_above_chance]
+        return known + str(self.verdict)
 
     @property
     def sentence(self) -> str:
         """The same in plain words, with the numbers they rest on."""
         parts = []
-        if self.known is not None:
-            answered = f"answers {percent(self.known_sr)} % of the questions right"
-            parts.append(f"the reader {'knows it' if self.known else 'does not know it'} ({answered})")
+        if self.reader_above_chance is not None:
+            answered = f"answers {percent(self.reader_sr)} % of the questions right"
+            parts.append(
+                f"the reader {'knows it' if self.reader_above_chance else 'does not know it'} ({answered})"
+            )
         parts.append(f"the answer {_READ[self.encoded]} (probe {percent(self.backbone)} %)")
         right = f" (right in {percent(self.sr)} % of the episodes)" if self.sr is not None else ""
-        parts.append(f"{_ACTED[self.used]}{right}")
+        parts.append(f"{_ACTED[self.verdict]}{right}")
         return f"{self.name}: {', '.join(parts[:-1])}, and {parts[-1]}."
 
 
 @dataclass(frozen=True)
-class Story:
-    """A policy's chapters. reader: what was asked beside it, empty for nobody."""
+class PolicySummary:
+    """A policy's categories. reader: what was asked beside it, empty for nobody."""
 
     policy: str
     reader: str
-    chapters: tuple[Chapter, ...]
+    categories: tuple[CategorySummary, ...]
 
     def to_rich(self) -> "ResponsiveTable":
         """A line per category: known, encoded and used, with the share each rests on."""
@@ -102,25 +107,29 @@ class Story:
         marks = {True: "yes", False: "no", None: "not asked"}
         cells = tuple(
             (
-                Cell(f"{marks[one.known]} ({percent(one.known_sr)})" if one.known is not None else marks[None]),
+                Cell(
+                    f"{marks[one.reader_above_chance]} ({percent(one.reader_sr)})"
+                    if one.reader_above_chance is not None
+                    else marks[None]
+                ),
                 Cell(f"{marks[one.encoded]} ({percent(one.backbone)})"),
-                Cell(f"{one.used} ({percent(one.sr)})"),
+                Cell(f"{one.verdict} ({percent(one.sr)})"),
             )
-            for one in self.chapters
+            for one in self.categories
         )
         return ResponsiveTable(
             title=f"Known, encoded, used: {' · '.join(name for name in (self.reader, self.policy) if name)}",
             caption="known: share of answers the reader gets right, %; encoded: of held-out decisions of the best "
             "probe; used: the verdict, and the share of episodes that end on the right picture",
             name="category",
-            names=tuple(one.name for one in self.chapters),
-            styles=("",) * len(self.chapters),
+            names=tuple(one.name for one in self.categories),
+            styles=("",) * len(self.categories),
             parts=(Part("", ("known", "encoded", "used"), cells),),
         )
 
 
-def stories(rows: Sequence[RetentionRow]) -> list[Story]:
-    """One per probed policy of a retention table, by the first view of each, beside the first asked run.
+def policy_summaries(rows: Sequence[RetentionRow]) -> list[PolicySummary]:
+    """One per probed policy of a retention table, by the first view of each, beside the first VLM run.
 
     Runs that only captured, or not probed, have none; so have policies on another suite than the reader's
     no reader.
@@ -129,33 +138,37 @@ def stories(rows: Sequence[RetentionRow]) -> list[Story]:
     acted: dict[str, list[RetentionRow]] = {}
     for row in rows:
         if (
-            row.kind == "acts"
+            row.run.mode == "acts"
             and row.category != MEAN
-            and not row.capture_only
-            and row.prefix_accuracy is not None
+            and not row.run.capture_only
+            and row.backbone.accuracy is not None
         ):
-            acted.setdefault(row.run, []).append(row)
+            acted.setdefault(row.run.location, []).append(row)
     return [_story([row for row in own if row.view == own[0].view], asked) for own in acted.values()]
 
 
 def _asks_for_the_answer(row: RetentionRow) -> bool:
-    return row.kind == "asks" and row.asked_for in (None, "target") and row.picture != "none"
+    return (
+        row.run.mode == "answers" and row.answers.asked_for in (None, "target") and row.answers.picture != "none"
+    )
 
 
-def _story(rows: Sequence[RetentionRow], asked: Sequence[RetentionRow]) -> Story:
-    same = [row for row in asked if row.suite == rows[0].suite]
-    first = {row.category: row for row in same if row.run == same[0].run}
+def _story(rows: Sequence[RetentionRow], asked: Sequence[RetentionRow]) -> PolicySummary:
+    same = [row for row in asked if row.run.suite == rows[0].run.suite]
+    first = {row.category: row for row in same if row.run.location == same[0].run.location}
     reader = model_name(same[0]) if same else ""
-    return Story(model_name(rows[0]), reader, tuple(_chapter(row, first.get(row.category)) for row in rows))
+    return PolicySummary(
+        model_name(rows[0]), reader, tuple(_chapter(row, first.get(row.category)) for row in rows)
+    )
 
 
-def _chapter(row: RetentionRow, asked: RetentionRow | None) -> Chapter:
-    return Chapter(
+def _chapter(row: RetentionRow, asked: RetentionRow | None) -> CategorySummary:
+    return CategorySummary(
         category=row.category,
-        known=None if asked is None else verdict(asked) == "known",
-        known_sr=None if asked is None else asked.sr,
-        encoded=row.prefix_signal,
-        backbone=row.prefix_accuracy,
-        used=verdict(row),
-        sr=row.sr,
+        reader_above_chance=None if asked is None else verdict(asked) == "known",
+        reader_sr=None if asked is None else asked.success.sr,
+        encoded=row.backbone.has_signal,
+        backbone=row.backbone.accuracy,
+        verdict=verdict(row),
+        sr=row.success.sr,
     )

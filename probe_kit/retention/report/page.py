@@ -8,28 +8,24 @@ from typing import Any
 from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.conditions import condition_tables, rule_sentences
-from probe_kit.retention.columns.glossary import glossary_of
-from probe_kit.retention.columns.known_used_table import join_tables
-from probe_kit.retention.columns.modes import Kind, heading, kind_of
+from probe_kit.retention.columns.conditions import wording_tables
+from probe_kit.retention.columns.glossary import glossary
+from probe_kit.retention.columns.known_used_table import known_used_tables
+from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.report_figures import Exhibit, gallery
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.heat import heat_key
-from probe_kit.retention.formats.html import (
-    behaviour_table,
-    control_table,
-    more_behaviour_table,
-    plain_tables,
-    retention_table,
-)
+from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.report.category_summary import stories
+from probe_kit.retention.report.category_summary import policy_summaries
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.pictures import data_uri
 from probe_kit.retention.report.provenance import citation, provenance
 from probe_kit.retention.report.summaries import Summary, summarise
-from probe_kit.retention.rows.outcome_rules import by_rule
-from probe_kit.retention.table import RetentionTable, retention
+from probe_kit.retention.rows.outcome_rules import under_rule
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.version import __version__
 
@@ -72,35 +68,31 @@ def report_html(
     """The page as text; the same runs and probes give the same text. See `write_report`."""
     if not runs:
         raise UsageError("a report needs at least one run")
-    table = table or retention(runs)
-    called = {row.run: model_name(row) for row in table.rows}
-    as_judged = [by_rule(run, table.rule, table.last_steps) for run in runs]
-    exhibits = [exhibit for exhibit in gallery(runs, table) if not exhibit.is_table]
+    table = table or retention_table(runs)
+    called = {row.run.location: model_name(row) for row in table.rows}
+    as_judged = [under_rule(run, table.rule, table.last_steps) for run in runs]
+    exhibits = [exhibit for exhibit in collect_figures(runs, table) if not exhibit.is_table]
     names = [called[str(run.location)] for run in runs]
     joins = joins_of(runs, table)
     sentence, bibtex = citation(runs)
     rows = table.all_rows
-    kind = kind_of(rows)
+    modes = modes_of(rows)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
     return _render(
         places,
-        kind=kind,
-        answered=_ANSWERED[kind],
+        modes=modes,
+        answered=_ANSWERED[modes],
         title=listed(names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         random_weights=any(run.random_weights for run in runs),
-        stories=stories(table.rows),
+        policy_summaries=policy_summaries(table.rows),
         summaries=_summaries(table),
         notes=table.notes,
-        behaviour=behaviour_table(rows, table.differences, table.unpaired),
-        more_behaviour=more_behaviour_table(rows),
-        retention=retention_table(rows, table.differences),
-        controls=control_table(rows),
-        rules=rule_sentences(rows),
-        conditions=plain_tables(condition_tables(rows, table.wordings)),
+        tables={subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")},
+        wordings=plain_tables(wording_tables(table.wordings)),
         further=plain_tables(table.further_tables),
-        joined=plain_tables([one for joined in joins.found for one in join_tables(joined)]),
+        joined=plain_tables([one for joined in joins.found for one in known_used_tables(joined)]),
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
         pictures={
             subject: _pictures(exhibits, subject, names)
@@ -112,16 +104,16 @@ def report_html(
             provenance(name, run, table.results.get(str(run.location)))
             for name, run in zip(names, runs, strict=True)
         ],
-        glossary={heading(word, kind): said for word, said in glossary_of(kind).items()},
+        glossary=glossary(modes),
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
     )
 
 
-_ANSWERED: dict[Kind, str] = {
+_ANSWERED: dict[Modes, str] = {
     "acts": "the answer is where the cube ends",
-    "asks": "the answer is what the model says",
+    "answers": "the answer is what the model says",
     "both": "a policy answers by where the cube ends, a model that was asked by what it says",
 }
 
@@ -144,12 +136,20 @@ def _render(places: tuple[str, ...], **content: Any) -> str:
     return environment.get_template("page.html.jinja").render(**assets, **content)
 
 
+def _tables(rows: Sequence[RetentionRow], table: RetentionTable, subject: str) -> list[HtmlTable]:
+    return [one for one in html_tables(rows, table.differences, table.unpaired) if one.subject == subject]
+
+
 def _summaries(table: RetentionTable) -> list[list[Summary]]:
     """Per run, one summary per view."""
     found: dict[tuple[str | None, str], list[Summary]] = {}
     for mean in table.means:
-        own = [r for r in table.rows if (r.group, r.run, r.view) == (mean.group, mean.run, mean.view)]
-        found.setdefault((mean.group, mean.run), []).append(summarise([*own, mean]))
+        own = [
+            r
+            for r in table.rows
+            if (r.group, r.run.location, r.view) == (mean.group, mean.run.location, mean.view)
+        ]
+        found.setdefault((mean.group, mean.run.location), []).append(summarise([*own, mean]))
     return list(found.values())
 
 
@@ -159,7 +159,7 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -> list[list[Picture]]:
+def _pictures(exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str]) -> list[list[Picture]]:
     """Figures of one subject by kind: those of several runs stand beside each other.
 
     All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
@@ -180,5 +180,5 @@ def _pictures(exhibits: Sequence[Exhibit], subject: str, names: Sequence[str]) -
     return list(found.values())
 
 
-def _kind(exhibit: Exhibit) -> str:
+def _kind(exhibit: ReportFigure) -> str:
     return exhibit.title.partition(",")[0]

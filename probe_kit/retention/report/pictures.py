@@ -3,13 +3,14 @@
 from base64 import b64encode
 from io import BytesIO
 
-from probe_kit.retention.displays.report_figures import Exhibit, caption_of
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.report_figures import caption_of
 
 SVG_LIMIT = 600_000
 """Bytes; a figure of more is kept as pixels."""
 
 
-def data_uri(exhibit: Exhibit) -> tuple[str, str]:
+def data_uri(exhibit: ReportFigure) -> tuple[str, str]:
     """The drawn figure as SVG, or PNG if that would be large, with its caption. A figure gives the same bytes."""
     import matplotlib as mpl
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
@@ -48,7 +48,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
     return Provenance(
         name,
-        Certificate.of_run(run).line,
+        ProvenanceLine.of_run(run).line,
         tuple((key, value) for key, value in facts.items() if value),
         tuple((key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value),
     )
@@ -77,7 +77,7 @@ def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
 
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
     """A sentence for a methods section, and BibTeX."""
-    lines = "; ".join(Certificate.of_run(run).line.replace(" · ", ", ") for run in runs)
+    lines = "; ".join(ProvenanceLine.of_run(run).line.replace(" · ", ", ") for run in runs)
     shares = (
         "Accuracies of answers about" if all(ask_of(run) is not None for run in runs) else "Success rates from"
     )

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.modes import RATE, kind_of
-from probe_kit.retention.columns.text import NOT_ACTED, model_name, percent
-from probe_kit.retention.columns.text_table import is_asked
+from probe_kit.retention.columns.modes import RATE, modes_of
+from probe_kit.retention.columns.text import NOT_ACTED, is_vlm, model_name, percent
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -44,7 +43,7 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
     return Summary(
         name=model_name(mean).replace(" (random weights)", ""),
         view=mean.view,
-        random_weights=mean.random_weights,
+        random_weights=mean.run.random_weights,
         headlines=tuple(_headlines(mean, single)),
         sentences=tuple(_sentences(mean, single)),
         warnings=tuple(_warnings(mean, single)),
@@ -53,167 +52,182 @@ def summarise(rows: Sequence[RetentionRow]) -> Summary:
 
 
 def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
-    rate = Headline(f"{percent(mean.sr)} %", RATE[kind_of([mean])].lower(), "guessing: 50 %")
+    rate = Headline(f"{percent(mean.success.sr)} %", RATE[modes_of([mean])].lower(), "guessing: 50 %")
     found = [
         Headline(NOT_ACTED, "success rate", "it captured activations only and did not act")
-        if mean.capture_only
+        if mean.run.capture_only
         else rate
     ]
-    if mean.prefix_accuracy is not None:
-        found.append(Headline(f"{percent(mean.prefix_accuracy)} %", "backbone", "best probe, mean of categories"))
-    if mean.action_accuracy is not None:
+    if mean.backbone.accuracy is not None:
         found.append(
-            Headline(f"{percent(mean.action_accuracy)} %", mean.action_name, "best probe, mean of categories")
+            Headline(f"{percent(mean.backbone.accuracy)} %", "backbone", "best probe, mean of categories")
         )
-    if mean.prefix_accuracy is not None and mean.action_accuracy is not None:
+    if mean.action.accuracy is not None:
+        found.append(
+            Headline(f"{percent(mean.action.accuracy)} %", mean.run.action_name, "best probe, mean of categories")
+        )
+    if mean.backbone.accuracy is not None and mean.action.accuracy is not None:
         found.append(_retention_headline(mean, rows))
     return found
 
 
 def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
-    if not mean.retention_defined or mean.retention_bounded is None:
+    if not mean.retention.defined or mean.retention.bounded is None:
         return Headline("n/a", "retention", _why_not(rows))
-    return Headline(f"{mean.retention_bounded:.2f}", "retention, bounded", _interval_words(mean))
+    return Headline(f"{mean.retention.bounded:.2f}", "retention, bounded", _interval_words(mean))
 
 
 def _interval_words(row: RetentionRow) -> str:
-    if row.retention_bounded_ci is None:
+    if row.retention.bounded_ci is None:
         return "no interval"
-    low, high = row.retention_bounded_ci
+    low, high = row.retention.bounded_ci
     return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
 
 
 def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = [_behaviour(mean, rows)]
-    if any(row.prefix_accuracy is not None for row in rows):
+    if any(row.backbone.accuracy is not None for row in rows):
         found.append(_knowledge(rows))
-    if any(row.retention is not None for row in rows):
+    if any(row.retention.published is not None for row in rows):
         found.append(_retention(mean, rows))
-    if mean.gap is not None and any(row.prefix_signal for row in rows):
+    if mean.controls.probe_minus_sr is not None and any(row.backbone.has_signal for row in rows):
         found.append(
-            f"On average the backbone's best probe is right {abs(100 * mean.gap):.0f} points "
-            f"{'more' if mean.gap >= 0 else 'less'} often than {_what_is_judged(mean)}."
+            f"On average the backbone's best probe is right {abs(100 * mean.controls.probe_minus_sr):.0f} points "
+            f"{'more' if mean.controls.probe_minus_sr >= 0 else 'less'} often than {_what_is_judged(mean)}."
         )
     return found
 
 
 def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    if mean.capture_only:
+    if mean.run.capture_only:
         return "The model was captured at the first picture of every episode and did not act: no success rate."
-    knows = [row for row in rows if row.regime == Regime.KNOWLEDGE]
-    fails = [row for row in rows if row.regime == Regime.FAILURE]
-    right = "It answers right in" if is_asked(mean) else "The cube ended on the correct picture in"
-    text = f"{right} {percent(mean.sr)} % of episodes, averaged over categories. "
+    knows = [row for row in rows if row.success.regime == Regime.KNOWLEDGE]
+    fails = [row for row in rows if row.success.regime == Regime.FAILURE]
+    right = "It answers right in" if is_vlm(mean) else "The cube ended on the correct picture in"
+    text = f"{right} {percent(mean.success.sr)} % of episodes, averaged over categories. "
     text += f"In {_of(knows, rows)} that is more than guessing explains"
     return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
 
 
 def _what_is_judged(mean: RetentionRow) -> str:
-    return "its answers" if is_asked(mean) else "the policy"
+    return "its answers" if is_vlm(mean) else "the policy"
 
 
 def _knowledge(rows: Sequence[RetentionRow]) -> str:
-    backbone = [row for row in rows if row.prefix_signal]
-    expert = [row for row in rows if row.action_signal]
+    backbone = [row for row in rows if row.backbone.has_signal]
+    expert = [row for row in rows if row.action.has_signal]
     text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
-    if any(row.action_accuracy is not None for row in rows):
-        text += f", and in the {rows[0].action_name} in {_of(expert, rows)}"
+    if any(row.action.accuracy is not None for row in rows):
+        text += f", and in the {rows[0].run.action_name} in {_of(expert, rows)}"
     return f"{text}."
 
 
 def _judge(rows: Sequence[RetentionRow]) -> str:
     """What had to be beaten."""
-    names = [name for name in ("binding", "twin") if any(row.prefix_beats.get(name) is not None for row in rows)]
+    names = [
+        name
+        for name in ("binding", "untrained")
+        if any(row.backbone.exceeds.get(name) is not None for row in rows)
+    ]
     *first, last = ["chance", *names]
     return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
 
 
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    counted = [row for row in rows if row.retention_defined]
-    if not counted or mean.retention_bounded is None:
+    counted = [row for row in rows if row.retention.defined]
+    if not counted or mean.retention.bounded is None:
         return f"Retention is not defined: {_why_not(rows)}."
     left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
     return (
-        f"Of what can be read in the backbone above chance, a share of {mean.retention_bounded:.2f} can still be "
-        f"read in the {mean.action_name} ({_interval_words(mean)}), over {_of(counted, rows, names=False)}{left}."
+        f"Of what can be read in the backbone above chance, a share of {mean.retention.bounded:.2f} can still be "
+        f"read in the {mean.run.action_name} ({_interval_words(mean)}), "
+        f"over {_of(counted, rows, names=False)}{left}."
     )
 
 
 def _why_not(rows: Sequence[RetentionRow]) -> str:
     """What keeps categories from having a retention, each reason once."""
-    notes = [row.retention_note for row in rows if not row.retention_defined]
+    notes = [row.retention.note for row in rows if not row.retention.defined]
     return "; ".join(dict.fromkeys(note.removeprefix("n/a (").removesuffix(")") for note in notes))
 
 
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = []
-    if mean.random_weights:
+    if mean.run.random_weights:
         found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
-    found += _unread(mean) if is_asked(mean) else _unmoved(mean)
-    biased = [row for row in rows if row.side_preference is not None and abs(row.side_preference - 0.5) > 0.25]
+    found += _unread(mean) if is_vlm(mean) else _unmoved(mean)
+    biased = [
+        row
+        for row in rows
+        if row.success.side_preference is not None and abs(row.success.side_preference - 0.5) > 0.25
+    ]
     if biased:
-        habit = "The answers have a habit of naming" if is_asked(mean) else "The policy has a habit of going to"
+        habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
         found.append(f"{habit} one side in {_of(biased, rows)}.")
-    if mean.leaks:
+    if mean.controls.leaks:
         found.append(
-            f"The suite gives answers away without a model ({', '.join(mean.leaks)}): see the controls before "
-            "believing a probe."
+            f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the "
+            "controls before believing a probe."
         )
     return found
 
 
 def _unread(mean: RetentionRow) -> list[str]:
     """What would be misread of a model that was asked."""
-    if (mean.p_oob or 0) <= _MOSTLY:
+    if (mean.success.share_outside or 0) <= _MOSTLY:
         return []
-    return [f"No answer could be read in {percent(mean.p_oob)} % of episodes: it may know more than it says."]
+    unread = percent(mean.success.share_outside)
+    return [f"No answer could be read in {unread} % of episodes: it may know more than it says."]
 
 
 def _unmoved(mean: RetentionRow) -> list[str]:
     """What would be misread of a policy."""
     found = []
-    if (mean.p_never_moved or 0) > _MOSTLY:
+    if (mean.success.share_never_moved or 0) > _MOSTLY:
         found.append(
-            f"The cube never moved in {percent(mean.p_never_moved)} % of episodes: the policy does not grasp, so "
-            "its success rate says nothing about what it knows."
+            f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
+            "the policy does not grasp, so its success rate says nothing about what it knows."
         )
-    elif (mean.p_oob or 0) > _MOSTLY:
-        found.append(f"The cube reached neither picture in {percent(mean.p_oob)} % of episodes.")
-    if mean.p_flagged:
+    elif (mean.success.share_outside or 0) > _MOSTLY:
+        found.append(f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes.")
+    if mean.success.share_invalid_action:
         found.append(
-            f"In {percent(mean.p_flagged)} % of its steps the policy put out something that is no action."
+            f"In {percent(mean.success.share_invalid_action)} % of its steps the policy put out "
+            "something that is no action."
         )
     return found
 
 
 def read_row(row: RetentionRow) -> list[str]:
     """One category in sentences."""
-    if row.sr is None:
+    if row.success.sr is None:
         found = [
-            f"Listened to in {row.n_episodes} episodes; it did not act."
-            if row.capture_only
-            else f"{RATE[kind_of([row])]} {row.regime_reason}."
+            f"Captured in {row.success.n_episodes} episodes; it did not act."
+            if row.run.capture_only
+            else f"{RATE[modes_of([row])]} {row.success.reason}."
         ]
     else:
-        right = round(row.sr * row.n_episodes)
-        found = [f"Right in {right} of {row.n_episodes} episodes ({row.regime}: {row.regime_reason})."]
-    if row.items_both_right is not None:
-        items = row.items_both_right + (row.items_one_right or 0) + (row.items_none_right or 0)
-        found.append(f"{row.items_both_right} of {items} questions right in both layouts.")
-    if row.prefix_accuracy is not None:
+        right = round(row.success.sr * row.success.n_episodes)
+        found = [
+            f"Right in {right} of {row.success.n_episodes} episodes ({row.success.regime}: {row.success.reason})."
+        ]
+    if (paired := row.success.paired) is not None:
+        items = paired.both + paired.one + paired.none
+        found.append(f"{paired.both} of {items} questions right in both layouts.")
+    if row.backbone.accuracy is not None:
         found.append(
-            f"In the backbone a probe is right in {percent(row.prefix_accuracy)} % at best, at depth "
-            f"{row.prefix_depth:.2f}{_ties_words(row.prefix_ties)}: "
-            f"{_clear_words(row.prefix_p_fwe, row.prefix_beats)}."
+            f"In the backbone a probe is right in {percent(row.backbone.accuracy)} % at best, at depth "
+            f"{row.backbone.depth:.2f}{_ties_words(row.backbone.ties)}: "
+            f"{_clear_words(row.backbone.p_fwe, row.backbone.exceeds)}."
         )
-    if row.action_accuracy is not None:
-        step = "" if row.action_iteration is None else f", iteration {row.action_iteration}"
+    if row.action.accuracy is not None:
+        step = "" if row.action.iteration is None else f", iteration {row.action.iteration}"
         found.append(
-            f"In the {row.action_name} {percent(row.action_accuracy)} %, at depth {row.action_depth:.2f}{step}"
-            f"{_ties_words(row.action_ties)}: {_clear_words(row.action_p_fwe, row.action_beats)}."
+            f"In the {row.run.action_name} {percent(row.action.accuracy)} %, at depth {row.action.depth:.2f}{step}"
+            f"{_ties_words(row.action.ties)}: {_clear_words(row.action.p_fwe, row.action.exceeds)}."
         )
-    if row.retention_defined and row.retention_bounded is not None:
-        found.append(f"Bounded retention {row.retention_bounded:.2f} ({_interval_words(row)}).")
+    if row.retention.defined and row.retention.bounded is not None:
+        found.append(f"Bounded retention {row.retention.bounded:.2f} ({_interval_words(row)}).")
     return found
 
 
@@ -224,7 +238,7 @@ def _ties_words(ties: int | None) -> str:
 def _clear_words(p: float | None, beats: Beats) -> str:
     if p is None:
         return "not tested, for lack of relabellings"
-    controls = {"binding": "an untrained conjunction of pictures and words", "twin": "its twin"}
+    controls = {"binding": "an untrained conjunction of pictures and words", "untrained": "the untrained network"}
     equals = [words for name, words in controls.items() if beats.get(name) is False]
     clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
     return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"

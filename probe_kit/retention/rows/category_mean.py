@@ -1,72 +1,50 @@
 """The average over the categories of one run, with its intervals."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from operator import attrgetter
 from statistics import fmean
 from typing import Any
 
-from probe_kit.retention.behaviour.success_rate import normalised_score
+from probe_kit.retention.behaviour.success_rate import SuccessRate, normalised_score
 from probe_kit.retention.estimators.bootstrap_draws import UNBOUNDED, Estimates, Limits, average
-from probe_kit.retention.rows.build import Drawn
-from probe_kit.retention.rows.outcome_rules import mean_part
+from probe_kit.retention.rows.build import RowWithDraws
+from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
+from probe_kit.retention.rows.parts import ActionPeak, BackbonePeak, ControlScores, RetentionScores, SwapEffect
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
-_AVERAGED = (
-    "sr_original", "sr_swapped", "sr_left", "sr_right", "p_wrong", "p_oob", "p_never_moved", "p_flagged", "chance",
-    "prefix_accuracy", "action_accuracy", "gap", "prefix_selectivity", "action_selectivity", "prefix_twin",
-    "action_twin", "action_first_accuracy", "accuracy_text", "accuracy_logits", "accuracy_debiased",
-    "p_unreadable", "option_mass", "letter_bias", "p_near_tie", "follow_rate", "reversal_rate", "net_follow_rate",
-)  # fmt: skip
-_OF_THE_RUN = ("kind", "prompt", "picture", "picture_size", "asked_for", "score")
 
-
-def mean_row(drawn: Sequence[Drawn]) -> RetentionRow:
+def mean_row(drawn: Sequence[RowWithDraws], averaged: Sequence[str]) -> RetentionRow:
     """The category average of rows of one run and view; retention over the categories where it is defined.
 
-    Intervals: items, or groups for probes, drawn within each category.
+    averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
+    them, see `probe_kit.retention.columns.columns`. Intervals: items, or groups for probes, drawn within each
+    category.
     """
     rows = [one.row for one in drawn]
     estimates = average_estimates([one.estimates for one in drawn])
-    first, counted = rows[0], [row for row in rows if row.retention_defined]
-    left_out = tuple(row.category for row in rows if row.view is not None and not row.retention_defined)
-    note = f"without {', '.join(left_out)}" if left_out else ""
-    acted = all(row.sr is not None for row in rows)
+    first = rows[0]
+    means = _means(rows, averaged)
     return RetentionRow(
-        run=first.run,
-        model=first.model,
-        label=first.label,
-        call=first.call,
-        random_weights=first.random_weights,
-        weights_sha256=first.weights_sha256,
-        suite=first.suite,
-        run_settings=first.run_settings,
-        probe_settings=first.probe_settings,
-        group=first.group,
         category=MEAN,
-        **{name: getattr(first, name) for name in _OF_THE_RUN},
         view=first.view,
-        action_stream=first.action_stream,
-        n_episodes=sum(row.n_episodes for row in rows),
-        n_items=sum(row.n_items for row in rows),
-        capture_only=first.capture_only,
-        normalised_score=normalised_score([row.sr for row in rows if row.sr is not None]) if acted else None,
-        sr=_mean(rows, "sr"),
-        **vars(mean_part(rows, {name: _limits(estimates, name) for name in ("sr_answered", "sr_grasped")})),
-        sr_ci=_limits(estimates, "sr"),
-        prefix_ci=_limits(estimates, "prefix_accuracy"),
-        action_ci=_limits(estimates, "action_accuracy"),
-        **{name: _mean(rows, name) for name in _AVERAGED},
-        sr_by_epsilon=_mean_by_key([row.sr_by_epsilon for row in rows]),
-        baselines=_mean_by_key([row.baselines for row in rows]),
-        leaks=tuple(dict.fromkeys(name for row in rows for name in row.leaks)),
-        twin=first.twin,
-        retention=_mean(counted, "retention"),
-        retention_debiased=_mean(counted, "retention_debiased"),
-        retention_ci=_retention_limits(counted, estimates, "retention_debiased", "retention_ci"),
-        **_other_retention(counted, estimates),
-        retention_defined=bool(counted),
-        retention_note=note if counted else first.retention_note,
+        group=first.group,
         categories=tuple(row.category for row in rows),
-        left_out=left_out,
+        left_out=_left_out(rows),
+        run=first.run,
+        success=_success(rows, estimates, means["success"]),
+        rules=_rules(rows, estimates, means["rules"]),
+        answers=replace(first.answers, **means["answers"]),
+        backbone=BackbonePeak(ci=_limits(estimates, "backbone_accuracy"), **means["backbone"]),
+        action=ActionPeak(ci=_limits(estimates, "action_accuracy"), **means["action"]),
+        retention=_retention(rows, estimates),
+        controls=ControlScores(
+            baselines=_mean_by_key([row.controls.baselines for row in rows]),
+            leaks=tuple(dict.fromkeys(name for row in rows for name in row.controls.leaks)),
+            untrained=first.controls.untrained,
+            **means["controls"],
+        ),
+        image_swap=SwapEffect(**means["image_swap"]),
     )
 
 
@@ -76,17 +54,70 @@ def average_estimates(estimates: Sequence[Estimates]) -> Estimates:
     return {name: average([found[name] for found in estimates if name in found]) for name in names}
 
 
+_PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
+
+
+def _means(rows: Sequence[RetentionRow], averaged: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """By part, the averages of its fields."""
+    means: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
+    for path in averaged:
+        part, _, name = path.partition(".")
+        means[part][name] = _mean(rows, path)
+    return means
+
+
+def _success(rows: Sequence[RetentionRow], estimates: Estimates, means: dict[str, Any]) -> SuccessRate:
+    rates = [row.success.sr for row in rows if row.success.sr is not None]
+    return SuccessRate(
+        n_episodes=sum(row.success.n_episodes for row in rows),
+        n_items=sum(row.success.n_items for row in rows),
+        ci=_limits(estimates, "sr"),
+        normalised_score=normalised_score(rates) if len(rates) == len(rows) else None,
+        **means,
+    )
+
+
+def _rules(rows: Sequence[RetentionRow], estimates: Estimates, means: dict[str, Any]) -> OutcomeRuleScores:
+    found = [row.rules for row in rows]
+    sides = {one.idle_side for one in found}
+    return OutcomeRuleScores(
+        rule=found[0].rule,
+        rule_words=found[0].rule_words,
+        last_steps=found[0].last_steps,
+        n_answered=_sum([one.n_answered for one in found]),
+        n_grasped=_sum([one.n_grasped for one in found]),
+        sr_answered_ci=_limits(estimates, "sr_answered"),
+        sr_grasped_ci=_limits(estimates, "sr_grasped"),
+        idle_side=sides.pop() if len(sides) == 1 else "both",
+        sr_by_rule=_mean_by_key([one.sr_by_rule for one in found]),
+        sr_by_epsilon=_mean_by_key([one.sr_by_epsilon for one in found]),
+        behaviour=_mean_by_key([one.behaviour for one in found]),
+        **means,
+    )
+
+
+def _left_out(rows: Sequence[RetentionRow]) -> tuple[str, ...]:
+    """Probed categories in which retention is not defined."""
+    return tuple(row.category for row in rows if row.view is not None and not row.retention.defined)
+
+
+def _retention(rows: Sequence[RetentionRow], estimates: Estimates) -> RetentionScores:
+    counted = [row for row in rows if row.retention.defined]
+    if not counted:
+        return RetentionScores(note=rows[0].retention.note)
+    left_out = _left_out(rows)
+    scores: dict[str, Any] = {
+        name: _mean(counted, f"retention.{name}") for name in ("published", "debiased", "bounded", "area")
+    }
+    for name, limits in (("debiased", "ci"), ("bounded", "bounded_ci"), ("area", "area_ci")):
+        scores[limits] = _retention_limits(counted, estimates, f"retention_{name}", limits)
+    note = f"without {', '.join(left_out)}" if left_out else ""
+    return RetentionScores(defined=True, note=note, **scores)
+
+
 def _limits(estimates: Estimates, name: str) -> Limits | None:
     found = estimates.get(name)
     return None if found is None else found.ci
-
-
-def _other_retention(counted: Sequence[RetentionRow], estimates: Estimates) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name in ("retention_bounded", "retention_area"):
-        found[name] = _mean(counted, name)
-        found[f"{name}_ci"] = _retention_limits(counted, estimates, name, f"{name}_ci")
-    return found
 
 
 def _retention_limits(
@@ -96,19 +127,25 @@ def _retention_limits(
 
     Those of several are around their mean, as ratios are skewed.
     """
+    own: list[Limits | None] = [getattr(row.retention, limits) for row in counted]
     if len(counted) == 1:
-        own: Limits | None = getattr(counted[0], limits)
-        return own
-    if any(getattr(row, limits) == UNBOUNDED for row in counted):
+        return own[0]
+    if UNBOUNDED in own:
         return UNBOUNDED
     found = estimates.get(name)
     return None if found is None else found.centred.ci
 
 
-def _mean(rows: Sequence[RetentionRow], name: str) -> Any:
-    """Average of a column over the rows that have it; None if none has."""
-    values = [value for row in rows if (value := getattr(row, name)) is not None]
+def _mean(rows: Sequence[RetentionRow], path: str) -> Any:
+    """Average of a field, as `part.field`, over the rows that have it; None if none has."""
+    read = attrgetter(path)
+    values = [value for row in rows if (value := read(row)) is not None]
     return fmean(values) if values else None
+
+
+def _sum(values: Sequence[int | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
 
 
 def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """What stored interventions add to a row: does the action follow the pictures, and is what can be read used?
 
-Reads what `probe-kit intervene` left in the run; nothing is loaded and nothing is played.
+Reads what `probe-kit intervene` left in the run; no model is loaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,17 +8,17 @@ from dataclasses import replace
 
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
 from probe_kit.intervene.kinds.image_swap.verdict import classify_use, control_for
-from probe_kit.retention.rows.parts import Followed
+from probe_kit.retention.rows.parts import SwapEffect
 from probe_kit.retention.rows.row import RetentionRow
 
 
-def with_following(
+def add_image_swap(
     row: RetentionRow,
     found: Mapping[str, ImageSwapEffect],
     located: Mapping[str, Sequence[str]],
     carried: Mapping[str, Sequence[str]],
 ) -> RetentionRow:
-    """The row with what was found of its category, judged by its own probes.
+    """The row with the effect of the image swap on its category, judged by its own probes.
 
     found: by category; may be empty. located: places that carry it, by category, of those that were searched.
     carried: directions that do.
@@ -26,10 +26,10 @@ def with_following(
     own = found.get(row.category)
     if own is None:
         return row
-    encoded = row.prefix_signal if row.prefix_beats else None
+    encoded = row.backbone.has_signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
     judged = classify_use(encoded, own, control, located.get(category), carried.get(category, ()))
-    part = Followed(
+    effect = SwapEffect(
         follow_rate=own.follow_rate,
         reversal_rate=own.reversal_rate,
         net_follow_rate=own.net_follow_rate,
@@ -38,4 +38,4 @@ def with_following(
         used=judged.verdict,
         used_note=judged.reason,
     )
-    return replace(row, **vars(part))
+    return replace(row, image_swap=effect)

@@ -1,8 +1,7 @@
 """By which outcome rule a success rate was made, what else it leaves unsaid, and what the other rules say."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from statistics import fmean
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
@@ -21,35 +20,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ruled:
+class OutcomeRuleScores:
     """The outcome rule, and what it gives away.
 
     rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
-    n_answered, p_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped, sr_grasped:
-    the same of episodes in which both fingers ever touched the cube. p_answers_unmoved: share of answers whose
-    cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the picture in
-    whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes. p_both: share of
-    episodes whose cube counts for both pictures, which is called correct. sr_by_rule: by every rule, at the last
-    step. behaviour: shares of episodes by what hand and cube did.
-    What is about answers is there for every run with a success rate; the rest is None or empty where the run
-    keeps no trajectories.
+    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped,
+    sr_grasped: the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of
+    answers whose cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the
+    picture in whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes.
+    share_both_zones: share of episodes whose cube counts for both pictures, which is called correct. sr_by_rule:
+    by every rule, at the last step. sr_by_epsilon: by zone radius in metres, for the rule `disc`. behaviour:
+    shares of episodes by what hand and cube did. What is about answers is there for every run with a success rate;
+    the rest is None or empty where the run keeps no trajectories.
     """
 
     rule: str = DEFAULT_RULE
     rule_words: str = ""
     last_steps: int = 1
     n_answered: int | None = None
-    p_answered: float | None = None
+    share_answered: float | None = None
     sr_answered: float | None = None
     sr_answered_ci: Limits | None = None
     n_grasped: int | None = None
     sr_grasped: float | None = None
     sr_grasped_ci: Limits | None = None
-    p_answers_unmoved: float | None = None
+    share_unmoved_answers: float | None = None
     sr_idle: float | None = None
     idle_side: str | None = None
-    p_both: float | None = None
+    share_both_zones: float | None = None
     sr_by_rule: dict[str, float] = field(default_factory=dict)
+    sr_by_epsilon: dict[str, float] = field(default_factory=dict)
     behaviour: dict[str, float] = field(default_factory=dict)
 
 
@@ -68,7 +68,7 @@ class Judgeable(Protocol):
 
 
 @dataclass(frozen=True)
-class Judged:
+class RunUnderRule:
     """A run by one rule. run: with its outcomes by that rule. verdicts, behaviour: None without trajectories."""
 
     run: RunReader
@@ -96,19 +96,19 @@ class Judged:
         """Whether there is a success rate by this rule: by the default rule it was stored with every run."""
         return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
 
-    def part(self, episodes: "pd.DataFrame") -> Ruled:
+    def part(self, episodes: "pd.DataFrame") -> OutcomeRuleScores:
         """The row part of some of the episodes; their index is their position in the run."""
         if not self.scored:
-            return Ruled(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
+            return OutcomeRuleScores(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
         answered = 1 - shares_of(episodes, "oob")
         rate = self._conditional(episodes, answered)
         facts = {} if self.verdicts is None else self._facts(episodes, answered)
-        return Ruled(
+        return OutcomeRuleScores(
             rule=self.rule,
             rule_words=self.words,
             last_steps=self.last_steps,
             n_answered=int((episodes["outcome"] != "oob").sum()),
-            p_answered=float(answered.mean()),
+            share_answered=float(answered.mean()),
             sr_answered=None if rate is None else rate.value,
             sr_answered_ci=None if rate is None else rate.ci,
             **facts,
@@ -138,10 +138,10 @@ class Judged:
             "n_grasped": int(grasped.sum()),
             "sr_grasped": None if rate is None else rate.value,
             "sr_grasped_ci": None if rate is None else rate.ci,
-            "p_answers_unmoved": float(stayed / answered.sum()) if answered.any() else None,
+            "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
             "sr_idle": float((own["idle"] == "correct").mean()),
             "idle_side": _idle_side(own["idle"], episodes["side_correct"]),
-            "p_both": float(own["both"].mean()),
+            "share_both_zones": float(own["both"].mean()),
             "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
             "behaviour": _behaviour(acted),
         }
@@ -180,57 +180,21 @@ def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
     return found
 
 
-AVERAGED = ("p_answered", "sr_answered", "sr_grasped", "p_answers_unmoved", "sr_idle", "p_both")
-"""Fields of which a row of category means holds the average."""
-
-
-def mean_part(rows: Sequence[Ruled], limits: Mapping[str, Limits | None]) -> Ruled:
-    """The part of a row that averages over categories; limits: of `sr_answered` and `sr_grasped`."""
-    first = rows[0]
-    sides = {row.idle_side for row in rows}
-    averages = {name: _mean([getattr(row, name) for row in rows]) for name in AVERAGED}
-    return Ruled(
-        rule=first.rule,
-        rule_words=first.rule_words,
-        last_steps=first.last_steps,
-        n_answered=_sum([row.n_answered for row in rows]),
-        n_grasped=_sum([row.n_grasped for row in rows]),
-        sr_answered_ci=limits.get("sr_answered"),
-        sr_grasped_ci=limits.get("sr_grasped"),
-        idle_side=sides.pop() if len(sides) == 1 else "both",
-        sr_by_rule=_mean_by_key([row.sr_by_rule for row in rows]),
-        behaviour=_mean_by_key([row.behaviour for row in rows]),
-        **averages,
-    )
-
-
-def _mean(values: Sequence[float | None]) -> Any:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
-
-
-def _sum(values: Sequence[int | None]) -> int | None:
-    known = [value for value in values if value is not None]
-    return sum(known) if known else None
-
-
-def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
-
-
-def rule_sentence(row: Ruled) -> str:
+def rule_sentence(rules: OutcomeRuleScores) -> str:
     """What outcomes were judged by, and what the rule gives away; for captions."""
-    steps = f", mean of the last {row.last_steps} control steps (all, where there are fewer)" * (
-        row.last_steps > 1
+    steps = f", mean of the last {rules.last_steps} control steps (all, where there are fewer)" * (
+        rules.last_steps > 1
     )
-    text = f"outcome rule {row.rule}{f': {row.rule_words}' if row.rule_words else ''}{steps}"
-    if row.sr_idle is None:
+    text = f"outcome rule {rules.rule}{f': {rules.rule_words}' if rules.rule_words else ''}{steps}"
+    if rules.sr_idle is None:
         return text
     where = {
         "none": "the untouched cube lies in neither zone",
         "both": "the untouched cube lies in a zone of some episodes",
-    }.get(row.idle_side or "none", f"the untouched cube already lies in the zone of the {row.idle_side} picture")
-    return f"{text}; a policy that does nothing would score {100 * row.sr_idle:.1f} %, as {where}"
+    }.get(
+        rules.idle_side or "none", f"the untouched cube already lies in the zone of the {rules.idle_side} picture"
+    )
+    return f"{text}; a policy that does nothing would score {100 * rules.sr_idle:.1f} %, as {where}"
 
 
 def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
@@ -240,7 +204,7 @@ def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
     return bool(getattr(run, "has_trajectories", False))
 
 
-def by_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
+def under_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
     """The run with its outcomes by a rule, for figures; as it is where it cannot be judged."""
     if (rule, last_steps) == (DEFAULT_RULE, 1) or not getattr(run, "has_trajectories", False):
         return run

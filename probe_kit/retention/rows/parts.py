@@ -1,81 +1,65 @@
-"""What a row of the retention table is put together from; None where there is nothing to say.
+"""The parts of a row of the retention table; None where there is nothing to say.
 
-Shares and accuracies run from 0 to 1, depths from 0 to 1 of the stream. Names are those of the JSON keys.
+Shares and accuracies run from 0 to 1, depths from 0 to 1 of the stream. JSON nests them by the names of
+`RetentionRow`, and data frames join both names by a dot: `backbone.accuracy`.
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.estimators.bootstrap_draws import Limits
+from probe_kit.train.results.control_scores import has_signal
+
+Mode = Literal["answers", "acts"]
+"""What the model of a run does: it answers questions about pictures (a VLM run), or acts (a policy run)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class RunInfo:
     """Whose numbers a row holds.
 
-    label: what the run is called in tables and legends. action_stream: `expert`, or `action` in a policy without
-    one, whose iterations are action tokens. call: the captured inference that was probed, from 0.
-    capture_only: activations were captured without acting.
+    location: folder or URL. label: what the run is called in tables and legends. settings: sha256 of the run's
+    settings; probes: key of its probe results. action_stream: `expert`, or `action` in a policy without one, whose
+    iterations are action tokens. call: the captured inference that was probed, from 0. capture_only: activations
+    were captured and the model did not act.
     """
 
-    run: str
+    location: str
     model: str
     random_weights: bool
     weights_sha256: str | None
     suite: str
-    run_settings: str
-    probe_settings: str | None
+    settings: str
+    probes: str | None
+    mode: Mode = "acts"
     label: str = ""
     action_stream: str | None = None
     call: int | None = None
     capture_only: bool = False
 
+    @property
+    def name(self) -> str:
+        """The label, marked if the weights are random or the model did not act."""
+        return full_name(self.label or self.model, self.random_weights, self.capture_only)
 
-@dataclass(frozen=True, kw_only=True)
-class Behaviour:
-    """What the policy did; `sr` is None where it captured activations only and did not act.
-
-    delta, delta_items, delta_regime: Δ over episodes (the paper's), over items, and over as many items as count,
-    which decides `regime`. sr_by_epsilon: SR by zone radius in metres. sr and all that follows from it is None
-    where the outcome rule needs trajectories that the run does not keep.
-    """
-
-    n_episodes: int
-    n_items: int
-    sr: float | None
-    delta: float | None = None
-    delta_items: float | None = None
-    delta_regime: float | None = None
-    sr_ci: Limits | None = None
-    sr_original: float | None = None
-    sr_swapped: float | None = None
-    sr_left: float | None = None
-    sr_right: float | None = None
-    p_wrong: float | None = None
-    p_oob: float | None = None
-    p_never_moved: float | None = None
-    p_flagged: float | None = None
-    regime: str | None = None
-    regime_reason: str | None = None
-    side_preference: float | None = None
-    items_both_right: int | None = None
-    items_one_right: int | None = None
-    items_none_right: int | None = None
-    paired_p: float | None = None
-    normalised_score: float | None = None
-    sr_by_epsilon: dict[str, float] = field(default_factory=dict)
+    @property
+    def action_name(self) -> str:
+        """What `action_stream` is called in a sentence."""
+        return label_of(self.action_stream or "expert")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
-    """How a run was asked and what else its answers say; `kind` is `acts` for a run that was not.
+class AnswerStats:
+    """How the model of a VLM run was asked, and what else its answers say; all None for a policy run.
 
-    asked_for: `target`, `distractor` or `absent`. score: by which of its scores `sr` is. accuracy_text,
-    accuracy_logits, accuracy_debiased: shares that are right by each score. p_unreadable: answers in text that
-    could not be read. option_mass: mean probability of the admissible answers together. letter_bias: mean
-    logit by which the option named first is preferred. p_near_tie: choices that rounding may have made.
+    asked_for: `target`, `distractor` or `absent`. score: by which of its scores `success.sr` is. accuracy_text,
+    accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in
+    text that could not be parsed. option_mass: mean probability of the admissible answers together. letter_bias:
+    mean logit by which the option named first is preferred. share_near_tie: choices that rounding may have made.
     """
 
-    kind: str = "acts"
     prompt: str | None = None
     picture: str | None = None
     picture_size: str | None = None
@@ -83,16 +67,16 @@ class Asked:
     score: str | None = None
     accuracy_text: float | None = None
     accuracy_logits: float | None = None
-    accuracy_debiased: float | None = None
-    p_unreadable: float | None = None
+    accuracy_order_balanced: float | None = None
+    share_unparsable: float | None = None
     option_mass: float | None = None
     letter_bias: float | None = None
-    p_near_tie: float | None = None
+    share_near_tie: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed:
-    """What the image swap did, if `probe-kit intervene` was run.
+class SwapEffect:
+    """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
     follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference, follow_p: exact, one-sided;
     see `intervene.ImageSwapEffect`. used: the
@@ -109,80 +93,81 @@ class Followed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackbonePeak:
-    """The backbone's best site, the first one on ties.
+class StreamPeak:
+    """The best site of a stream, the first one on ties.
 
-    prefix_ties: how many other sites are as accurate. prefix_selectivity: its accuracy above that of the same
-    probe on random labels of items. prefix_beats: whether it is better than `chance`, `binding` and `twin`,
-    family-wise; None for a control that was not run. prefix_twin: how much more accurate it is than `twin`'s.
+    ties: how many other sites are as accurate. selectivity: its accuracy above that of the same probe on random
+    labels of items. exceeds: whether it is better than `chance`, `binding` and `untrained`, family-wise; None for
+    a control that was not run. minus_untrained: how much more accurate it is than the untrained network's best.
     """
 
-    prefix_accuracy: float | None = None
-    prefix_ci: Limits | None = None
-    prefix_layer: int | None = None
-    prefix_depth: float | None = None
-    prefix_p_fwe: float | None = None
-    prefix_selectivity: float | None = None
-    prefix_beats: dict[str, bool | None] = field(default_factory=dict)
-    prefix_twin: float | None = None
-    prefix_twin_ci: Limits | None = None
-    prefix_ties: int | None = None
+    accuracy: float | None = None
+    ci: Limits | None = None
+    layer: int | None = None
+    depth: float | None = None
+    p_fwe: float | None = None
+    selectivity: float | None = None
+    exceeds: dict[str, bool | None] = field(default_factory=dict)
+    minus_untrained: float | None = None
+    minus_untrained_ci: Limits | None = None
+    ties: int | None = None
+
+    @property
+    def has_signal(self) -> bool:
+        """Whether it is better than chance and than every control that was run."""
+        return bool(self.exceeds) and has_signal(self.exceeds)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActionPeak:
-    """The best site where the action is made; fields as of `BackbonePeak`.
-
-    action_first_accuracy, action_first_layer: the best layer at the first iteration, which has seen no
-    action; None where the stream runs once.
-    """
-
-    action_accuracy: float | None = None
-    action_ci: Limits | None = None
-    action_layer: int | None = None
-    action_depth: float | None = None
-    action_iteration: int | None = None
-    action_p_fwe: float | None = None
-    action_selectivity: float | None = None
-    action_beats: dict[str, bool | None] = field(default_factory=dict)
-    action_twin: float | None = None
-    action_twin_ci: Limits | None = None
-    action_first_accuracy: float | None = None
-    action_first_layer: int | None = None
-    action_ties: int | None = None
+class BackbonePeak(StreamPeak):
+    """The best site of the backbone; see `StreamPeak`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
-    """How much of the backbone's signal reaches the action.
+class ActionPeak(StreamPeak):
+    """The best site where the action is made; see `StreamPeak`.
 
-    `retention` is the published ratio even when `retention_defined` is False, and then no category mean contains
-    it. `retention_ci` is the 95 % interval of `retention_debiased`, (None, None) when the data set no limit;
-    `retention_bounded` lies between that and the peaks, `retention_area` is the ratio of means over all sites.
+    iteration: the flow-matching step or action token of the site. first_accuracy, first_layer: of the best layer
+    at the first iteration, which has seen no action. All three are None where the stream runs once.
     """
 
-    retention: float | None = None
-    retention_defined: bool = False
-    retention_note: str = "n/a (no probes)"
-    retention_debiased: float | None = None
-    retention_ci: Limits | None = None
-    retention_bounded: float | None = None
-    retention_bounded_ci: Limits | None = None
-    retention_area: float | None = None
-    retention_area_ci: Limits | None = None
+    iteration: int | None = None
+    first_accuracy: float | None = None
+    first_layer: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Background:
-    """What the probes are held against.
+class RetentionScores:
+    """Share of the backbone's signal that can be read where the action is made.
 
-    chance: accuracy of always naming the larger class. baselines: accuracy of each control that never sees the
-    model; leaks: those above chance. gap: prefix accuracy − SR. twin: the run of random weights beside this one.
+    `published` is the published ratio even when `defined` is False, and then no category mean contains it. `ci` is
+    the 95 % interval of `debiased`, (None, None) when the data set no limit; `bounded` lies between `debiased` and
+    the peaks, `area` is the ratio of means over all sites. note: why it is not defined; in a mean, what it omits.
+    """
+
+    published: float | None = None
+    defined: bool = False
+    note: str = "n/a (no probes)"
+    debiased: float | None = None
+    ci: Limits | None = None
+    bounded: float | None = None
+    bounded_ci: Limits | None = None
+    area: float | None = None
+    area_ci: Limits | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlScores:
+    """What the probes are compared with.
+
+    n_groups: independent groups of items. chance: accuracy of always naming the larger class. probe_minus_sr:
+    backbone accuracy − success rate. baselines: accuracy of each control that never sees the model; leaks: those
+    above chance. untrained: name of the untrained network's run.
     """
 
     n_groups: int | None = None
     chance: float | None = None
-    gap: float | None = None
+    probe_minus_sr: float | None = None
     baselines: dict[str, float] = field(default_factory=dict)
     leaks: tuple[str, ...] = ()
-    twin: str | None = None
+    untrained: str | None = None

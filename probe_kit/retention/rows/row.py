@@ -1,33 +1,29 @@
 """One row per run, category and view: behaviour, probes and retention side by side."""
 
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, field
 
-from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.rows.outcome_rules import Ruled
+from probe_kit.retention.behaviour.success_rate import SuccessRate
+from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
 from probe_kit.retention.rows.parts import (
     ActionPeak,
-    Asked,
+    AnswerStats,
     BackbonePeak,
-    Background,
-    Behaviour,
-    Followed,
-    Kept,
-    Source,
+    ControlScores,
+    RetentionScores,
+    RunInfo,
+    SwapEffect,
 )
-from probe_kit.train.results.control_scores import has_signal
 
 MEAN = "mean"
 """Category of the rows that average over categories."""
 
-Part = Source | Behaviour | Followed | Asked | Ruled | BackbonePeak | ActionPeak | Kept | Background
-
 
 @dataclass(frozen=True, kw_only=True)
-class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Followed, Behaviour, Source):
-    """One line of the retention table: its parts, side by side under their own names.
+class RetentionRow:
+    """One row of the retention table: its parts. A part with nothing to say holds defaults.
 
-    In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
+    view: how tokens became one vector, None without probes. group: of several groups of runs, this run's. In a row
+    of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
     """
 
     category: str
@@ -35,24 +31,17 @@ class RetentionRow(Background, Kept, ActionPeak, BackbonePeak, Asked, Ruled, Fol
     group: str | None = None
     categories: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, category: str, view: str | None, group: str | None, *parts: Part) -> Self:
-        """Put a row together; a part that is left out has nothing to say."""
-        fields = {name: value for part in parts for name, value in vars(part).items()}
-        return cls(category=category, view=view, group=group, **fields)
-
-    @property
-    def prefix_signal(self) -> bool:
-        """Whether the backbone knows the answer: better than chance and every control that was run."""
-        return bool(self.prefix_beats) and has_signal(self.prefix_beats)
+    run: RunInfo
+    success: SuccessRate
+    rules: OutcomeRuleScores = field(default_factory=OutcomeRuleScores)
+    answers: AnswerStats = field(default_factory=AnswerStats)
+    backbone: BackbonePeak = field(default_factory=BackbonePeak)
+    action: ActionPeak = field(default_factory=ActionPeak)
+    retention: RetentionScores = field(default_factory=RetentionScores)
+    controls: ControlScores = field(default_factory=ControlScores)
+    image_swap: SwapEffect = field(default_factory=SwapEffect)
 
     @property
-    def action_signal(self) -> bool:
-        """The same of the stream the action is made in."""
-        return bool(self.action_beats) and has_signal(self.action_beats)
-
-    @property
-    def action_name(self) -> str:
-        """What `action_stream` is called in a sentence."""
-        return label_of(self.action_stream or "expert")
+    def key(self) -> tuple[str | None, str]:
+        """Group and location of its run, which tell runs of a table apart."""
+        return self.group, self.run.location

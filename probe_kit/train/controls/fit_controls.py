@@ -22,7 +22,13 @@ from probe_kit.train.data.labels import target_labels
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.control_scores import BINDING, TWIN, BaselineScore, ControlComparison, TwinScore
+from probe_kit.train.results.control_scores import (
+    BINDING,
+    UNTRAINED,
+    BaselineScore,
+    ControlComparison,
+    UntrainedScore,
+)
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
@@ -105,23 +111,26 @@ def _baseline_scores(
         )
 
 
-def check_twin(run: RunReader, twin: RunReader, settings: ProbeSettings) -> None:
-    """Raise UsageError unless `twin` is another run of the same episodes with the same labels."""
-    if run.location.address == twin.location.address:
-        raise UsageError(f"{run.location} cannot be its own twin; give another run of the same episodes")
-    here, there = (_labels_by_episode(one, settings) for one in (run, twin))
+def check_untrained(run: RunReader, untrained: RunReader, settings: ProbeSettings) -> None:
+    """Raise UsageError unless `untrained` is another run of the same episodes with the same labels."""
+    if run.location.address == untrained.location.address:
+        raise UsageError(
+            f"{run.location} cannot be its own untrained control; give another run of the same episodes"
+        )
+    here, there = (_labels_by_episode(one, settings) for one in (run, untrained))
     if here != there:
         mend = "Extract both from the same suite"
         if settings.call > 0:
             reached = f"Not the same episodes got as far as captured inference {settings.call}"
-            mend = f"{reached}: leave --call or --twin out"
+            mend = f"{reached}: leave --call or --untrained out"
         raise UsageError(
-            f"the twin {twin.model!r} has {len(there)} episodes to probe, {run.model!r} has {len(here)}, and they "
-            f"are not the same. {mend}."
+            f"the untrained control {untrained.model!r} has {len(there)} episodes to probe, "
+            f"{run.model!r} has {len(here)}, and they are not the same. {mend}."
         )
-    if run.settings_sha256 == twin.settings_sha256:
+    if run.settings_sha256 == untrained.settings_sha256:
         raise UsageError(
-            f"{twin.location} is a copy of {run.location}, which cannot be its own twin; give other weights"
+            f"{untrained.location} is a copy of {run.location}, which cannot be its own untrained control; "
+            "give other weights"
         )
 
 
@@ -140,39 +149,48 @@ def _labels_by_episode(run: RunReader, settings: ProbeSettings) -> list[tuple[st
     ]
 
 
-def add_twin(results: ProbeResults, twin: ProbeResults) -> ProbeResults:
-    """`results` compared with the same probes of a twin. Raises UsageError if the twin saw other episodes."""
+def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResults:
+    """`results` compared with the same probes of an untrained network.
+
+    Raises UsageError if that one saw other episodes.
+    """
     scores = [
-        score for place, curve in results.curves.items() for score in _twin_scores(results, place, curve, twin)
+        score
+        for place, curve in results.curves.items()
+        for score in _untrained_scores(results, place, curve, untrained)
     ]
-    excess = [one for place, curve in results.curves.items() for one in _twin_excess(results, place, curve, twin)]
-    return replace(results, controls=results.controls.with_twin(scores).with_excess(excess))
+    excess = [
+        one
+        for place, curve in results.curves.items()
+        for one in _untrained_excess(results, place, curve, untrained)
+    ]
+    return replace(results, controls=results.controls.with_untrained(scores).with_excess(excess))
 
 
-def _twin_excess(
-    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, twin: ProbeResults
+def _untrained_excess(
+    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, untrained: ProbeResults
 ) -> Iterator[ControlComparison]:
-    """Every site of a stream against the best of the twin's."""
-    other = twin.curves[place]
+    """Every site of a stream against the best of the untrained network's."""
+    other = untrained.curves[place]
     for stream in dict.fromkeys(site.stream for site in curve.sites):
         if not other.stream(stream).size:
             continue
         rows, others = curve.stream(stream), other.correct[other.stream(stream)]
-        seed = derive_seed(TWIN, results.settings.seed, *place, stream)
+        seed = derive_seed("twin", results.settings.seed, *place, stream)
         p = better_than_best(curve.correct[rows], others, curve.groups, seed)
         best = float(others.mean(axis=1).max())
         for row, of_site in zip(rows, p, strict=True):
-            yield ControlComparison(TWIN, *place, str(curve.sites[row]), best, float(of_site))
+            yield ControlComparison(UNTRAINED, *place, str(curve.sites[row]), best, float(of_site))
 
 
-def _twin_scores(
-    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, twin: ProbeResults
-) -> Iterator[TwinScore]:
-    other = twin.curves[place]
+def _untrained_scores(
+    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, untrained: ProbeResults
+) -> Iterator[UntrainedScore]:
+    other = untrained.curves[place]
     if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
         raise UsageError(
-            f"category {place[0]!r}: the twin {twin.label!r} has {other.labels.size} episodes, this run "
-            f"{curve.labels.size}, and they are not the same. Extract both from the same suite."
+            f"category {place[0]!r}: the untrained control {untrained.label!r} has {other.labels.size} "
+            f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same suite."
         )
     pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
     streams = [name for name in dict.fromkeys(site.stream for site in curve.sites) if other.stream(name).size]
@@ -182,15 +200,15 @@ def _twin_scores(
     )
     seed = units_seed(curve.groups, results.settings.suite)
     low, high = group_bootstrap(here - there, curve.groups, seed, bounds=GAINS)
-    for column, (row, twin_row, peak) in enumerate(pairs):
-        yield TwinScore(
+    for column, (row, untrained_row, peak) in enumerate(pairs):
+        yield UntrainedScore(
             *place,
             site=str(curve.sites[row]),
-            twin_site=str(other.sites[twin_row]),
+            untrained_site=str(other.sites[untrained_row]),
             peak=peak,
             accuracy=float(here[:, column].mean()),
-            twin_accuracy=float(there[:, column].mean()),
+            untrained_accuracy=float(there[:, column].mean()),
             difference=float((here - there)[:, column].mean()),
             ci=(float(low[column]), float(high[column])),
-            twin=twin.label + (" (random weights)" if twin.settings.random_weights else ""),
+            untrained=untrained.label + (" (random weights)" if untrained.settings.random_weights else ""),
         )

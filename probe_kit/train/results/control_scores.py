@@ -8,7 +8,7 @@ from typing import Any
 
 from probe_kit.statistics.significance import SIGNIFICANCE
 
-BINDING, TWIN = "binding", "twin"
+BINDING, UNTRAINED = "binding", "untrained"
 """The controls that a site must beat, where they were run, before its signal counts as knowledge."""
 
 
@@ -34,8 +34,10 @@ class BaselineScore:
 
 
 @dataclass(frozen=True)
-class TwinScore:
-    """How much more accurate than its twin's a probe is, on the same episodes; 95 % interval over groups.
+class UntrainedScore:
+    """How much more accurate a probe is than the untrained network's, on the same episodes.
+
+    ci: 95 % interval over groups.
 
     peak: the best site of the stream here against the best site there; otherwise the same site in both.
     """
@@ -43,20 +45,21 @@ class TwinScore:
     category: str
     view: str
     site: str
-    twin_site: str
+    untrained_site: str
     peak: bool
     accuracy: float
-    twin_accuracy: float
+    untrained_accuracy: float
     difference: float
     ci: tuple[float, float]
-    twin: str
+    untrained: str
 
 
 @dataclass(frozen=True)
 class ControlComparison:
     """Whether a site's probe is more accurate than a control: paired by group, family-wise over its stream.
 
-    control: `binding`, or `twin` for the best site of the twin's stream. reference: the control's accuracy.
+    control: `binding`, or `untrained` for the best site of that stream in the untrained network. reference: the
+    control's accuracy.
     """
 
     control: str
@@ -68,7 +71,7 @@ class ControlComparison:
 
 
 Beats = dict[str, bool | None]
-"""Whether a site is better than `chance`, `binding` and `twin`; None for what was not run."""
+"""Whether a site is better than `chance`, `binding` and `untrained`; None for what was not run."""
 
 
 def has_signal(beats: Beats) -> bool:
@@ -78,17 +81,17 @@ def has_signal(beats: Beats) -> bool:
 
 @dataclass(frozen=True)
 class Controls:
-    """Scores of the controls so far. excess: every site compared with binding and twin."""
+    """Scores of the controls so far. excess: every site compared with binding and untrained."""
 
     baselines: tuple[BaselineScore, ...] = ()
-    twin: tuple[TwinScore, ...] = ()
+    untrained: tuple[UntrainedScore, ...] = ()
     excess: tuple[ControlComparison, ...] = ()
 
     def beats(self, category: str, view: str, site: str, p_fwe: float) -> Beats:
         """What a site with this family-wise p is better than."""
         found = self._beaten.get((category, view, site), {})
         chance = None if isnan(p_fwe) else bool(p_fwe < SIGNIFICANCE)
-        return {"chance": chance, BINDING: found.get(BINDING), TWIN: found.get(TWIN)}
+        return {"chance": chance, BINDING: found.get(BINDING), UNTRAINED: found.get(UNTRAINED)}
 
     @cached_property
     def _beaten(self) -> dict[tuple[str, str, str], dict[str, bool]]:
@@ -102,9 +105,9 @@ class Controls:
         """Baselines of a category by name."""
         return {score.name: score for score in self.baselines if score.category == category}
 
-    def twin_peak(self, category: str, view: str, stream: str) -> TwinScore | None:
-        """The best site of a stream against the twin's best, None without a twin."""
-        found = (s for s in self.twin if s.peak and (s.category, s.view) == (category, view))
+    def untrained_peak(self, category: str, view: str, stream: str) -> UntrainedScore | None:
+        """The best site of a stream against the untrained network's best, None without one."""
+        found = (s for s in self.untrained if s.peak and (s.category, s.view) == (category, view))
         return next((score for score in found if score.site.startswith(f"{stream}.")), None)
 
     def with_baselines(self, scores: Iterable[BaselineScore]) -> "Controls":
@@ -112,9 +115,9 @@ class Controls:
         merged = {(score.name, score.category): score for score in (*self.baselines, *scores)}
         return replace(self, baselines=tuple(merged.values()))
 
-    def with_twin(self, scores: Sequence[TwinScore]) -> "Controls":
-        """The same baselines with another twin."""
-        return replace(self, twin=tuple(scores))
+    def with_untrained(self, scores: Sequence[UntrainedScore]) -> "Controls":
+        """The same baselines with another untrained network."""
+        return replace(self, untrained=tuple(scores))
 
     def with_excess(self, found: Sequence[ControlComparison]) -> "Controls":
         """These, with all sites held anew against the controls that are in `found`."""
@@ -127,9 +130,27 @@ class Controls:
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> "Controls":
-        """What `to_json` gave."""
+        """What `to_json` gave, also by versions that called the untrained network a twin."""
+        stored = _in_present_words(stored)
         return cls(
             tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
-            tuple(TwinScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["twin"]),
+            tuple(UntrainedScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["untrained"]),
             tuple(ControlComparison(**one) for one in stored["excess"]),
         )
+
+
+_FORMER_WORDS = {"twin": "untrained", "twin_site": "untrained_site", "twin_accuracy": "untrained_accuracy"}
+
+
+def _in_present_words(stored: dict[str, Any]) -> dict[str, Any]:
+    """The stored controls with the keys and names of controls of today."""
+    return {
+        _FORMER_WORDS.get(part, part): [
+            {
+                _FORMER_WORDS.get(key, key): _FORMER_WORDS.get(value, value) if key == "control" else value
+                for key, value in one.items()
+            }
+            for one in scores
+        ]
+        for part, scores in stored.items()
+    }

@@ -22,8 +22,8 @@ from probe_kit.train.results.store import (
 class StoredProbes:
     """One set of probe results, or what is known of a set written by another version.
 
-    created: when they were fitted. controls: baselines and, last, `twin: NAME`. state: `used` if `retention` reads
-    them by default, `other` if it does so for their key, `other episodes` if the run has others by now,
+    created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention`
+    reads them by default, `other` if it does so for their key, `other episodes` if the run has others by now,
     `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
     run is in its items' own words.
     """
@@ -137,8 +137,8 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
 def _controls(bundle: Bundle) -> tuple[str, ...]:
     controls = read_controls(bundle)
     names = dict.fromkeys(score.name for score in controls.baselines)
-    twins = dict.fromkeys(f"twin: {score.twin}" for score in controls.twin)
-    return (*names, *twins)
+    untrained = dict.fromkeys(f"untrained: {score.untrained}" for score in controls.untrained)
+    return (*names, *untrained)
 
 
 def _words(run: RunReader, name: str) -> str:

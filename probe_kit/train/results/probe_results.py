@@ -66,7 +66,7 @@ class ProbeResults:
         against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per
         outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
         consistent within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`:
-        no p-value can be lower with so many relabellings. `beats_binding`, `beats_twin`: whether the site is
+        no p-value can be lower with so many relabellings. `beats_binding`, `beats_untrained`: whether the site is
         better than that control, missing where it was not run; `has_signal`: than chance, family-wise, and every
         control that was run.
         """
@@ -77,7 +77,7 @@ class ProbeResults:
             for (category, view), curve in self.curves.items()
             for row in _score_rows(self, category, view, curve)
         ]
-        kinds = {"iteration": "Int64", "beats_binding": "boolean", "beats_twin": "boolean"}
+        kinds = {"iteration": "Int64", "beats_binding": "boolean", "beats_untrained": "boolean"}
         return pd.DataFrame(rows).astype(kinds)
 
     def direction(self, category: str, view: str, site: Site) -> Direction:
@@ -137,7 +137,7 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCur
             "settings": settings.key,
             "smallest_p": smallest_p(curve.null.shape[1]),
             "beats_binding": beats[row]["binding"],
-            "beats_twin": beats[row]["twin"],
+            "beats_untrained": beats[row]["untrained"],
             "signal": has_signal(beats[row]),
         }
         for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True))

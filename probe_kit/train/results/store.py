@@ -39,7 +39,7 @@ def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = T
     """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
 
     asked: whether a user requested these probes, which `load_results` then prefers to all older ones, rather
-    than needing them in passing, as the twin of another run.
+    than needing them in passing, as the untrained control of another run.
     """
     location = locate(run)
     if not is_stored(location, results.key):

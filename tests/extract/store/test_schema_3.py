@@ -16,7 +16,7 @@ from probe_kit.extract import ExtractSettings, extract_run, label_run, open_run,
 from probe_kit.extract.store.format.hashes import as_record
 from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.intervene import load_effects
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from tests.support.stored_numbers import numbers_of
@@ -81,7 +81,7 @@ def test_its_probes_are_found_again_and_new_ones_are_fitted_to_the_same_numbers(
 
 
 def test_retention_and_stored_interventions_are_read(unpacked: Path) -> None:
-    assert {row.label for row in retention([open_run(unpacked / "acted")]).rows} == {"a tiny run"}
+    assert {row.run.label for row in retention_table([open_run(unpacked / "acted")]).rows} == {"a tiny run"}
     assert len(load_effects(open_run(unpacked / "little")).table)
 
 

@@ -14,7 +14,7 @@ from probe_kit.extract import Run
 from probe_kit.intervene import commands, load_effects
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from tests.intervene.kinds.dimmed_images.kind import KIND
 
@@ -38,7 +38,7 @@ def invoke(module: ModuleType, *arguments: str) -> tuple[int, str, str]:
 def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     with_entry: ModuleType, copy: Run, small_suite: Suite
 ) -> None:
-    before = retention([copy]).to_json()
+    before = retention_table([copy]).to_json()
     asked = ("--kind", KIND.name, "--categories", "color", "--items", "1", "--coefficients", "0,1")
     where = (str(copy.path), "--suite", str(small_suite.folder))
     code, shown, said = invoke(with_entry, *where, *asked)
@@ -55,7 +55,7 @@ def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     assert json.loads(shown)["effects"][0]["median_displacement"] == pytest.approx(dark.median_displacement)
     assert "loaded the stored result" in said
     assert [(one.kind, one.state) for one in listed_interventions(copy)] == [(KIND.name, "used")]
-    assert retention([copy]).to_json() == before
+    assert retention_table([copy]).to_json() == before
 
 
 def test_help_names_every_kind_and_what_its_options_mean_to_it(with_entry: ModuleType) -> None:

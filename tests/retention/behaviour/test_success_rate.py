@@ -42,14 +42,14 @@ def test_the_regime_says_why(sr: float, wrong: float, oob: float, expected: Regi
 
 def test_rates_add_up_and_split_by_layout_and_side(outcome_table: Outcomes) -> None:
     success = success_rate(outcome_table(correct=101, wrong=49, oob=50))
-    assert (success.sr, success.p_wrong, success.p_oob) == (0.505, 0.245, 0.25)
+    assert (success.sr, success.share_wrong, success.share_outside) == (0.505, 0.245, 0.25)
     assert (success.n_episodes, success.n_items) == (200, 100)
     assert (success.sr_original, success.sr_swapped, success.layout_mean) == (0.51, 0.5, 0.505)
     assert success.sr_left is not None
     assert success.sr_right is not None
     assert (success.sr_left + success.sr_right) / 2 == pytest.approx(0.505)
     assert success.ci[0] < 0.505 < success.ci[1]
-    assert success.delta < success.delta_items
+    assert success.chance_margin_episodes < success.chance_margin_items
 
 
 def test_a_policy_that_always_goes_left_is_half_right_but_never_twice(outcome_table: Outcomes) -> None:
@@ -85,8 +85,8 @@ def twins(groups: int, knows: Callable[[int, int], bool]) -> pd.DataFrame:
 
 def test_twins_that_answer_alike_count_as_one_item() -> None:
     alike = success_rate(twins(40, lambda group, _: group % 5 < 3))
-    assert alike.delta_regime == pytest.approx(chance_margin(40))
-    assert alike.delta_items == pytest.approx(chance_margin(80))
+    assert alike.chance_margin == pytest.approx(chance_margin(40))
+    assert alike.chance_margin_items == pytest.approx(chance_margin(80))
     assert alike.regime is Regime.NO_RELIABLE_KNOWLEDGE, "0.60 of 160 episodes, but only 40 answers"
     assert alike.paired.p == pytest.approx(binomtest(24, 40, alternative="greater").pvalue)
     assert alike.ci[1] - alike.ci[0] > 0.25
@@ -94,7 +94,7 @@ def test_twins_that_answer_alike_count_as_one_item() -> None:
 
 def test_twins_that_answer_apart_count_as_items() -> None:
     apart = success_rate(twins(40, lambda group, item: (group % 5 < 3) == (item == 0) or group % 4 == 0))
-    assert apart.delta_regime == apart.delta_items
+    assert apart.chance_margin == apart.chance_margin_items
 
 
 def test_a_guesser_with_a_fixed_preference_per_item_is_not_called_knowing() -> None:

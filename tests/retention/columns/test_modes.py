@@ -10,8 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import retention
-from probe_kit.retention.displays import KnowledgeActionDisplay, SideTableDisplay, SuccessTableDisplay, gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import (
+    KnowledgeActionDisplay,
+    SideTableDisplay,
+    SuccessTableDisplay,
+    collect_figures,
+)
 from probe_kit.retention.report import report_html
 from probe_kit.train import save_results
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
@@ -35,10 +40,10 @@ def text_of(page: str) -> str:
 
 
 def formats(runs: list[SaidRun]) -> Mapping[str, str]:
-    table = retention(runs)
+    table = retention_table(runs)
     console = Console(width=220, record=True, file=StringIO())
     console.print(table.to_rich())
-    exhibits = gallery(runs, table)
+    exhibits = collect_figures(runs, table)
     return {
         "terminal": console.export_text(),
         "markdown": table.to_markdown(),
@@ -97,7 +102,7 @@ def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -
 
 
 def test_axes_and_titles_name_the_share_they_show(tmp_path: Path) -> None:
-    table = retention([reader(tmp_path)])
+    table = retention_table([reader(tmp_path)])
     assert SuccessTableDisplay.from_table(table).title == "Accuracy of answers (%)"
     assert SideTableDisplay.from_table(table).title.startswith("Accuracy of answers (%) where")
     axes = KnowledgeActionDisplay.from_table(table).plot().ax_

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import RetentionTable, retention
-from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results, save_results
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.train import ArrayRun, BaselineScore, Controls, UntrainedScore, load_results, save_results
 
 
 @pytest.fixture
@@ -21,12 +21,12 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
             BaselineScore("instruction", "color", 0.51, (0.45, 0.57), 0.4, 0.5, 200),
         ),
         tuple(
-            TwinScore("color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "twin")
+            UntrainedScore("color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "twin")
             for site, gain in zip(sites, (0.3, 0.2), strict=True)
         ),
     )
     save_results(replace(load_results(run), controls=controls), run.path)
-    return retention([run])
+    return retention_table([run])
 
 
 def test_a_baseline_above_chance_is_red_in_every_format(table: RetentionTable) -> None:
@@ -41,14 +41,18 @@ def test_a_baseline_above_chance_is_red_in_every_format(table: RetentionTable) -
 
 def test_json_has_controls_by_name_and_csv_a_column_each(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[0]
-    assert row["baselines"] == {"pixels": 0.75, "instruction": 0.51}
-    assert row["leaks"] == ["pixels"]
-    assert (row["twin"], row["prefix_twin"], row["action_twin"]) == ("twin", 0.3, 0.2)
+    assert row["controls"]["baselines"] == {"pixels": 0.75, "instruction": 0.51}
+    assert row["controls"]["leaks"] == ["pixels"]
+    assert (
+        row["controls"]["untrained"],
+        row["backbone"]["minus_untrained"],
+        row["action"]["minus_untrained"],
+    ) == ("twin", 0.3, 0.2)
     frame = table.to_frame()
-    assert frame["baselines.pixels"].tolist() == [0.75, 0.75]
-    assert frame["action_twin_ci_high"][0] == pytest.approx(0.3)
+    assert frame["controls.baselines.pixels"].tolist() == [0.75, 0.75]
+    assert frame["action.minus_untrained_ci_high"][0] == pytest.approx(0.3)
 
 
 def test_controls_take_no_room_where_there_are_none(probed_run: Callable[..., ArrayRun]) -> None:
-    bare = retention([probed_run({"color": ([0.9], [[0.7]])})])
+    bare = retention_table([probed_run({"color": ([0.9], [[0.7]])})])
     assert "Controls" not in bare.to_markdown() + bare.to_latex()

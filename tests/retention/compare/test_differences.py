@@ -4,7 +4,7 @@ from collections.abc import Callable
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
@@ -18,22 +18,22 @@ NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
 def table(probed_run: ProbedRun) -> RetentionTable:
     vqa = probed_run({"color": SIGNAL, "shape": SIGNAL}, "vqa")
     plain = probed_run({"color": WEAK, "shape": NONE}, "plain")
-    return retention({"with VQA": [vqa], "without": [plain]})
+    return retention_table({"with VQA": [vqa], "without": [plain]})
 
 
 def test_a_difference_is_the_first_group_minus_the_second(table: RetentionTable) -> None:
     color, shape, mean = table.differences
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
-    assert color.prefix_accuracy == pytest.approx(0.9 - 0.8)
+    assert color.backbone_accuracy == pytest.approx(0.9 - 0.8)
     assert color.action_accuracy == pytest.approx(0.7 - 0.8)
     assert color.retention == pytest.approx(
-        table.rows[0].retention_debiased - table.rows[2].retention_debiased  # type: ignore[operator]
+        table.rows[0].retention.debiased - table.rows[2].retention.debiased  # type: ignore[operator]
     )
-    assert mean.prefix_accuracy == pytest.approx((0.1 + 0.35) / 2)
-    assert shape.prefix_ci is not None
-    assert shape.prefix_ci[0] is not None
-    assert shape.prefix_ci[0] > 0
+    assert mean.backbone_accuracy == pytest.approx((0.1 + 0.35) / 2)
+    assert shape.backbone_ci is not None
+    assert shape.backbone_ci[0] is not None
+    assert shape.backbone_ci[0] > 0
 
 
 def test_retention_is_compared_only_where_both_groups_have_it(table: RetentionTable) -> None:
@@ -55,7 +55,7 @@ def test_equal_behaviour_on_the_same_items_is_no_proof_of_equality(table: Retent
 def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> None:
     one = probed_run({"color": SIGNAL}, "one")
     other = probed_run({"color": SIGNAL}, "other", suite="other@1#ba9876543210")
-    row = retention({"a": [one], "b": [other]}).differences[0]
+    row = retention_table({"a": [one], "b": [other]}).differences[0]
     assert not row.paired
     assert row.p is None
     assert row.sr == 0.0
@@ -66,10 +66,10 @@ def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> Non
 def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
     alone = probed_run({"color": SIGNAL}, "alone")
-    table = retention({"both": [strong, weak], "strong": [alone]})
-    assert table.differences[0].prefix_accuracy == pytest.approx((0.9 + 0.8) / 2 - 0.9)
+    table = retention_table({"both": [strong, weak], "strong": [alone]})
+    assert table.differences[0].backbone_accuracy == pytest.approx((0.9 + 0.8) / 2 - 0.9)
     assert table.differences[0].paired
-    assert [(mean.group, mean.model) for mean in table.means] == [
+    assert [(mean.group, mean.run.model) for mean in table.means] == [
         ("both", "strong"), ("both", "weak"), ("strong", "alone"),
     ]  # fmt: skip
     assert len(table.all_rows) == 2 * 3
@@ -83,11 +83,11 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     assert "| with VQA: vqa |" in table.to_markdown()
     assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
     frame = table.differences_frame()
-    assert frame["prefix_accuracy"].round(6).tolist() == [0.1, 0.35, 0.225]
-    assert (frame["prefix_ci_low"] < frame["prefix_accuracy"]).all()
+    assert frame["backbone_accuracy"].round(6).tolist() == [0.1, 0.35, 0.225]
+    assert (frame["backbone_ci_low"] < frame["backbone_accuracy"]).all()
 
 
 def test_keys_follow_the_runs_of_all_groups(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     with pytest.raises(UsageError, match="1 keys for 2 runs"):
-        retention({"a": [run], "b": [run]}, keys=[None])
+        retention_table({"a": [run], "b": [run]}, keys=[None])

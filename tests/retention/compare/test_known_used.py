@@ -14,8 +14,8 @@ from rich.console import Console
 
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.vlm_answers import scored
-from probe_kit.retention.columns.known_used_table import rich_join
-from probe_kit.retention.compare.known_used import Joined, encoded_decisions, match_runs
+from probe_kit.retention.columns.known_used_table import rich_known_used
+from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
 SIZES = {"color": 14, "shape": 12}
@@ -118,7 +118,7 @@ def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRu
         assert {code: n for code, n in row.counts.items() if n} == dict(expected["counts"])
         assert {code: n for code, n in row.episodes.items() if n} == dict(expected["episodes"])
         for one, (pair, (binomial_p, flip)) in zip(row.comparisons, expected["tests"].items(), strict=True):
-            assert (one.first, one.second) == tuple(("known", "encoded", "used")[k] for k in pair)
+            assert (one.first, one.second) == tuple(("answered", "encoded", "acted")[k] for k in pair)
             assert one.p_mcnemar == pytest.approx(binomial_p)
             assert one.p_groups == pytest.approx(flip)
             assert one.p == max(one.p_mcnemar, one.p_groups)
@@ -148,7 +148,7 @@ def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(t
     one_side = {"color": np.array([[True, False], [False, True]] * 10)}
     found = match_runs(asked(tmp_path, one_side), acted(tmp_path, one_side))
     (row,) = found.rows
-    assert (row.known, row.used, row.encoded) == (0, 0, None)
+    assert (row.answered_correctly, row.acted_correctly, row.encoded) == (0, 0, None)
     assert row.counts == {"1-1": 0, "1-0": 0, "0-1": 0, "0-0": 20}
     assert row.guessed == pytest.approx({"1-1": 1.25, "1-0": 3.75, "0-1": 3.75, "0-0": 11.25})
     assert row.episodes == {"1-1": 20, "1-0": 0, "0-1": 0, "0-0": 20}
@@ -156,10 +156,10 @@ def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(t
 
 def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    assert match_runs(scored(reader, "logits"), policy).rows[-1].known == 0, "it always says left"
-    debiased = match_runs(scored(reader, "debiased"), policy)
-    assert debiased.rows[-1].known == 26
-    assert debiased.score == "debiased"
+    assert match_runs(scored(reader, "logits"), policy).rows[-1].answered_correctly == 0, "it always says left"
+    debiased = match_runs(scored(reader, "order-balanced"), policy)
+    assert debiased.rows[-1].answered_correctly == 26
+    assert debiased.score == "order-balanced"
 
 
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
@@ -183,7 +183,7 @@ def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, Sai
 
 def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
-    with pytest.raises(UsageError, match="not an asked and an acting run, in this order"):
+    with pytest.raises(UsageError, match="not a VLM run and a policy run, in this order"):
         match_runs(policy, reader)
     strange = policy.episodes.assign(item_id="other-" + policy.episodes["item_id"])
     with pytest.raises(UsageError, match="no question in common"):
@@ -207,12 +207,12 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     reader, policy = runs
     found = match_runs(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
-    console.print(rich_join(found))
+    console.print(rich_known_used(found))
     text = console.export_text()
-    for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "known − used"):
+    for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "answered − acted"):
         assert words in text
     frame = found.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}
     assert found.to_json()["rows"][0]["counts"] == found.rows[0].counts
-    assert isinstance(found.rows[0], Joined)
+    assert isinstance(found.rows[0], CategoryCounts)
     assert isinstance(frame, pd.DataFrame)

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.train import ArrayRun, load_results
@@ -32,7 +32,7 @@ def hits(share: float, seed: int, items: Mapping[str, int] | None = None) -> Hit
 
 
 def run(folder: Path, right: Hits, suite: str = SUITE, called: str = "", **settings: object) -> SaidRun:
-    """An acting run in a folder of its own."""
+    """A policy run in a folder of its own."""
     return SaidRun(folder, folder.name, suite, episodes(right), {}, settings=settings, called=called)
 
 
@@ -65,7 +65,7 @@ def oracle(gains: pd.Series, groups: pd.Series) -> tuple[float, float, float, fl
 
 def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.8, 0)), run(tmp_path / "other", hits(0.5, 1))
-    table = retention([one, other])
+    table = retention_table([one, other])
     for category in ("color", "shape"):
         mine, theirs = (r.episodes[r.episodes["category"] == category].reset_index() for r in (one, other))
         gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
@@ -79,7 +79,7 @@ def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_p
 
 def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_run: ProbedRun) -> None:
     one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
-    found = difference(retention([one, other]), "other", "color")
+    found = difference(retention_table([one, other]), "other", "color")
     best = []
     for probed in (one, other):
         curve = load_results(probed).curves["color", "mean"]
@@ -87,8 +87,8 @@ def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_r
         right = (curve.decisions[backbone] > 0) == curve.labels
         best.append(right[right.mean(axis=1).argmax()].astype(float))
     value, low, high, _ = oracle(pd.Series(best[0] - best[1]), pd.Series(curve.groups))
-    assert found.prefix_accuracy == pytest.approx(value)
-    assert found.prefix_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
+    assert found.backbone_accuracy == pytest.approx(value)
+    assert found.backbone_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
 
 
 def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> No
     right, other = hits(0.5, 0, items), hits(0.5, 1, items)
     nearly = {name: array.copy() for name, array in right.items()}
     nearly["color"][0, 0] ^= True
-    table = retention(
+    table = retention_table(
         [run(tmp_path / name, own) for name, own in (("one", right), ("nearly", nearly), ("other", other))]
     )
     widths = []
@@ -108,7 +108,7 @@ def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> No
 
 def test_holm_holds_over_all_categories_of_all_pairs(tmp_path: Path) -> None:
     runs = [run(tmp_path / f"run-{seed}", hits(0.9 - 0.2 * seed, seed)) for seed in range(3)]
-    rows = retention(runs).differences
+    rows = retention_table(runs).differences
     for means in (False, True):
         family = sorted((row for row in rows if (row.category == "mean") == means), key=lambda row: row.p or 0)
         assert len(family) == (2 if means else 4)
@@ -121,7 +121,7 @@ def test_holm_holds_over_all_categories_of_all_pairs(tmp_path: Path) -> None:
 
 def test_a_group_of_runs_is_tested_by_its_mean_on_the_same_items(tmp_path: Path) -> None:
     first, second, third = (run(tmp_path / name, hits(0.7, at)) for at, name in enumerate("abc"))
-    table = retention({"two": [first, second], "one": [third]})
+    table = retention_table({"two": [first, second], "one": [third]})
     right = [(r.episodes["outcome"] == "correct").astype(float) for r in (first, second, third)]
     of_color = first.episodes["category"] == "color"
     gains = ((right[0] + right[1]) / 2 - right[2])[of_color]
@@ -140,30 +140,30 @@ def pairs(table: RetentionTable) -> list[tuple[str, str]]:
 
 def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_named(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at)) for at, name in enumerate("abc")]
-    assert pairs(retention(runs)) == [("a", "b"), ("a", "c")]
-    assert pairs(retention(runs, against="b")) == [("a", "b"), ("c", "b")]
-    assert pairs(retention(runs, against=str(tmp_path / "c"))) == [("a", "c"), ("b", "c")]
+    assert pairs(retention_table(runs)) == [("a", "b"), ("a", "c")]
+    assert pairs(retention_table(runs, against="b")) == [("a", "b"), ("c", "b")]
+    assert pairs(retention_table(runs, against=str(tmp_path / "c"))) == [("a", "c"), ("b", "c")]
     groups = {"x": runs[:1], "y": runs[1:2], "z": runs[2:]}
-    assert pairs(retention(groups)) == [("x", "y"), ("x", "z"), ("y", "z")]
-    assert pairs(retention(groups, against="y")) == [("x", "y"), ("z", "y")]
+    assert pairs(retention_table(groups)) == [("x", "y"), ("x", "z"), ("y", "z")]
+    assert pairs(retention_table(groups, against="y")) == [("x", "y"), ("z", "y")]
 
 
 def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at), called="twin") for at, name in enumerate("ab")]
     with pytest.raises(UsageError, match=r"--against 'c' is none of the runs a \(twin · .*\), b"):
-        retention(runs, against="c")
+        retention_table(runs, against="c")
     with pytest.raises(UsageError, match="--against 'twin' is several of the runs"):
-        retention(runs, against="twin")
+        retention_table(runs, against="twin")
     with pytest.raises(UsageError, match="there is no group 'z' to compare with; there are x, y"):
-        retention({"x": runs[:1], "y": runs[1:]}, against="z")
+        retention_table({"x": runs[:1], "y": runs[1:]}, against="z")
     with pytest.raises(UsageError, match="needs a second run"):
-        retention(runs[:1], against="a")
+        retention_table(runs[:1], against="a")
 
 
 def test_one_run_twice_is_refused(tmp_path: Path) -> None:
     one = run(tmp_path / "one", hits(0.5, 0))
     with pytest.raises(UsageError, match="given twice"):
-        retention([one, one])
+        retention_table([one, one])
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
     from rich.console import Console
 
     there = {"right": hits(0.5, 1), "seed": 0} | other
-    table = retention([run(tmp_path / "one", hits(0.5, 0), seed=0), run(tmp_path / "other", **there)])
+    table = retention_table([run(tmp_path / "one", hits(0.5, 0), seed=0), run(tmp_path / "other", **there)])
     assert table.differences == []
     assert table.unpaired == (f"one and other are not compared: {why}.",)
     console = Console(width=200, record=True, file=StringIO())
@@ -193,15 +193,15 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
 def test_other_words_are_other_questions(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
     side = replace(other, episodes=other.episodes.assign(wording="side"))
-    assert "other wordings (knowledge and side)" in retention([one, side]).unpaired[0]
+    assert "other wordings (knowledge and side)" in retention_table([one, side]).unpaired[0]
     own = replace(other, episodes=other.episodes.assign(wording="knowledge"))
-    assert retention([one, own]).differences
+    assert retention_table([one, own]).differences
 
 
 def test_a_category_with_other_items_alone_is_left_out(tmp_path: Path) -> None:
     one = run(tmp_path / "one", hits(0.5, 0))
     other = run(tmp_path / "other", hits(0.5, 1, {"color": 20, "shape": 10}))
-    table = retention([one, other])
+    table = retention_table([one, other])
     assert [row.category for row in table.differences] == ["color", "mean"]
     assert table.differences[1].categories == ("color",)
     assert table.unpaired == ("one and other are not compared in shape: other episodes.",)
@@ -211,13 +211,15 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     readers = [asked(tmp_path / str(at), hits(0.7, at), f"reader-{at}") for at in range(2)]
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
     mixed = [policies[0], readers[0], policies[1], readers[1]]
-    table = retention(mixed)
+    table = retention_table(mixed)
     assert pairs(table) == [("reader-0", "reader-1"), ("policy-0", "policy-1")]
-    assert table.unpaired == ("Asked and acting runs are not compared with each other here; --gap does that.",)
-    assert retention(mixed, gap=True).unpaired == ()
+    assert table.unpaired == (
+        "VLM runs and policy runs are not compared with each other here; --vlm-vla does that.",
+    )
+    assert retention_table(mixed, vlm_vla=True).unpaired == ()
     accuracy = [(r.episodes["outcome"] == "correct").mean() for r in readers]
     gain = next(row.sr for row in table.differences if row.category == "mean")
-    right = [row.sr for row in table.means if row.kind == "asks"]
+    right = [row.success.sr for row in table.means if row.run.mode == "answers"]
     assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]
     assert accuracy[0] != accuracy[1]
 
@@ -225,9 +227,9 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
 def test_a_run_without_probes_is_compared_in_what_it_did(probed_run: ProbedRun, tmp_path: Path) -> None:
     probed = probed_run({"color": SIGNAL})
     bare = ArrayRun(tmp_path / "bare", "bare", probed.suite, probed.episodes, {})
-    table = retention([probed, bare])
+    table = retention_table([probed, bare])
     assert [(row.category, row.view) for row in table.differences] == [("color", None), ("mean", None)]
-    assert all(row.sr == 0 and row.prefix_accuracy is None for row in table.differences)
+    assert all(row.sr == 0 and row.backbone_accuracy is None for row in table.differences)
 
 
 # -- names ---------------------------------------------------------------------------------------------------
@@ -240,7 +242,7 @@ def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
     disguised = run(tmp_path / "e", right, called="pi0 (random weights)")
     names = full_names([*same, random, disguised])
     assert len(set(names)) == 5
-    models = {row.label for row in retention(same).rows}
+    models = {row.run.label for row in retention_table(same).rows}
     assert len(models) == 3
 
 
@@ -249,13 +251,13 @@ def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
 
 def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
-    alone = json.loads(retention([one]).to_json())
+    alone = json.loads(retention_table([one]).to_json())
     assert all("differences" not in row for row in alone)
-    both = json.loads(retention([one, other]).to_json())
-    assert [row["run"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
+    both = json.loads(retention_table([one, other]).to_json())
+    assert [row["run"]["location"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
     assert [{name: row[name] for name in alone[0]} for row in both[:3]] == alone
     (found,) = both[0]["differences"]
     assert found["minus_run"] == str(tmp_path / "other")
     assert found["category"] == both[0]["category"] == "color"
-    assert found["sr"] == pytest.approx(both[0]["sr"] - both[3]["sr"])
+    assert found["sr"] == pytest.approx(both[0]["success"]["sr"] - both[3]["success"]["sr"])
     assert [row["differences"] for row in both[3:]] == [[], [], []]

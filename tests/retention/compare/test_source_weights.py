@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 from probe_kit.hooks import ModelCard, known_families, load_model
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.retention import retention
+from probe_kit.retention import retention_table
 from probe_kit.retention.compare.source_weights import grew_from
-from probe_kit.retention.compare.vlm_vla import vlm_gaps
+from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 
@@ -119,11 +119,11 @@ def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None
 def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_path: Path) -> None:
     readers = [reader(tmp_path / str(n), one, f"reader {n}") for n, one in enumerate((QWEN_4B, QWEN_32B))]
     grown = policy(tmp_path / "p", xiaomi())
-    found = vlm_gaps([*readers, grown])
+    found = vlm_vla_differences([*readers, grown])
     assert {(gap.asked, gap.source) for gap in found} == {("reader 0", "yes")}
-    assert {(gap.asked, gap.source) for gap in vlm_gaps([readers[1], grown])} == {("reader 1", "no")}
+    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([readers[1], grown])} == {("reader 1", "no")}
     unknown = reader(tmp_path / "u", replace(QWEN_4B, checkpoint="my/copy"), "copy")
-    assert {(gap.asked, gap.source) for gap in vlm_gaps([*readers, unknown, grown])} == {
+    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([*readers, unknown, grown])} == {
         ("reader 0", "yes"),
         ("copy", "unknown"),
     }
@@ -139,7 +139,7 @@ def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_
 )
 def test_every_format_says_whether_the_reader_is_the_source(tmp_path: Path, card: ModelCard, words: str) -> None:
     runs = [reader(tmp_path / "r", card), policy(tmp_path / "p", xiaomi())]
-    table = retention(runs, gap=True)
+    table = retention_table(runs, vlm_vla=True)
     console = Console(width=300, record=True, file=StringIO())
     console.print(table.to_rich())
     pages = (table.to_markdown(), table.to_latex(), report_html(runs, table), console.export_text())

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from probe_kit.errors import UsageError
-from probe_kit.retention import retention
-from probe_kit.retention.compare.vlm_vla import vlm_gaps
+from probe_kit.retention import retention_table
+from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from tests.retention.asked_runs import SaidRun, acted, asked
 
 
@@ -28,59 +28,72 @@ def runs(tmp_path: Path) -> list[SaidRun]:
 
 
 def test_asked_rows_stand_first_and_say_what_they_are(runs: list[SaidRun]) -> None:
-    table = retention(runs)
-    assert [row.kind for row in table.all_rows] == ["asks"] * 3 + ["acts"] * 3
+    table = retention_table(runs)
+    assert [row.run.mode for row in table.all_rows] == ["answers"] * 3 + ["acts"] * 3
     color, _, mean = table.all_rows[:3]
-    assert (color.prompt, color.picture_size, color.asked_for, color.score) == ("p1", "224x224", "target", "text")
-    assert color.accuracy_text == color.sr
-    assert (color.accuracy_logits, color.accuracy_debiased, color.letter_bias, color.option_mass) == (
+    answers = color.answers
+    assert (answers.prompt, answers.picture_size, answers.asked_for, answers.score) == (
+        "p1",
+        "224x224",
+        "target",
+        "text",
+    )
+    assert answers.accuracy_text == color.success.sr
+    assert (
+        answers.accuracy_logits,
+        answers.accuracy_order_balanced,
+        answers.letter_bias,
+        answers.option_mass,
+    ) == (
         0.5,
         1,
         1.5,
         0.8,
     )
-    assert color.p_unreadable == color.p_oob > 0
-    assert (mean.kind, mean.prompt, mean.accuracy_logits) == ("asks", "p1", 0.5)
-    assert "no answer could be read" in retention([_mostly_silent(runs[1])]).rows[0].regime_reason
+    assert answers.share_unparsable == color.success.share_outside > 0
+    assert (mean.run.mode, mean.answers.prompt, mean.answers.accuracy_logits) == ("answers", "p1", 0.5)
+    assert "no answer could be read" in retention_table([_mostly_silent(runs[1])]).rows[0].success.reason
 
 
 def _mostly_silent(run: SaidRun) -> SaidRun:
     return replace(run, episodes=run.episodes.assign(outcome="oob", side_placed="none"))
 
 
-@pytest.mark.parametrize(("score", "sr"), [("logits", 0.5), ("debiased", 1.0)])
+@pytest.mark.parametrize(("score", "sr"), [("logits", 0.5), ("order-balanced", 1.0)])
 def test_the_score_is_what_the_table_shows(runs: list[SaidRun], score: str, sr: float) -> None:
-    table = retention(runs, score=score)
-    assert all(row.sr == sr and row.score == score for row in table.rows if row.kind == "asks")
-    assert [row.sr for row in table.rows if row.kind == "acts"] == [
-        row.sr for row in retention(runs).rows if row.kind == "acts"
+    table = retention_table(runs, score=score)
+    assert all(
+        row.success.sr == sr and row.answers.score == score for row in table.rows if row.run.mode == "answers"
+    )
+    assert [row.success.sr for row in table.rows if row.run.mode == "acts"] == [
+        row.success.sr for row in retention_table(runs).rows if row.run.mode == "acts"
     ]
-    assert table.rows[0].accuracy_text == retention(runs).rows[0].sr
+    assert table.rows[0].answers.accuracy_text == retention_table(runs).rows[0].success.sr
     with pytest.raises(UsageError, match="score is 'luck'"):
-        retention(runs, score="luck")
+        retention_table(runs, score="luck")
 
 
 def test_a_constant_answer_has_one_right_per_item_and_no_paired_evidence(runs: list[SaidRun]) -> None:
-    row = retention(runs, score="logits").rows[0]
-    assert (row.sr, row.items_one_right, row.paired_p) == (0.5, 20, 1)
+    row = retention_table(runs, score="logits").rows[0]
+    assert (row.success.sr, row.success.paired.one, row.success.paired.p) == (0.5, 20, 1)
 
 
 def test_items_with_a_side_in_their_name_are_left_out_unless_asked_for(tmp_path: Path) -> None:
     run = asked(tmp_path, by_chance(1, 0.9), worded=True)
-    table = retention([run])
-    assert table.rows[0].n_items == 19
+    table = retention_table([run])
+    assert table.rows[0].success.n_items == 19
     assert any("4 episodes are left out because a side stands in the name" in note for note in table.notes)
-    assert retention([run], with_side_words=True).rows[0].n_items == 20
+    assert retention_table([run], with_side_words=True).rows[0].success.n_items == 20
 
 
 def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None:
-    table = retention(runs, gap=True)
+    table = retention_table(runs, vlm_vla=True)
     policy, reader = (run.episodes.set_index("episode_id") for run in runs)
     ps = []
-    for gap in table.gaps[:2]:
+    for gap in table.vlm_vla[:2]:
         here = reader[reader["category"] == gap.category]["outcome"] == "correct"
         there = (policy["outcome"] == "correct")[here.index]
-        assert gap.vlm_gap == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
+        assert gap.difference == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
         gains: dict[str, int] = {}
         for name in here.index:
             group = reader.loc[name, "group_id"]
@@ -102,25 +115,25 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
             min(low, own.mean() - share * (own.mean() + 1)),
             max(high, own.mean() + share * (1 - own.mean())),
         )
-        assert gap.vlm_gap_ci == (pytest.approx(low, abs=0.04), pytest.approx(high, abs=0.04))
+        assert gap.difference_ci == (pytest.approx(low, abs=0.04), pytest.approx(high, abs=0.04))
         assert (gap.paired, gap.same_frames) == (True, True)
     smaller, larger = sorted(ps)
     corrected = {smaller: min(1, 2 * smaller), larger: min(1, max(2 * smaller, larger))}
-    assert [gap.p_holm for gap in table.gaps[:2]] == [pytest.approx(corrected[p]) for p in ps]
-    mean = table.gaps[2]
+    assert [gap.p_holm for gap in table.vlm_vla[:2]] == [pytest.approx(corrected[p]) for p in ps]
+    mean = table.vlm_vla[2]
     assert mean.category == "mean"
-    assert mean.vlm_gap == pytest.approx(np.mean([gap.vlm_gap for gap in table.gaps[:2]]))
+    assert mean.difference == pytest.approx(np.mean([gap.difference for gap in table.vlm_vla[:2]]))
 
 
 def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
     policy, reader = runs
     fewer = replace(policy, episodes=policy.episodes[policy.episodes["item_id"] != "color-0"])
-    color = vlm_gaps([reader, fewer])[0]
+    color = vlm_vla_differences([reader, fewer])[0]
     assert (color.paired, color.p) == (False, None)
     other = replace(policy, episodes=policy.episodes.assign(first_frame_sha256="another"))
-    assert vlm_gaps([reader, other])[0].same_frames is False
+    assert vlm_vla_differences([reader, other])[0].same_frames is False
     bare = replace(policy, episodes=policy.episodes.drop(columns="first_frame_sha256"))
-    assert vlm_gaps([reader, bare])[0].same_frames is None
+    assert vlm_vla_differences([reader, bare])[0].same_frames is None
 
 
 def test_a_policy_is_compared_with_the_reader_it_grew_from(tmp_path: Path) -> None:
@@ -133,34 +146,40 @@ def test_a_policy_is_compared_with_the_reader_it_grew_from(tmp_path: Path) -> No
     grown = {"source": "paligemma", "source_weights": {"checkpoint": "google/paligemma-3b-pt-224"}}
     pi0 = replace(pi0, certificate={"policy": grown})
     tiny = acted(tmp_path / "d", by_chance(4, 0.5), "pi0-tiny")
-    pairs = {(gap.asked, gap.acted) for gap in vlm_gaps([qwen, gemma, pi0, tiny])}
+    pairs = {(gap.asked, gap.acted) for gap in vlm_vla_differences([qwen, gemma, pi0, tiny])}
     assert pairs == {("paligemma", "pi0"), ("qwen3-vl", "pi0-tiny"), ("paligemma", "pi0-tiny")}
 
 
 def test_a_gap_needs_both_kinds(runs: list[SaidRun]) -> None:
     with pytest.raises(UsageError, match="have no such pair"):
-        retention(runs[:1], gap=True)
+        retention_table(runs[:1], vlm_vla=True)
 
 
 def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path: Path) -> None:
     larger = asked(tmp_path / "large", by_chance(5, 0.7), called="large", picture_size="560x480")
     other = asked(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")
-    table = retention([*runs, larger, other], gap=True)
+    table = retention_table([*runs, larger, other], vlm_vla=True)
     console = Console(width=200, record=True, file=StringIO())
     console.print(table.to_rich())
     shown = console.export_text()
-    for words in ("Accuracy of answers", "asked above, acting below", "VLM − VLA", "560x480", "letter bias"):
+    for words in (
+        "Accuracy of answers",
+        "VLM runs above, policy runs below",
+        "VLM − VLA",
+        "560x480",
+        "letter bias",
+    ):
         assert words in shown
     markdown = table.to_markdown()
-    for words in ("SR / accuracy % [95 %]", "**Answers**", "**VLM − VLA: ", "| qwen3-vl | seen |"):
+    for words in ("accuracy % [95 %]", "**Accuracy of answers", "**VLM − VLA: ", "| qwen3-vl | seen |"):
         assert words in markdown
     latex = table.to_latex()
-    assert "SR / acc." in latex
+    assert "accuracy \\,\\%".replace(" ", "") in latex
     assert "VLM $-$ VLA" in latex
     content = json.loads(table.to_json())
-    assert len(content["gaps"]) == 9
-    assert {"vlm_gap", "vlm_gap_ci", "p_holm", "paired"} <= content["gaps"][0].keys()
-    assert isinstance(json.loads(retention(runs).to_json()), list)
+    assert len(content["vlm_vla"]) == 9
+    assert {"difference", "difference_ci", "p_holm", "paired"} <= content["vlm_vla"][0].keys()
+    assert isinstance(json.loads(retention_table(runs).to_json()), list)
     sizes = next(own for own in table.further_tables if own.columns[:2] == ("model", "prompt"))
     assert sizes.columns == ("model", "prompt", "224x224", "560x480")
     assert [cells[:2] for cells in sizes.cells] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]

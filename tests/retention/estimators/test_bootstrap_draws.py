@@ -21,14 +21,14 @@ Outcomes = Callable[..., pd.DataFrame]
 
 
 def estimates_of(curve: ProbeCurve, suite: str = "s@1#0") -> dict[str, Estimate]:
-    peaks = {"prefix": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
+    peaks = {"backbone": best_site(curve, "backbone"), "action": best_site(curve, "expert")}
     found = {name: peak for name, peak in peaks.items() if peak is not None}
     return probe_estimates(curve, found, measure_retention(curve), suite)
 
 
 def test_intervals_are_those_of_the_bootstrap_over_groups(curve_of: CurveOf, outcome_table: Outcomes) -> None:
     curve = curve_of(outcome_table(100, 100, 0), [0.5, 0.9], [[0.6, 0.7]])
-    found = estimates_of(curve)["prefix_accuracy"]
+    found = estimates_of(curve)["backbone_accuracy"]
     low, high = group_bootstrap(curve.correct[[1]].T, curve.groups, found.units)
     assert found.value == 0.9
     assert found.ci == (low[0], high[0])
@@ -66,7 +66,7 @@ def test_a_backbone_at_chance_gives_no_ratio() -> None:
 
 def test_retention_without_backbone_signal_is_not_estimated(curve_of: CurveOf, outcome_table: Outcomes) -> None:
     assert set(estimates_of(curve_of(outcome_table(100, 100, 0), [0.55], [[0.6]]))) == {
-        "prefix_accuracy",
+        "backbone_accuracy",
         "action_accuracy",
     }
 

@@ -2,7 +2,7 @@ from collections.abc import Callable
 
 import pytest
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.formats.latex import escape, heat_colour
 from probe_kit.train import ArrayRun
 
@@ -10,7 +10,7 @@ from probe_kit.train import ArrayRun
 @pytest.fixture
 def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
     accuracies = {"color": ([0.5, 0.9, 0.7], [[0.6, 0.7]]), "traffic_sign": ([0.5, 0.55, 0.5], [[0.58, 0.5]])}
-    return retention([probed_run(accuracies, "pi0-tiny", random_weights=True)])
+    return retention_table([probed_run(accuracies, "pi0-tiny", random_weights=True)])
 
 
 def test_text_is_escaped_and_only_defined_retention_is_coloured(table: RetentionTable) -> None:
@@ -18,8 +18,8 @@ def test_text_is_escaped_and_only_defined_retention_is_coloured(table: Retention
     assert r"[95 \%]" not in text, "percent stands close to its number in every heading"
     lines = {line.split(" & ")[3]: line for line in text.splitlines() if line.startswith("pi0-tiny (random")}
     row = table.rows[0]
-    assert row.retention_bounded is not None
-    shown = rf"\cellcolor{{{heat_colour(row.retention_bounded)}}}{row.retention_bounded:.2f}"
+    assert row.retention.bounded is not None
+    shown = rf"\cellcolor{{{heat_colour(row.retention.bounded)}}}{row.retention.bounded:.2f}"
     assert shown in lines["color"]
     assert "cellcolor" not in lines[r"traffic\_sign"]
     assert text.count("{") == text.count("}")

@@ -2,14 +2,14 @@ from collections.abc import Callable
 
 import pytest
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.train import ArrayRun
 
 
 @pytest.fixture
 def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
     accuracies = {"color": ([0.5, 0.9, 0.7], [[0.6, 0.7]]), "counting": ([0.5, 0.55, 0.5], [[0.58, 0.5]])}
-    return retention([probed_run(accuracies, "pi0-tiny", random_weights=True)])
+    return retention_table([probed_run(accuracies, "pi0-tiny", random_weights=True)])
 
 
 def test_titles_and_rows_mark_random_weights(table: RetentionTable) -> None:
@@ -19,7 +19,8 @@ def test_titles_and_rows_mark_random_weights(table: RetentionTable) -> None:
 
 
 def test_undefined_retention_says_why(table: RetentionTable) -> None:
-    assert table.to_markdown().count("| n/a (no backbone signal) | – | – | – |") == 1
+    assert table.to_markdown().count("| n/a | – | – | – |") == 1
+    assert "n/a (no backbone signal): counting." in table.to_markdown()
 
 
 def test_rows_have_as_many_cells_as_the_heading(table: RetentionTable) -> None:

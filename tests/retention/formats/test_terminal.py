@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import RetentionTable, retention
-from probe_kit.train import ArrayRun, BaselineScore, Controls, TwinScore, load_results, save_results
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.train import ArrayRun, BaselineScore, Controls, UntrainedScore, load_results, save_results
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
@@ -40,13 +40,13 @@ def table(probed_run: ProbedRun) -> RetentionTable:
                 for category in accuracies
             ),
             tuple(
-                TwinScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "a twin")
+                UntrainedScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "a twin")
                 for site in ("backbone.01.residual", "expert.01.residual@0")
                 for category in accuracies
             ),
         )
         save_results(replace(results, controls=controls), run.path)
-    return retention({"first": [runs[0]], "second": [runs[1]]})
+    return retention_table({"first": [runs[0]], "second": [runs[1]]})
 
 
 def numbers(text: str) -> list[float]:
@@ -79,46 +79,43 @@ def rounded(values: list[object], scales: list[tuple[float, int]]) -> list[float
 SHARE, RATIO, WHOLE, PLACE, P = (100, 1), (1, 2), (100, 0), (1, 0), (1, 3)
 
 
-RETENTIONS = ("bounded", "bounded_ci", "area", "area_ci", "debiased", "ci")
+RETENTIONS = ("bounded", "bounded_ci", "area", "area_ci", "debiased", "ci", "published")
 
 
-def expected(row: dict[str, object]) -> dict[str, list[float]]:
-    defined = bool(row["retention_defined"])
-    score = row["normalised_score"]
+def expected(row: dict[str, dict[str, object]]) -> dict[str, list[float]]:
+    success, backbone, action, controls = (row[name] for name in ("success", "backbone", "action", "controls"))
+    defined = bool(row["retention"]["defined"])
     return {
         "Success": rounded(
             [
-                row["sr"],
-                row["sr_ci"],
-                row["delta_regime"],
-                row["delta"],
-                score,
-                row["sr_left"],
-                row["sr_right"],
-                row["p_wrong"],
-                row["p_oob"],
+                *(success[name] for name in ("sr", "ci", "chance_margin", "chance_margin_episodes")),
+                *(success[name] for name in ("normalised_score", "sr_left", "sr_right")),
+                *(success[name] for name in ("share_wrong", "share_outside")),
             ],
-            [SHARE, SHARE, SHARE, SHARE, (1, 1), WHOLE, WHOLE, SHARE, SHARE],
+            [SHARE, SHARE, SHARE, SHARE, (1, 1), SHARE, SHARE, SHARE, SHARE],
         ),
         "Retention": rounded(
             [
-                *(row[f"prefix_{name}"] for name in ("accuracy", "ci", "layer")),
-                row["prefix_ties"] or None,
-                row["prefix_p_fwe"],
-                *(row[f"action_{name}"] for name in ("accuracy", "ci", "layer", "iteration")),
-                row["action_ties"] or None,
-                *(row[f"action_{name}"] for name in ("p_fwe", "first_accuracy")),
-                *(row[f"retention_{name}"] if defined else None for name in RETENTIONS),
-                row["retention"] if defined else None,
-                row["gap"],
+                *(row["retention"][name] if defined else None for name in RETENTIONS),
+                controls["probe_minus_sr"],
+                *(backbone[name] for name in ("accuracy", "ci", "layer")),
+                backbone["ties"] or None,
+                backbone["p_fwe"],
+                *(action[name] for name in ("accuracy", "ci", "layer", "iteration")),
+                action["ties"] or None,
+                *(action[name] for name in ("p_fwe", "first_accuracy")),
             ],
-            [SHARE, SHARE, PLACE, PLACE, P, SHARE, SHARE, PLACE, PLACE, PLACE, P, SHARE, *[RATIO] * 7, SHARE],
+            [*[RATIO] * 7, SHARE, SHARE, SHARE, PLACE, PLACE, P, SHARE, SHARE, PLACE, PLACE, PLACE, P, SHARE],
         ),
         "Controls": rounded(
             [
-                *(row["baselines"][name] for name in ("position", "instruction", "pixels")),  # type: ignore[index]
-                *(row[f"{stream}_selectivity"] for stream in ("prefix", "action")),
-                *(row[f"{stream}_{name}"] for stream in ("prefix", "action") for name in ("twin", "twin_ci")),
+                *(controls["baselines"][name] for name in ("position", "instruction", "pixels")),  # type: ignore[index]
+                *(stream["selectivity"] for stream in (backbone, action)),
+                *(
+                    stream[name]
+                    for stream in (backbone, action)
+                    for name in ("minus_untrained", "minus_untrained_ci")
+                ),
             ],
             [SHARE] * 9,
         ),
@@ -141,7 +138,8 @@ def test_every_number_can_be_read_back_at_every_width(table: RetentionTable, wid
     told = found[0][1]["mean", "A − B"]
     assert told == pytest.approx([0.0, *(round(100 * x, 1) for x in difference.sr_ci), 1.0, 1.0])
     told = found[1][1]["mean", "A − B"]
-    assert told[:3] == pytest.approx([0.0, *(round(100 * x, 1) for x in difference.prefix_ci)])
+    start = [0.0, *(round(100 * x, 1) for x in difference.backbone_ci)]
+    assert any(told[at : at + 3] == pytest.approx(start) for at in range(len(told)))
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -150,45 +148,53 @@ def test_no_width_crops_anything_or_runs_over(table: RetentionTable, width: int)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= width
     row = table.rows[1]
-    low, high = (f"{100 * limit:.1f}" for limit in row.prefix_ci)  # type: ignore[union-attr,operator]
+    low, high = (f"{100 * limit:.1f}" for limit in row.backbone.ci)  # type: ignore[union-attr,operator]
     assert f"100.0 [{low}, {high}]" in text
 
 
 def test_a_wide_terminal_has_one_table_per_subject(table: RetentionTable) -> None:
-    headings = [line for line in printed(table, 240).splitlines() if line.startswith("category ")]
+    headings = [line for line in printed(table, 300).splitlines() if line.startswith("category ")]
     assert len(headings) == 3
 
 
-def test_text_says_backbone_and_action_and_latex_the_papers_columns(table: RetentionTable) -> None:
-    from probe_kit.retention.formats.html import control_table, retention_table
+def test_headings_are_the_same_in_every_format(table: RetentionTable) -> None:
+    from probe_kit.retention.columns.tables import tables_of
+    from probe_kit.retention.formats.html import html_tables
 
-    headings = [column.name for column in retention_table(table.all_rows).columns]  # type: ignore[union-attr]
-    headings += [column.name for column in control_table(table.all_rows).columns]  # type: ignore[union-attr]
-    lines = [
-        line for line in table.to_markdown().splitlines() if line.startswith("| model") or "| category" in line
+    rows = table.all_rows
+    pages = [
+        column.name.replace("\u00a0", " ")
+        for one in html_tables(rows, table.differences)
+        for column in one.columns
     ]
-    lines += [line for line in printed(table, 240).splitlines() if line.startswith("category")]
-    for text in (*headings, *lines):
-        assert not re.search("prefix|expert", text), text
-    assert sum("backbone" in text for text in (*headings, *lines)) >= 6
-    assert sum("action" in text for text in (*headings, *lines)) >= 6
-    assert "& Prefix & Layer & Action & Layer & First it. &" in table.to_latex()
+    texts = {"terminal": printed(table, 300), "markdown": table.to_markdown(), "latex": table.to_latex()}
+    texts["latex"] = (
+        texts["latex"].replace(r"\,\%", " %").replace("$-$", "−").replace(r"$\pm$", "±").replace(r"$\Delta$", "Δ")
+    )
+    for one in tables_of(rows, table.differences):
+        for column in one.columns:
+            assert column.heading in pages
+            assert f" {column.heading} |" in texts["markdown"]
+            assert not re.search("prefix|expert", column.heading)
+        for column in one.without_details().columns:
+            assert column.heading in texts["terminal"]
+            assert f"& {column.heading}" in texts["latex"]
 
 
 def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:
-    text = printed(retention([probed_run({"color": SIGNAL}, "pi0-tiny", random_weights=True)]))
+    text = printed(retention_table([probed_run({"color": SIGNAL}, "pi0-tiny", random_weights=True)]))
     assert text.count("pi0-tiny (random weights) on") == 2
 
 
 def test_the_caption_says_why_retention_is_missing(probed_run: ProbedRun) -> None:
-    text = printed(retention([probed_run({"color": SIGNAL, "counting": NONE})]))
+    text = printed(retention_table([probed_run({"color": SIGNAL, "counting": NONE})]))
     assert "n/a (no backbone signal)" in " ".join(text.split())
     assert "without counting" in " ".join(text.split())
 
 
 def test_several_runs_stand_in_one_table_under_a_title_that_names_all(probed_run: ProbedRun) -> None:
     text = printed(
-        retention([probed_run({"color": SIGNAL}, "pi0"), probed_run({"color": SIGNAL}, "smolvla")]), 160
+        retention_table([probed_run({"color": SIGNAL}, "pi0"), probed_run({"color": SIGNAL}, "smolvla")]), 160
     )
     for what in ("Success rate", "Retention, view mean"):
         assert text.count(f"{what}: A pi0, B smolvla on suite@1#0123456789ab") == 1
@@ -198,8 +204,8 @@ def test_several_runs_stand_in_one_table_under_a_title_that_names_all(probed_run
 
 def test_a_policy_without_an_expert_has_the_same_columns(probed_run: ProbedRun) -> None:
     runs = [probed_run({"color": SIGNAL}, "openvla", action_stream="action"), probed_run({"color": SIGNAL}, "pi0")]
-    table = retention(runs)
-    assert [row.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
-    assert [row.retention for row in table.rows] == [table.rows[0].retention] * 2 != [None, None]
+    table = retention_table(runs)
+    assert [row.run.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
+    assert [row.retention.bounded for row in table.rows] == [table.rows[0].retention.bounded] * 2 != [None, None]
     headings = [line for line in printed(table, 160).splitlines() if "backbone %" in line]
     assert len(headings) == 1

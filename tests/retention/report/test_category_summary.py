@@ -1,33 +1,45 @@
 """What a report opens with: known, encoded, used, in a sentence per category."""
 
+from dataclasses import replace
 from typing import Any
-
-import pytest
 
 from probe_kit._terminal.console import out
 from probe_kit.retention import RetentionRow
-from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.report.category_summary import stories
+from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
+from probe_kit.retention.report.category_summary import policy_summaries, verdict
+from probe_kit.retention.rows.parts import AnswerStats, BackbonePeak, RunInfo, SwapEffect
 from probe_kit.retention.rows.row import MEAN
 
 
-def row(kind: str, category: str, **fields: Any) -> RetentionRow:
+def row(
+    mode: str, category: str, sr: float | None = 0.5, regime: Regime | None = None, **run: Any
+) -> RetentionRow:
+    """Of a run that answers or acts. run: fields of its `RunInfo`."""
     plain: dict[str, Any] = {
-        "run": kind, "model": "pi0-tiny" if kind == "acts" else "vlm-tiny", "random_weights": False,
-        "weights_sha256": None, "suite": "suite@1", "run_settings": "r", "probe_settings": None, "view": None,
-        "n_episodes": 48, "n_items": 24, "sr": 0.5,
+        "location": mode, "model": "pi0-tiny" if mode == "acts" else "vlm-tiny", "random_weights": False,
+        "weights_sha256": None, "suite": "suite@1", "settings": "r", "probes": None,
     }  # fmt: skip
-    return RetentionRow(kind=kind, category=category, **{**plain, **fields})
+    return RetentionRow(
+        category=category,
+        view=None,
+        run=RunInfo(mode=mode, **{**plain, **run}),  # type: ignore[arg-type]
+        success=SuccessRate(n_episodes=48, n_items=24, sr=sr, regime=regime),
+    )
 
 
-def answers(category: str, sr: float = 1.0, **fields: Any) -> RetentionRow:
-    return row("asks", category, sr=sr, regime=Regime.KNOWLEDGE if sr > 0.7 else None, **fields)
+def answers(category: str, sr: float = 1.0, picture: str | None = None, **run: Any) -> RetentionRow:
+    made = row("answers", category, sr, Regime.KNOWLEDGE if sr > 0.7 else None, **run)
+    return replace(made, answers=AnswerStats(picture=picture))
 
 
-def acts(category: str, backbone: float | None, used: str, sr: float = 0.5, **fields: Any) -> RetentionRow:
+def acts(category: str, backbone: float | None, used: str | None, sr: float = 0.5, **run: Any) -> RetentionRow:
     chance = None if backbone is None else backbone > 0.7
-    beats = {"prefix_beats": {"chance": chance}, "prefix_accuracy": backbone, "used": used}
-    return row("acts", category, sr=sr, view="mean", **beats, **fields)
+    return replace(
+        row("acts", category, sr, Regime.KNOWLEDGE if sr > 0.7 else None, **run),
+        view="mean",
+        backbone=BackbonePeak(accuracy=backbone, exceeds={"chance": chance}),
+        image_swap=SwapEffect(used=used),
+    )
 
 
 ROWS = [
@@ -38,12 +50,12 @@ ROWS = [
 
 
 def test_every_category_is_a_sentence_with_the_numbers_it_rests_on() -> None:
-    (story,) = stories(ROWS)
+    (story,) = policy_summaries(ROWS)
     assert (story.policy, story.reader) == ("pi0-tiny", "vlm-tiny")
-    assert [one.outcome for one in story.chapters] == [
+    assert [one.outcome for one in story.categories] == [
         "known; used", "known; encoded, unused", "not known; absent",
     ]  # fmt: skip
-    color, state, counting = (one.sentence for one in story.chapters)
+    color, state, counting = (one.sentence for one in story.categories)
     assert color == (
         "Color: the reader knows it (answers 100.0 % of the questions right), the answer can be read in the "
         "policy's backbone (probe 100.0 %), and the policy acts on it (right in 93.8 % of the episodes)."
@@ -58,33 +70,40 @@ def test_without_a_reader_nothing_is_said_of_knowing() -> None:
         [*ROWS[4:], answers("color", suite="another@1")],
         [*ROWS[4:], answers("color", picture="none")],
     ):
-        (story,) = stories(rows)
+        (story,) = policy_summaries(rows)
         assert story.reader == ""
-        assert {one.known for one in story.chapters} == {None}
-        assert "reader" not in story.chapters[0].sentence
+        assert {one.reader_above_chance for one in story.categories} == {None}
+        assert "reader" not in story.categories[0].sentence
 
 
 def test_a_category_that_was_not_asked_about_is_told_without_the_reader() -> None:
-    (story,) = stories([answers("state"), *ROWS[4:]])
-    assert [one.known for one in story.chapters] == [None, True, None]
+    (story,) = policy_summaries([answers("state"), *ROWS[4:]])
+    assert [one.reader_above_chance for one in story.categories] == [None, True, None]
 
 
 def test_every_probed_policy_has_its_story_by_its_first_view() -> None:
-    again = RetentionRow(**{**vars(acts("color", 0.6, "absent")), "view": "mean:language"})
-    rows = [*ROWS, again, acts("color", 0.5, "absent", run="twin", random_weights=True)]
-    first, twin = stories(rows)
+    again = replace(acts("color", 0.6, "absent"), view="mean:language")
+    rows = [*ROWS, again, acts("color", 0.5, "absent", location="twin", random_weights=True)]
+    first, twin = policy_summaries(rows)
     assert (first.policy, twin.policy) == ("pi0-tiny", "pi0-tiny (random weights)")
-    assert [len(one.chapters) for one in (first, twin)] == [3, 1]
+    assert [len(one.categories) for one in (first, twin)] == [3, 1]
 
 
-@pytest.mark.parametrize("fields", [{"capture_only": True}, {"prefix_accuracy": None}])
-def test_who_only_listened_or_was_not_probed_has_none(fields: dict[str, Any]) -> None:
-    plain = vars(acts("color", 1.0, "used"))
-    assert stories([RetentionRow(**{**plain, **fields})]) == []
+def test_a_run_that_did_not_act_or_was_not_probed_has_none() -> None:
+    assert policy_summaries([acts("color", 1.0, "used", capture_only=True)]) == []
+    assert policy_summaries([acts("color", None, "used")]) == []
+
+
+def test_used_is_said_only_where_an_intervention_was_stored() -> None:
+    assert verdict(acts("color", 1.0, None, 0.95)) == "acted on"
+    assert verdict(acts("color", 1.0, None, 0.5)) == "encoded, not acted on"
+    assert verdict(acts("color", 0.5, None, 0.95)) == "acted on, not found"
+    assert verdict(acts("color", 0.5, None, 0.5)) == "absent"
+    assert verdict(acts("color", 0.5, "used", 0.5)) == "used"
 
 
 def test_the_table_fits_a_narrow_terminal() -> None:
-    (story,) = stories(ROWS)
+    (story,) = policy_summaries(ROWS)
     with out.capture() as printed:
         out.print(story.to_rich(), width=80)
     text = printed.get()

@@ -4,7 +4,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from probe_kit.retention import RetentionTable, retention
+from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.train import ArrayRun
 
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])
@@ -13,29 +13,29 @@ NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
 
 @pytest.fixture
 def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
-    return retention([probed_run({"color": SIGNAL, "shape": SIGNAL, "counting": NONE})])
+    return retention_table([probed_run({"color": SIGNAL, "shape": SIGNAL, "counting": NONE})])
 
 
 def test_the_mean_of_categories_is_known_better_than_one_of_them(table: RetentionTable) -> None:
     (mean,) = table.means
-    for name in ("sr_ci", "prefix_ci", "action_ci"):
-        widths = [limits[1] - limits[0] for row in table.rows for limits in [getattr(row, name)]]
-        low, high = getattr(mean, name)
+    for part in ("success", "backbone", "action"):
+        widths = [limits[1] - limits[0] for row in table.rows for limits in [getattr(row, part).ci]]
+        low, high = getattr(mean, part).ci
         assert high - low == pytest.approx(np.sqrt(np.mean(np.square(widths)) / 3), rel=0.15)
-    assert mean.sr_ci is not None
-    assert mean.sr_ci[0] < mean.sr < mean.sr_ci[1]
+    assert mean.success.ci is not None
+    assert mean.success.ci[0] < mean.success.sr < mean.success.ci[1]
 
 
 def test_the_interval_of_mean_retention_is_over_the_categories_that_have_one(table: RetentionTable) -> None:
     (mean,) = table.means
     assert mean.left_out == ("counting",)
-    low, high = mean.retention_ci
-    of_one = table.rows[0].retention_ci
-    assert low < mean.retention_debiased < high
+    low, high = mean.retention.ci
+    of_one = table.rows[0].retention.ci
+    assert low < mean.retention.debiased < high
     assert high - low < of_one[1] - of_one[0]
 
 
 def test_selectivity_is_the_peak_above_the_relabelled_probes(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[0]
-    assert row["prefix_selectivity"] == pytest.approx(0.9 - 0.5)  # the fixture's null is centred on one half
-    assert row["action_selectivity"] == pytest.approx(0.7 - 0.5)
+    assert row["backbone"]["selectivity"] == pytest.approx(0.9 - 0.5)  # the fixture's null is centred on one half
+    assert row["action"]["selectivity"] == pytest.approx(0.7 - 0.5)

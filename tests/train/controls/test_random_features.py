@@ -48,7 +48,7 @@ def test_a_random_network_is_no_better_than_binding(suite: Suite, tmp_path: Path
     scores = probed(suite, tmp_path / "random").scores
     assert not scores["beats_binding"].any()
     assert not scores["signal"].any()
-    assert scores["beats_twin"].isna().all()
+    assert scores["beats_untrained"].isna().all()
 
 
 def test_a_network_that_knows_the_answer_is_better_than_binding(suite: Suite, tmp_path: Path) -> None:

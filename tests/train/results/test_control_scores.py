@@ -1,6 +1,6 @@
 import json
 
-from probe_kit.train import BaselineScore, ControlComparison, Controls, TwinScore
+from probe_kit.train import BaselineScore, ControlComparison, Controls, UntrainedScore
 from probe_kit.train.results.control_scores import has_signal
 
 
@@ -8,8 +8,8 @@ def baseline(name: str, p: float | None = 0.5, accuracy: float = 0.5) -> Baselin
     return BaselineScore(name, "color", accuracy, (0.4, 0.6), p, 0.5, 80)
 
 
-def twin(site: str, peak: bool) -> TwinScore:
-    return TwinScore("color", "mean", site, site, peak, 0.9, 0.5, 0.4, (0.3, 0.5), "tiny (random weights)")
+def twin(site: str, peak: bool) -> UntrainedScore:
+    return UntrainedScore("color", "mean", site, site, peak, 0.9, 0.5, 0.4, (0.3, 0.5), "tiny (random weights)")
 
 
 def test_above_chance_means_a_small_p() -> None:
@@ -25,7 +25,7 @@ def test_a_newer_baseline_replaces_an_older_one_and_keeps_the_twin() -> None:
         "pixels": 0.9,
         "position": 0.5,
     }
-    assert merged.twin == controls.twin
+    assert merged.untrained == controls.untrained
     assert merged.of_category("shape") == {}
 
 
@@ -35,26 +35,26 @@ def test_the_twin_of_a_stream_is_its_peak() -> None:
         twin("expert.00.residual@1", True),
         twin("backbone.03.residual", True),
     ]
-    controls = Controls().with_twin(scores)
-    assert controls.twin_peak("color", "mean", "backbone") == scores[2]
-    assert controls.twin_peak("color", "last", "backbone") is None
+    controls = Controls().with_untrained(scores)
+    assert controls.untrained_peak("color", "mean", "backbone") == scores[2]
+    assert controls.untrained_peak("color", "last", "backbone") is None
 
 
 def test_signal_must_beat_every_control_that_was_run() -> None:
     site = "backbone.01.residual"
     controls = Controls().with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.2)])
-    assert controls.beats("color", "mean", site, 0.001) == {"chance": True, "binding": False, "twin": None}
+    assert controls.beats("color", "mean", site, 0.001) == {"chance": True, "binding": False, "untrained": None}
     assert not has_signal(controls.beats("color", "mean", site, 0.001))
     better = controls.with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.01)])
     assert has_signal(better.beats("color", "mean", site, 0.001))
     assert not has_signal(better.beats("color", "mean", site, 0.2))
-    assert better.beats("shape", "mean", site, 0.001) == {"chance": True, "binding": None, "twin": None}
-    assert has_signal({"chance": True, "binding": None, "twin": None})
+    assert better.beats("shape", "mean", site, 0.001) == {"chance": True, "binding": None, "untrained": None}
+    assert has_signal({"chance": True, "binding": None, "untrained": None})
     assert better.beats("color", "mean", site, float("nan"))["chance"] is None
     assert not has_signal(better.beats("color", "mean", site, float("nan")))
 
 
 def test_json_gives_the_same_controls_back() -> None:
-    excess = ControlComparison("twin", "color", "mean", "backbone.01.residual", 0.6, 0.2)
+    excess = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.6, 0.2)
     controls = Controls((baseline("pixels", None),), (twin("backbone.01.residual", True),), (excess,))
     assert Controls.from_json(json.loads(json.dumps(controls.to_json()))) == controls

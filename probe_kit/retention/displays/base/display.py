@@ -14,7 +14,7 @@ _DPI = 160
 _PAGE_DPI = 90  # fewer than the picture has, so that it is sharp on fine screens
 
 
-class Shown:
+class Display:
     """A display that has been plotted shows its figure; `ax_` is what `plot` drew on."""
 
     ax_: "Axes | None"

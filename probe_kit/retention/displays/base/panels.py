@@ -4,8 +4,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, Self
 
-from probe_kit.retention.displays.base.display import Shown
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.display import Display
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import Line, axes_for, caption, legend_above, panels, plain
 
 if TYPE_CHECKING:
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class Panelled(Shown, ABC):
+class Panelled(Display, ABC):
     """One panel. measure: what its upright axis counts. title: what it is of."""
 
     measure: ClassVar[str]
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None"
 
     @property

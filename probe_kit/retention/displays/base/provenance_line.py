@@ -13,7 +13,7 @@ SHOWN = 12
 
 
 @dataclass(frozen=True)
-class Certificate:
+class ProvenanceLine:
     """Where the numbers of a figure come from.
 
     weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
@@ -52,16 +52,16 @@ class Certificate:
     @classmethod
     def of_row(cls, row: RetentionRow) -> Self:
         """Of a row of the retention table, usually a mean."""
-        n = f"n = {row.n_episodes} episodes"
+        n = f"n = {row.success.n_episodes} episodes"
         return cls(
-            row.label or row.model,
-            row.random_weights,
-            row.weights_sha256,
-            row.suite,
+            row.run.label or row.run.model,
+            row.run.random_weights,
+            row.run.weights_sha256,
+            row.run.suite,
             n,
-            row.run_settings,
-            row.probe_settings,
-            call=row.call,
+            row.run.settings,
+            row.run.probes,
+            call=row.run.call,
         )
 
     @property

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def plain(axes: "Axes") -> None:
     axes.tick_params(labelsize=8)
 
 
-def caption(figure: "Figure | None", *certificates: Certificate) -> None:
+def caption(figure: "Figure | None", *certificates: ProvenanceLine) -> None:
     """One line under the figure says what it is about; the rest is kept as `figure.caption`.
 
     The line names every model once, then what all have in common, and is cut between its parts where the figure
@@ -158,7 +158,7 @@ def footer(figure: "Figure", text: str) -> None:
     figure.supxlabel(" · ".join(parts), fontsize=_CAPTION_SIZE, color="0.25")
 
 
-def _footer(certificates: Sequence[Certificate], width: float) -> str:
+def _footer(certificates: Sequence[ProvenanceLine], width: float) -> str:
     """As many parts as `width` inches hold, the first one always; what all certificates share comes once."""
     parts = list(
         dict.fromkeys(

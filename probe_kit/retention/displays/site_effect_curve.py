@@ -1,7 +1,8 @@
 """Readable, passes, read: by depth, where a probe reads the answer and where changing it turns the action."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -13,7 +14,8 @@ from probe_kit.intervene.edits.sites import ALL
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
-from probe_kit.retention.displays.base.provenance_line import Certificate
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import curve_of, scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
@@ -36,7 +38,7 @@ class Points:
 
 
 @dataclass
-class CausalCurveDisplay(Panelled):
+class SiteEffectDisplay(Panelled):
     """By backbone layer: held-out accuracy of probes, and how many episodes turn when its tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
@@ -50,7 +52,7 @@ class CausalCurveDisplay(Panelled):
     readable: Points
     passes: dict[str, Points]
     read: Points | None
-    certificate: Certificate
+    certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
@@ -86,7 +88,7 @@ class CausalCurveDisplay(Panelled):
             ),
             passes={role: _points(own) for role, own in by_role.items()},
             read=_points(read) if read else None,
-            certificate=Certificate.of_results(results, view),
+            certificate=ProvenanceLine.of_results(results, view),
         )  # fmt: skip
 
     @property
@@ -127,11 +129,11 @@ def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
     return {category: rows for category, rows in found.items() if rows}
 
 
-def causal_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
+def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
     """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
     found = shown_passing(run)
     names = [name for name in results.settings.categories if name in found] or ["any"]
-    return in_panels([CausalCurveDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
+    return in_panels([SiteEffectDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
 
 
 def _points(rows: Sequence[PatchEffect]) -> Points:
@@ -148,3 +150,21 @@ def _stream(row: PatchEffect) -> str:
 
 def _layer(row: PatchEffect) -> int:
     return int(row.place.partition(".")[2])
+
+
+PLACE = 13
+"""Of its figures in the report."""
+
+
+def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for one in source.runs:
+        if one.results is None or not set(shown_passing(one.run)) & set(one.results.settings.categories):
+            continue
+        yield ReportFigure(
+            f"{one.stem}-causes", "Readable and used", "interventions",
+            "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
+            "layer are taken from the same inference with swapped images. A layer that is readable and "
+            "turns nothing is read by nothing behind it.",
+            one.position, partial(site_effect_curve, one.run, one.results, one.results.settings.views[0]),
+        )  # fmt: skip

@@ -10,8 +10,8 @@ import pytest
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.store.answers import ConditionOutcomes
 from probe_kit.intervene.store.settings import FORMAT
-from probe_kit.retention import retention
-from probe_kit.retention.displays import CausalCurveDisplay, causal_curve, gallery
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import SiteEffectDisplay, collect_figures, site_effect_curve
 from probe_kit.train import ArrayRun, load_results
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
@@ -58,7 +58,7 @@ def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
 def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
     answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0))
-    display = CausalCurveDisplay.from_run(run, load_results(run), "color").plot()
+    display = SiteEffectDisplay.from_run(run, load_results(run), "color").plot()
     np.testing.assert_allclose(display.readable.percent, [50.0, 90.0])
     assert display.readable.significant.tolist() == [False, True]
     np.testing.assert_allclose(display.passes["all"].percent, [100.0, 0.0])
@@ -67,31 +67,31 @@ def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None
     assert display.ax_ is not None
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert "passes: all" in labels
-    names = [exhibit.name for exhibit in gallery([run], retention([run]))]
+    names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any("causes" in name for name in names)
 
 
 def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
-        CausalCurveDisplay.from_run(run, load_results(run), "color")
+        SiteEffectDisplay.from_run(run, load_results(run), "color")
     with pytest.raises(NoInterventionsError):
-        causal_curve(run, load_results(run))
-    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+        site_effect_curve(run, load_results(run))
+    assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
 
 
 def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
-    rows = {row.category: row for row in retention([run]).rows}
-    assert (rows["color"].used, rows["shape"].used) == ("used", "encoded, unused")
-    assert rows["shape"].used_note == "positive control: color"
-    assert (rows["color"].follow_rate, rows["color"].reversal_rate) == (1.0, 0.0)
+    rows = {row.category: row for row in retention_table([run]).rows}
+    assert (rows["color"].image_swap.used, rows["shape"].image_swap.used) == ("used", "encoded, unused")
+    assert rows["shape"].image_swap.used_note == "positive control: color"
+    assert (rows["color"].image_swap.follow_rate, rows["color"].image_swap.reversal_rate) == (1.0, 0.0)
 
 
 def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
     answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
-    rows = {row.category: row for row in retention([run]).rows}
-    assert rows["color"].used == "inconclusive"
-    assert rows["shape"].used == "encoded, unused"
+    rows = {row.category: row for row in retention_table([run]).rows}
+    assert rows["color"].image_swap.used == "inconclusive"
+    assert rows["shape"].image_swap.used == "encoded, unused"
 
 
 @pytest.mark.parametrize("is_memory_last", [False, True])
@@ -104,9 +104,9 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     }
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
-    (row,) = (row for row in retention([run]).rows if row.category == "color")
-    assert (row.used, row.used_note) == ("used", "passes at backbone.00; read at kv.00")
-    display = CausalCurveDisplay.from_run(run, load_results(run), "color")
+    (row,) = (row for row in retention_table([run]).rows if row.category == "color")
+    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "passes at backbone.00; read at kv.00")
+    display = SiteEffectDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])
 
@@ -116,8 +116,8 @@ def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     answers = outcomes_of({"color": follower(48)})
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
-    (row,) = (row for row in retention([run]).rows if row.category == "color")
-    assert (row.used, row.used_note) == ("used", "")
-    assert not any("causes" in exhibit.name for exhibit in gallery([run], retention([run])))
+    (row,) = (row for row in retention_table([run]).rows if row.category == "color")
+    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "")
+    assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
-        causal_curve(run, load_results(run))
+        site_effect_curve(run, load_results(run))

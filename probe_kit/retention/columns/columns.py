@@ -1,0 +1,617 @@
+"""The columns of the tables, each declared once: terminal, Markdown, LaTeX, report and glossary only render them.
+
+A column names the field that it shows (`part.field` of `RetentionRow`, which is also its place in JSON and in data
+frames), its heading, its entry in the glossary, its text, and what it sorts by. `TABLES` says which columns stand
+in which table. To add a column: compute the field where its part is made, and declare the column here.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any
+
+from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.modes import Modes
+from probe_kit.retention.columns.text import (
+    action_place,
+    area_value,
+    backbone_place,
+    baseline,
+    bounded_value,
+    debiased_value,
+    difference_interval,
+    difference_test,
+    exceeds,
+    number,
+    p_text,
+    percent,
+    published_value,
+    ratio_difference,
+    regime_value,
+    success_interval,
+    with_limits,
+)
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+Text = Callable[[RetentionRow], str]
+Sort = Callable[[RetentionRow], Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of a table.
+
+    key: the field that it shows, as `part.field`. heading: with its unit, the same in all formats. help: its entry
+    in the glossary. text: what a row shows; "–" or nothing where it has no value. sort: what the report sorts by,
+    the field itself by default. difference: what a difference between runs shows. heat: whether the report and
+    LaTeX colour it by `sort`, from 0 to 1. averaged: whether a category mean averages the field. also_averaged:
+    further fields of the same column that are averaged. strong: which rows are bold. note: shown in the report on
+    pointing at the cell. answers: heading and help where the rows are of models that were asked, if these differ.
+    """
+
+    key: str
+    heading: str
+    help: str
+    text: Text
+    sort: Sort | None = None
+    difference: Callable[[Difference], str] | None = None
+    heat: bool = False
+    averaged: bool = False
+    also_averaged: tuple[str, ...] = ()
+    strong: Callable[[RetentionRow], bool] | None = None
+    note: Text | None = None
+    answers: tuple[str, str] | None = None
+
+    def worded(self, modes: Modes) -> "Column":
+        """The column with the words for rows of policies, of models that were asked, or of both."""
+        if self.answers is None or modes == "acts":
+            return self
+        heading, meaning = self.answers
+        if modes == "answers":
+            return replace(self, heading=heading, help=meaning)
+        both = self.heading if heading == self.heading else f"{self.heading.removesuffix(' %')} / {heading}"
+        return replace(self, heading=both, help=f"{self.help} Of a model that was asked: {_lower(meaning)}")
+
+    def sort_value(self, row: RetentionRow) -> Any:
+        """What a row is sorted by in this column; None for last."""
+        return attrgetter(self.key)(row) if self.sort is None else self.sort(row)
+
+
+@dataclass(frozen=True)
+class ColumnGroup:
+    """Columns that answer one question. detail: shown where there is room, in Markdown and the report."""
+
+    title: str
+    columns: tuple[Column, ...]
+    detail: bool = False
+
+
+def _lower(sentence: str) -> str:
+    return f"{sentence[:1].lower()}{sentence[1:]}"
+
+
+def share(key: str, heading: str, meaning: str, **more: Any) -> Column:
+    """A column of a share in percent, averaged over categories."""
+    read = attrgetter(key)
+    column = Column(key=key, heading=heading, help=meaning, text=lambda row: percent(read(row)), averaged=True)
+    return replace(column, **more)
+
+
+def interval(key: str, ci: str, heading: str, meaning: str, **more: Any) -> Column:
+    """A column of a share in percent with its 95 % interval, averaged over categories."""
+    read, limits = attrgetter(key), attrgetter(ci)
+
+    def text(row: RetentionRow) -> str:
+        return with_limits(percent(read(row)), limits(row), percent)
+
+    return replace(Column(key=key, heading=heading, help=meaning, text=text, averaged=True), **more)
+
+
+def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
+    """A column of p-values with three decimals, bold below 0.05."""
+    read = attrgetter(key)
+
+    def low(row: RetentionRow) -> bool:
+        value = read(row)
+        return value is not None and value < SIGNIFICANCE
+
+    column = Column(key=key, heading=heading, help=meaning, text=lambda row: p_text(read(row)), strong=low)
+    return replace(column, **more)
+
+
+def _judged(column: Column) -> Column:
+    """The column, empty for a run that keeps no trajectories."""
+    text = column.text
+    return replace(column, text=lambda row: "–" if row.rules.sr_idle is None else text(row))
+
+
+# -- what the policy did, and what the VLM answered ----------------------------------------------------------
+
+SR = Column(
+    key="success.sr",
+    heading="SR % [95 %]",
+    help="Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 % "
+    "interval, whole groups of questions resampled. Two pictures: guessing gives 50 %.",
+    text=success_interval,
+    difference=lambda row: difference_interval(row.sr, row.sr_ci),
+    heat=True,
+    averaged=True,
+    strong=lambda row: row.success.regime == Regime.KNOWLEDGE,
+)
+ACCURACY = replace(
+    SR,
+    heading="accuracy % [95 %]",
+    help="Share of questions that the VLM answers right, by the score that was chosen. In brackets the 95 % "
+    "interval, whole groups of questions resampled. Two pictures: guessing gives 50 %.",
+)
+DIFFERENCE_P = Column(
+    key="difference.p",
+    heading="p (Holm)",
+    help="Of a difference between two runs: probability that two equally good ones differ so much on these "
+    "questions, whole groups turned together; in brackets corrected by Holm for all categories and pairs.",
+    text=lambda _: "",
+    sort=lambda _: None,
+    difference=difference_test,
+)
+MARGIN = share(
+    "success.chance_margin",
+    "± Δ %",
+    "How far from 50 % guessing alone may lead, which decides the regime. It counts questions, and those that "
+    "share a picture and are answered alike as fewer.",
+    averaged=False,
+)
+PAPER_MARGIN = share(
+    "success.chance_margin_episodes",
+    "paper's Δ %",
+    "The same if every episode were a question of its own, as the paper has it. It decides nothing here.",
+    averaged=False,
+)
+REGIME = Column(
+    key="success.regime",
+    heading="regime",
+    help="Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so far. "
+    "Failure: as far below; the policy misses both pictures or prefers the wrong one. In a mean the normalised "
+    "score: the success rate on a scale where guessing is 0 and perfection 100.",
+    text=regime_value,
+    sort=lambda row: row.success.sr,
+    answers=(
+        "regime",
+        "Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so far. "
+        "Failure: as far below; the answers cannot be read, or the wrong one is preferred. In a mean the "
+        "normalised score: the accuracy on a scale where guessing is 0 and perfection 100.",
+    ),
+)
+LEFT = share(
+    "success.sr_left",
+    "left %",
+    "Success rate where the correct picture lay on the left.",
+    heat=True,
+    answers=("left %", "Accuracy where the correct picture lay on the left."),
+)
+RIGHT = share(
+    "success.sr_right",
+    "right %",
+    "Success rate where it lay on the right. Left and right far apart: the policy goes to a side.",
+    heat=True,
+    answers=("right %", "Accuracy where it lay on the right. Left and right far apart: one side is preferred."),
+)
+FOLLOWS = Column(
+    key="image_swap.follow_rate",
+    heading="follows / against %",
+    help="With the two pictures exchanged, and nothing else: share of episodes whose action then turns from the "
+    "correct picture's side to the other one, and share in which it does the reverse.",
+    text=lambda row: (
+        "–"
+        if row.image_swap.follow_rate is None
+        else f"{percent(row.image_swap.follow_rate)} / {percent(row.image_swap.reversal_rate)}"
+    ),
+    sort=lambda row: row.image_swap.net_follow_rate,
+    averaged=True,
+    also_averaged=("image_swap.reversal_rate", "image_swap.net_follow_rate"),
+    strong=lambda row: row.image_swap.used == "used",
+    note=lambda row: row.image_swap.used_note,
+)
+USED = Column(
+    key="image_swap.used",
+    heading="used",
+    help="Whether the action follows what can be read in the backbone. Encoded, unused: it can be read, and the "
+    "action does not change with it, while another category's does.",
+    text=lambda row: row.image_swap.used or "–",
+    sort=lambda row: row.image_swap.net_follow_rate,
+    strong=lambda row: row.image_swap.used == "used",
+    note=lambda row: row.image_swap.used_note,
+)
+WRONG = share(
+    "success.share_wrong",
+    "wrong %",
+    "Share of episodes that ended on the other picture.",
+    answers=("wrong %", "Share of questions in which the other picture was named."),
+)
+OUTSIDE = share("success.share_outside", "outside %", "Share of episodes that ended on neither picture.")
+UNREAD = replace(
+    OUTSIDE, heading="unread %", help="Share of questions without an answer, or with several, by the chosen score."
+)
+NEVER_MOVED = share(
+    "success.share_never_moved",
+    "never moved %",
+    "Share of episodes, part of outside, in which the cube was never carried away: a failed grasp rather than a "
+    "wrong answer.",
+)
+INVALID_ACTION = share(
+    "success.share_invalid_action",
+    "invalid actions %",
+    "Share of the policy's steps in which it put out something that is no action, such as text. Magma then holds "
+    "still; OpenVLA takes the nearest action, as its authors do.",
+)
+ORIGINAL = share(
+    "success.sr_original",
+    "original %",
+    "Success rate in the layout as drawn.",
+    answers=("original %", "Accuracy in the layout as drawn."),
+)
+SWAPPED = share(
+    "success.sr_swapped",
+    "swapped %",
+    "Success rate with the two pictures exchanged.",
+    answers=("swapped %", "Accuracy with the two pictures exchanged."),
+)
+GOES_LEFT = share(
+    "success.side_preference",
+    "goes left %",
+    "Among episodes that reached a picture, the share that ended on the left one. 50 %: no habit.",
+    averaged=False,
+    answers=(
+        "answers left %",
+        "Among the answers that could be read, the share that named the left one. 50 %: no habit.",
+    ),
+)
+
+
+def _right_twice(row: RetentionRow) -> str:
+    paired = row.success.paired
+    return "–" if paired is None else f"{paired.both} of {paired.both + paired.one + paired.none}"
+
+
+RIGHT_TWICE = Column(
+    key="success.paired.both",
+    heading="right twice",
+    help="Questions answered correctly in both layouts, of those that ran in both. A habit of going to one side "
+    "cannot produce these.",
+    text=_right_twice,
+    sort=lambda row: None if row.success.paired is None else row.success.paired.both,
+    answers=(
+        "right twice",
+        "Questions answered correctly in both layouts, of those that were asked in both. A habit of naming one "
+        "side cannot produce these.",
+    ),
+)
+RIGHT_TWICE_P = replace(
+    p_value(
+        "success.paired.p",
+        "p (twice)",
+        "Probability that luck alone gives so many questions right twice rather than wrong twice.",
+    ),
+    text=lambda row: "–" if row.success.paired is None else p_text(row.success.paired.p),
+    sort=lambda row: None if row.success.paired is None else row.success.paired.p,
+    strong=lambda row: row.success.paired is not None and row.success.paired.p < SIGNIFICANCE,
+)
+SIZES = Column(
+    key="success.n_episodes",
+    heading="n (items)",
+    help="Episodes, and in brackets questions; each question is asked in two layouts.",
+    text=lambda row: f"{row.success.n_episodes} ({row.success.n_items})",
+)
+
+# -- what the outcome rule makes of it -----------------------------------------------------------------------
+
+RULES = tuple(
+    map(
+        _judged,
+        (
+            share("rules.share_answered", "answered %", "Share of episodes that ended in a zone."),
+            interval(
+                "rules.sr_answered",
+                "rules.sr_answered_ci",
+                "SR of answered % [95 %]",
+                "Success among episodes that ended in a zone: an episode without an answer is not a wrong answer.",
+            ),
+            interval(
+                "rules.sr_grasped",
+                "rules.sr_grasped_ci",
+                "SR of grasped % [95 %]",
+                "Success among episodes in which both fingers ever touched the cube.",
+            ),
+            share(
+                "rules.share_unmoved_answers",
+                "unmoved answers %",
+                "Share of answers whose cube never left its start.",
+            ),
+            share("rules.sr_idle", "doing nothing scores %", "Success rate of a policy that does nothing."),
+            share(
+                "rules.share_both_zones",
+                "in both zones %",
+                "Share of episodes whose cube counts for both pictures, which is called correct.",
+                text=lambda row: percent(row.rules.share_both_zones) if row.rules.share_both_zones else "–",
+            ),
+        ),
+    )
+)
+
+
+def radius_columns(rows: Sequence[RetentionRow]) -> tuple[Column, ...]:
+    """A column of success rates per zone radius that any row was scored at."""
+    return tuple(map(_radius, dict.fromkeys(radius for row in rows for radius in row.rules.sr_by_epsilon)))
+
+
+def _radius(radius: str) -> Column:
+    def value(row: RetentionRow) -> float | None:
+        return row.rules.sr_by_epsilon.get(radius)
+
+    return Column(
+        key=f"rules.sr_by_epsilon.{radius}",
+        heading=f"SR % at {1000 * float(radius):g} mm",
+        help="Success rate if the cube had to end this close to the middle of the correct picture.",
+        text=lambda row: percent(value(row)),
+        sort=value,
+        heat=True,
+    )
+
+
+# -- how a VLM answered --------------------------------------------------------------------------------------
+
+ANSWERS = (
+    WRONG,
+    UNREAD,
+    share("answers.accuracy_text", "by text %", "Share of questions that the text answers right."),
+    share(
+        "answers.accuracy_logits",
+        "by logits %",
+        "Share of questions in which the logit of the right option is larger. A constant answer is right in half.",
+    ),
+    share(
+        "answers.accuracy_order_balanced",
+        "order-balanced %",
+        "The same with the logits averaged over both orders of the options, without a preference for a letter.",
+    ),
+    share("answers.share_unparsable", "unparsable %", "Share of answers in text that could not be parsed."),
+    share("answers.share_near_tie", "near ties %", "Share of choices that rounding may have made."),
+    share(
+        "answers.option_mass",
+        "option mass",
+        "Mean probability of the admissible answers together.",
+        text=lambda row: number(row.answers.option_mass),
+    ),
+    share(
+        "answers.letter_bias",
+        "letter bias",
+        "Mean logit by which the option named first is preferred.",
+        text=lambda row: number(row.answers.letter_bias),
+    ),
+)
+
+# -- probes and retention ------------------------------------------------------------------------------------
+
+
+def _where_defined(key: str) -> Sort:
+    read = attrgetter(key)
+    return lambda row: read(row) if row.retention.defined else None
+
+
+BOUNDED = Column(
+    key="retention.bounded",
+    heading="bounded [95 %]",
+    help="Retention between its bounds: four fifths the debiased estimate, which is too low where the best layer "
+    "is missed, and one fifth the peaks, which are too high. The number to quote for one category.",
+    text=bounded_value,
+    sort=_where_defined("retention.bounded"),
+    difference=lambda row: ratio_difference(row.retention_bounded, row.retention_bounded_ci),
+    heat=True,
+    note=lambda row: row.retention.note,
+)
+AREA = Column(
+    key="retention.area",
+    heading="area [95 %]",
+    help="The same ratio with the mean over all layers (and iterations) in place of the best: how much of the "
+    "stack carries the answer. Nothing is chosen, so nothing is biased; the number to average.",
+    text=area_value,
+    sort=_where_defined("retention.area"),
+    difference=lambda row: ratio_difference(row.retention_area, row.retention_area_ci),
+    heat=True,
+)
+DEBIASED = Column(
+    key="retention.debiased",
+    heading="debiased [95 %]",
+    help="The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
+    "interval; “unbounded” means that with so few groups of questions the backbone's score above chance may be a "
+    "quarter of what it seems, or nothing: too little to divide by.",
+    text=debiased_value,
+    sort=_where_defined("retention.debiased"),
+    difference=lambda row: ratio_difference(row.retention, row.retention_ci),
+    heat=True,
+)
+PUBLISHED = Column(
+    key="retention.published",
+    heading="published",
+    help="(action − chance) / (backbone − chance): the share of what can be read in the backbone that can still "
+    "be read where the action is made. Biased upwards when signals are weak: both are maxima.",
+    answers=(
+        "published",
+        "(answer − chance) / (backbone − chance): the share of what can be read in the backbone that can still be "
+        "read where the answer is made. Biased upwards when signals are weak: both are maxima.",
+    ),
+    text=published_value,
+    sort=_where_defined("retention.published"),
+    heat=True,
+)
+PROBE_MINUS_SR = share(
+    "controls.probe_minus_sr",
+    "probe − SR %",
+    "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
+    answers=(
+        "probe − accuracy %",
+        "Backbone accuracy minus that of the answers, in points: what can be read but is not said.",
+    ),
+)
+_P = (
+    "Probability that the best layer of a stream looks this good when the answers are relabelled at random. It "
+    "allows for having looked at all layers (family-wise)."
+)
+_LAYER = (
+    "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first of "
+    "several that are equally good; after +: how many others are."
+)
+BACKBONE = interval(
+    "backbone.accuracy",
+    "backbone.ci",
+    "backbone % [95 %]",
+    "Best held-out accuracy of a probe in the vision-language backbone, over its layers.",
+    difference=lambda row: difference_interval(row.backbone_accuracy, row.backbone_ci),
+    strong=lambda row: row.backbone.has_signal,
+)
+BACKBONE_LAYER = Column(key="backbone.layer", heading="backbone layer", help=_LAYER, text=backbone_place)
+BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
+EXCEEDS = Column(
+    key="backbone.exceeds",
+    heading="backbone exceeds",
+    help="What the best layer is better than, family-wise and paired by question: chance; binding, an untrained "
+    "conjunction of pictures and words; untrained, the same network with random weights. Signal counts only if it "
+    "exceeds every control that was run. Compared with chance alone, even an untrained network can appear to "
+    "encode the answer.",
+    text=exceeds,
+    sort=exceeds,
+)
+ACTION = interval(
+    "action.accuracy",
+    "action.ci",
+    "action % [95 %]",
+    "Best held-out accuracy of a probe where the action is made (the action expert, or the positions that choose "
+    "action tokens), over layers and iterations.",
+    answers=(
+        "answer % [95 %]",
+        "Best held-out accuracy of a probe where the answer is made (the position that chooses its first token), "
+        "over layers.",
+    ),
+    difference=lambda row: difference_interval(row.action_accuracy, row.action_ci),
+    strong=lambda row: row.action.has_signal,
+)
+ACTION_LAYER = Column(
+    key="action.layer",
+    heading="action layer @iteration",
+    help=f"{_LAYER} After @: the iteration, a flow-matching step or an action token, of which the first sees no "
+    "action yet.",
+    text=action_place,
+    answers=("answer layer", _LAYER),
+)
+ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
+FIRST_ITERATION = share(
+    "action.first_accuracy",
+    "first iteration %",
+    "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the decision "
+    "itself, as a noisy action or as the tokens before.",
+    answers=("first iteration %", "Best layer at the first iteration."),
+)
+CHANCE = share("controls.chance", "chance %", "Accuracy of always naming the more frequent side.")
+GROUPS = Column(
+    key="controls.n_groups",
+    heading="groups",
+    help="Independent groups of questions; questions that share a picture count once.",
+    text=lambda row: "–" if row.controls.n_groups is None else str(row.controls.n_groups),
+)
+
+# -- controls ------------------------------------------------------------------------------------------------
+
+
+def _baseline(name: str) -> Column:
+    text = baseline(name)
+    return Column(
+        key=f"controls.baselines.{name}",
+        heading=f"{name} %",
+        help=_BASELINES[name],
+        text=text,
+        sort=lambda row: row.controls.baselines.get(name),
+    )
+
+
+_LEAK = " Red: the suite gives the answer away without a model."
+_BASELINES = {
+    "position": f"The same probe on the layout alone.{_LEAK}",
+    "instruction": f"The same probe on the words alone.{_LEAK}",
+    "pixels": f"The same probe on the two pictures alone.{_LEAK}",
+    "binding": "The same probe on an untrained conjunction of pictures and words, which the backbone must exceed.",
+}
+BASELINES = tuple(map(_baseline, _BASELINES))
+_SELECTIVITY = "Accuracy above that of the same probe on random labels, at the best site"
+_UNTRAINED = "The same probes on another run of the same episodes, usually with untrained weights, subtracted"
+
+TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
+    "Success rate": (
+        ColumnGroup(
+            "Does it act on the answer?",
+            (SR, DIFFERENCE_P, MARGIN, PAPER_MARGIN, REGIME, LEFT, RIGHT, FOLLOWS, USED),
+        ),
+        ColumnGroup("Where the cube ended", (WRONG, OUTSIDE, NEVER_MOVED, INVALID_ACTION)),
+        ColumnGroup("What the outcome rule makes of it", RULES),
+        ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
+    ),
+    "Accuracy of answers": (
+        ColumnGroup("Does it know the answer?", (ACCURACY, DIFFERENCE_P, MARGIN, REGIME, LEFT, RIGHT)),
+        ColumnGroup("How it answered", ANSWERS),
+        ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
+    ),
+    "Retention": (
+        ColumnGroup("What is retained", (BOUNDED, AREA, DEBIASED, PUBLISHED, PROBE_MINUS_SR)),
+        ColumnGroup("In the backbone", (BACKBONE, BACKBONE_LAYER, BACKBONE_P, EXCEEDS)),
+        ColumnGroup("Where the action is made", (ACTION, ACTION_LAYER, ACTION_P, FIRST_ITERATION)),
+        ColumnGroup("Compared with", (CHANCE, GROUPS), True),
+    ),
+    "Controls": (
+        ColumnGroup("What gives the answer away without the model", BASELINES),
+        ColumnGroup(
+            "Selectivity",
+            (
+                share("backbone.selectivity", "backbone selectivity %", f"{_SELECTIVITY} of the backbone."),
+                share("action.selectivity", "action selectivity %", f"{_SELECTIVITY} of the action."),
+            ),
+        ),
+        ColumnGroup(
+            "Against the untrained network",
+            (
+                interval(
+                    "backbone.minus_untrained",
+                    "backbone.minus_untrained_ci",
+                    "backbone − untrained %",
+                    f"{_UNTRAINED}: backbone.",
+                ),
+                interval(
+                    "action.minus_untrained",
+                    "action.minus_untrained_ci",
+                    "action − untrained %",
+                    f"{_UNTRAINED}: where the action is made.",
+                ),
+            ),
+        ),
+    ),
+}
+"""By title of the table, its groups of columns in order."""
+
+
+_OF_ONE_MODE: Mapping[str, Modes] = {"Success rate": "acts", "Accuracy of answers": "answers"}
+
+
+def all_columns(modes: Modes = "both") -> tuple[Column, ...]:
+    """Every column of the tables of such rows once, in order and with their words."""
+    tables = [groups for title, groups in TABLES.items() if modes in ("both", _OF_ONE_MODE.get(title, modes))]
+    every = [column.worded(modes) for groups in tables for group in groups for column in group.columns]
+    return tuple({column.heading: column for column in every}.values())
+
+
+def averaged_fields() -> tuple[str, ...]:
+    """The fields that a category mean averages, as `part.field`."""
+    every = [
+        field
+        for column in all_columns()
+        for field in (*((column.key,) if column.averaged else ()), *column.also_averaged)
+    ]
+    return tuple(dict.fromkeys(every))

@@ -1,0 +1,99 @@
+"""What a display contributes to reports and `--figures`: figures, each with how to read it."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.retention.displays.base.style import SIGNAL
+from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
+from probe_kit.retention.table import RetentionTable
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ONLY_FILLED = f"Only filled markers are evidence: {SIGNAL}"
+DOTS = f"Dots mark evidence: {SIGNAL}"
+
+
+@dataclass(frozen=True)
+class DrawnRun:
+    """A run of a table. stem: beginning of its files' names. name: in legends. position: among the runs.
+
+    results: its probes, None without any.
+    """
+
+    run: RunReader
+    stem: str
+    name: str
+    position: int
+    results: ProbeResults | None
+
+    def judged(self, table: RetentionTable) -> RunReader | None:
+        """The run with its outcomes by the table's rule; None where it cannot be judged by that."""
+        if not can_be_judged(self.run, table.rule, table.last_steps):
+            return None
+        return under_rule(self.run, table.rule, table.last_steps)
+
+
+@dataclass(frozen=True)
+class FigureSource:
+    """What figures of a report are made of."""
+
+    table: RetentionTable
+    runs: tuple[DrawnRun, ...]
+
+    @property
+    def probed(self) -> tuple[DrawnRun, ...]:
+        """Runs with probes."""
+        return tuple(run for run in self.runs if run.results is not None)
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure that can be drawn.
+
+    name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
+    runs, None if it shows all of them. reading: how to read it, in plain language. is_table: its numbers are a
+    table that is printed as such elsewhere.
+    """
+
+    name: str
+    title: str
+    subject: str
+    reading: str
+    run: int | None
+    draw: "Callable[[], Figure]"
+    is_table: bool = False
+
+    @contextmanager
+    def drawn(self) -> "Iterator[Figure]":
+        """The figure, closed again afterwards, so that pyplot keeps none of many."""
+        from matplotlib import pyplot as plt
+
+        figure = self.draw()
+        try:
+            yield figure
+        finally:
+            plt.close(figure)
+
+
+def figure_of(display: Any) -> "Figure":
+    """The figure of a display that draws on axes of its own."""
+    from matplotlib.figure import Figure
+
+    figure = display.plot().ax_.figure
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def in_view(title: str, view: str, views: Sequence[str]) -> str:
+    """The title, which names the view where there are several."""
+    return f"{title}, view {view}" if len(views) > 1 else title
+
+
+def view_suffix(view: str, views: Sequence[str]) -> str:
+    """Of a file's name; the first view needs none."""
+    return "" if view == views[0] else f"-{view.replace(':', '-')}"
