@@ -11,6 +11,7 @@ from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.principal_axes import narrow_axes
 from probe_kit.train.solver.row_subset import RowSubset
+from probe_kit.train.solver.standardiser import Moments
 
 ROWS_PER_BLOCK = 512
 """8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
@@ -75,10 +76,8 @@ class JointSite:
     def of(cls, samples: Samples, folds: Sequence[NestedFold]) -> "JointSite":
         """The site of `samples`. Memory: their copy in float32, D × D a few times, and a block in float64."""
         features, blocks = _sorted(samples, folds)
-        xp, count = array_namespace(features.matrix), len(features)
-        mean = sum(rows.sum(axis=0, dtype=xp.float64) for rows in features.blocks()) / count
-        scale = xp.sqrt(sum(xp.square(rows - mean).sum(axis=0) for rows in features.blocks()) / count)
-        rounding = 10 * xp.finfo(features.matrix.dtype).eps * abs(mean)  # as for `Standardiser`
+        xp = array_namespace(features.matrix)
+        mean, scale, rounding = Moments.of(features)
         unclear = bool(((scale > 0.25 * rounding) & (scale < 4 * rounding)).any())
         scale[scale <= rounding] = np.inf
         turned = xp.empty(features.shape, dtype=xp.float32, device=mean.device)

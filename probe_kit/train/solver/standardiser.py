@@ -1,9 +1,32 @@
 """Standardisation of features by the mean and deviation of training samples; numpy or torch."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from probe_kit.train.solver.backend import Array
 from probe_kit.train.solver.row_subset import Features, blocks_of, module_of
+
+
+class Moments(NamedTuple):
+    """(D,) float64 each: mean and deviation of features, and the rounding of the mean in their stored type."""
+
+    mean: Array
+    scale: Array
+    rounding: Array
+
+    @classmethod
+    def of(cls, features: Features) -> "Moments":
+        """Of (N, D) samples.
+
+        Sums are of differences from the first sample in float64. A feature that never varies has deviation 0, and
+        a variation that is small against its offset is exact. rounding: at least one unit in the last place.
+        """
+        xp, count = module_of(features), len(features)
+        first = xp.asarray(next(blocks_of(features))[0], dtype=xp.float64)
+        shift = sum((block - first).sum(axis=0) for block in blocks_of(features)) / count
+        mean = first + shift
+        scale = xp.sqrt(sum(xp.square(block - first - shift).sum(axis=0) for block in blocks_of(features)) / count)
+        return cls(mean, scale, xp.finfo(next(blocks_of(features)).dtype).eps * abs(mean))
 
 
 @dataclass(frozen=True)
@@ -21,12 +44,10 @@ class Standardiser:
     def fit(cls, features: Features) -> "Standardiser":
         """Learn from (N, D) training samples.
 
-        A feature counts as constant when its deviation is below the rounding of its own mean.
+        A feature counts as constant when its deviation is within the rounding of its own mean: about one unit in
+        the last place of the stored type.
         """
-        xp, count = module_of(features), len(features)
-        mean = sum(block.sum(axis=0, dtype=xp.float64) for block in blocks_of(features)) / count
-        scale = xp.sqrt(sum(xp.square(block - mean).sum(axis=0) for block in blocks_of(features)) / count)
-        rounding = 10 * xp.finfo(next(blocks_of(features)).dtype).eps * abs(mean)
+        mean, scale, rounding = Moments.of(features)
         kept = scale > rounding
         return cls(kept, mean[kept], scale[kept])
 

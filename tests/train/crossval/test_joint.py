@@ -171,8 +171,18 @@ def test_a_feature_that_one_training_set_never_sees_vary_is_left_to_axes_of_its_
 
 def test_a_feature_at_the_edge_of_rounding_is_left_to_axes_of_its_own() -> None:
     features = NOISE.astype(np.float32)
-    features[:, 1] = 1e4 + 1e-2 * features[:, 1]
+    features[:, 1] = 1e4 + 2e-3 * features[:, 1]
     assert not JointSite.of(tokens(features), FOLDS).alike
+
+
+def test_a_small_variation_around_a_large_offset_is_found_by_all_training_sets_together() -> None:
+    features = NOISE.astype(np.float32)
+    features[:, 3] = 1e7 + 5 * SIGNS[:, 0]
+    samples = tokens(features)
+    assert JointSite.of(samples, FOLDS).alike
+    found = cross_validate(samples, LABELS[:, None], FOLDS)
+    for fold, one in zip(FOLDS, found, strict=True):
+        np.testing.assert_array_equal(one.decisions[:, 0] > 0, LABELS[fold.outer.test])
 
 
 def test_fewer_samples_than_features_are_left_to_axes_of_their_own() -> None:

@@ -125,6 +125,18 @@ def test_token_probes_equal_scikit_learn_on_every_token_with_logits_averaged_per
     np.testing.assert_allclose(probe.decisions, expected, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize(
+    ("offset", "variation", "dtype"), [(1e7, 5, np.float32), (-1e7, 2, np.float32), (1000, 3, np.float16)]
+)
+def test_a_side_told_apart_by_a_small_variation_around_a_large_offset_is_read_perfectly(
+    offset: float, variation: float, dtype: type
+) -> None:
+    features = np.random.default_rng(1).standard_normal((60, 4))
+    features[:, 2] = offset + np.where(LABELS, variation, -variation)
+    probe = probe_site(Samples.pooled(features.astype(dtype)), LABELS, NONE, nested_folds(LABELS, ITEMS, seed=0))
+    np.testing.assert_array_equal(probe.decisions > 0, LABELS)
+
+
 # -- weights ---------------------------------------------------------------------------------------------------
 
 

@@ -28,6 +28,41 @@ def test_features_constant_up_to_rounding_are_dropped() -> None:
     assert Standardiser.fit(features).kept.tolist() == [True, False, False, True]
 
 
+@pytest.mark.parametrize("make", [np.asarray, torch.from_numpy])
+@pytest.mark.parametrize(
+    ("offset", "variation", "dtype"),
+    [(1e7, 5, np.float32), (-3e6, 1, np.float32), (100, 0.5, np.float16), (1e15, 5, np.float64)],
+)
+def test_a_small_variation_around_a_large_offset_is_kept(
+    offset: float, variation: float, dtype: type, make: Callable[[np.ndarray], np.ndarray | torch.Tensor]
+) -> None:
+    """All values are exact in their type, several units in the last place apart."""
+    signs = np.where(np.arange(40) % 2, 1, -1)
+    features = np.column_stack([offset + variation * signs, noise(40)]).astype(dtype)
+    standardise = Standardiser.fit(make(features))
+    assert standardise.kept.tolist() == [True, True]
+    np.testing.assert_allclose(np.asarray(standardise(make(features)))[:, 0], signs, atol=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1e7, -1 / 3, 3e15])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_feature_that_never_varies_is_dropped_however_many_samples_there_are(value: float, dtype: type) -> None:
+    if value > float(np.finfo(dtype).max):
+        pytest.skip("the type holds no such number")
+    features = np.column_stack([np.full(10_007, value), noise(10_007)]).astype(dtype)
+    assert Standardiser.fit(features).kept.tolist() == [False, True]
+
+
+def test_a_jitter_of_one_unit_in_the_last_place_is_dropped() -> None:
+    constant = np.full(50, 1.7, np.float32)
+    constant[::3] = np.nextafter(constant[0], np.float32(2))
+    constant[1::3] = np.nextafter(constant[0], np.float32(1))
+    assert Standardiser.fit(np.column_stack([constant, noise(50)]).astype(np.float32)).kept.tolist() == [
+        False,
+        True,
+    ]
+
+
 def test_test_samples_are_scaled_with_training_statistics() -> None:
     scaled = Standardiser.fit(np.array([[0.0], [2.0]]))(np.array([[5.0]]))
     assert scaled.item() == 4.0

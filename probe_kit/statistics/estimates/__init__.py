@@ -1,0 +1,1 @@
+"""Estimates with intervals: shares, scores of best sites, retention, and their verdicts."""

@@ -1,0 +1,53 @@
+"""Intervals of differences and means from the intervals of their parts (MOVER).
+
+Zou and Donner, “Construction of confidence limits about effect measures”, Statistics in Medicine 27 (2008).
+"""
+
+from collections.abc import Sequence
+from math import inf, sqrt
+from statistics import fmean
+
+from probe_kit.errors import UsageError
+from probe_kit.statistics.fieller import Interval
+
+NO_LIMITS = Interval(-inf, inf)
+
+
+def difference_interval(
+    first: float, first_limits: Interval, second: float, second_limits: Interval, correlation: float = 0.0
+) -> Interval:
+    """Interval of `first` − `second`, at the level of the two intervals.
+
+    correlation: of the two estimates; 0 where they share no group. With a, b the values, l, u their limits and ρ
+    the correlation: low = a − b − √((a − l_a)² + (u_b − b)² − 2 ρ (a − l_a)(u_b − b)), high with the other limits.
+    No limits where either has none. Raises UsageError for a correlation outside −1 … 1.
+    """
+    if not -1 <= correlation <= 1:
+        raise UsageError(f"a correlation of {correlation}; expected a number from -1 to 1")
+    if not (first_limits.bounded and second_limits.bounded):
+        return NO_LIMITS
+    gap = first - second
+    below = _combined(first - first_limits.low, second_limits.high - second, correlation)
+    above = _combined(first_limits.high - first, second - second_limits.low, correlation)
+    return Interval(gap - below, gap + above)
+
+
+def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interval:
+    """Interval of the mean of independent estimates, at the level of their intervals.
+
+    low = mean − √(Σ (value − its low)²) / n, high alike. No limits where one of them has none. Raises UsageError
+    without estimates.
+    """
+    if not values:
+        raise UsageError("the mean of no estimates; expected at least one")
+    if not all(interval.bounded for interval in limits):
+        return NO_LIMITS
+    pairs = list(zip(values, limits, strict=True))
+    below = sqrt(sum((value - interval.low) ** 2 for value, interval in pairs)) / len(pairs)
+    above = sqrt(sum((interval.high - value) ** 2 for value, interval in pairs)) / len(pairs)
+    middle = fmean(values)
+    return Interval(middle - below, middle + above)
+
+
+def _combined(first: float, second: float, correlation: float) -> float:
+    return sqrt(max(0.0, first**2 + second**2 - 2 * correlation * first * second))

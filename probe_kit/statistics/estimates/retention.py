@@ -1,0 +1,69 @@
+"""Retention: the score of the action's best site as a share of the backbone's, with limits."""
+
+from dataclasses import dataclass
+from math import nan, sqrt
+
+import numpy as np
+
+from probe_kit.statistics.estimates.balanced import Matrix
+from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval
+from probe_kit.statistics.estimates.scores import Scores, t_quantile
+from probe_kit.statistics.fieller import Interval, fieller_interval
+
+LEAST_KNOWN = 0.25
+"""Share of the backbone's score that the lower end of its 95 % interval must reach.
+
+A score that may be a quarter of its estimate makes the upper limit of a ratio four times as large.
+"""
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A value with its 95 % interval, which may have no limits."""
+
+    value: float
+    interval: Interval
+
+
+def retention(scores: Scores) -> Ratio:
+    """First score over the second one, (expert, backbone), with Fieller's limits (Fieller 1954).
+
+    Of a mean over categories it is the ratio of the mean scores. No limits where the backbone is not known well
+    enough to divide by, see LEAST_KNOWN; NaN where its score is exactly 0.
+    """
+    expert, backbone = float(scores.above[0]), float(scores.above[1])
+    value = expert / backbone if backbone else nan
+    quantile = t_quantile(scores.df)
+    low = backbone - quantile * sqrt(scores.covariance[1, 1])
+    if backbone <= 0 or low < LEAST_KNOWN * backbone:
+        return Ratio(value, NO_LIMITS)
+    return Ratio(value, fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile))
+
+
+def retention_difference(first: Scores, second: Scores, between: Matrix | None = None) -> Ratio:
+    """Retention of the first minus that of the second, of two runs or two means, with MOVER's limits.
+
+    between: (2, 2) covariance of the first's (expert, backbone) with the second's, where both are of the same
+    groups (`CrossFit.covariance_with`; of means the sum over categories divided by n²). None for other groups.
+    """
+    a, b = retention(first), retention(second)
+    correlation = 0.0 if between is None else _correlation(first, second, between)
+    interval = difference_interval(a.value, a.interval, b.value, b.interval, correlation)
+    return Ratio(a.value - b.value, interval)
+
+
+def _correlation(first: Scores, second: Scores, between: Matrix) -> float:
+    """Correlation of two ratios by the delta method; 0 where one of them is not defined or does not vary."""
+    if not (first.above[1] and second.above[1]):
+        return 0.0
+    by_first, by_second = _slope(first), _slope(second)
+    variances = [by @ scores.covariance[:2, :2] @ by for by, scores in ((by_first, first), (by_second, second))]
+    scale = sqrt(max(0.0, float(variances[0] * variances[1])))
+    return float(np.clip(by_first @ between @ by_second / scale, -1, 1)) if scale > 0 else 0.0
+
+
+def _slope(scores: Scores) -> Matrix:
+    """(2,) derivatives of the ratio by its two scores."""
+    expert, backbone = scores.above[:2]
+    slope: Matrix = np.array([1.0, -expert / backbone]) / backbone
+    return slope

@@ -1,0 +1,148 @@
+"""Shares of episodes with their intervals, groups of items as the unit.
+
+Korn and Graubard, “Confidence intervals for proportions with small expected number of positive counts estimated
+from survey data”, Survey Methodology 24 (1998).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+Matrix = NDArray[np.float64]
+
+TAIL = SIGNIFICANCE / 2
+"""Chance of either side of a two-sided 95 % interval."""
+_NOTHING = 1e-12
+"""A variance below this is the rounding of 0."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of episodes, such as a success rate.
+
+    groups: (G,) names of the groups of items, sorted. sums, sizes: (G,) hits and episodes of each group.
+    """
+
+    groups: NDArray[np.str_]
+    sums: Matrix
+    sizes: Matrix
+
+    @classmethod
+    def of(cls, values: ArrayLike, groups: ArrayLike) -> "Share":
+        """The mean of (E,) values from 0 to 1 over the episodes of (E,) groups.
+
+        Raises UsageError for no episode, or a value that is NaN or outside 0 … 1.
+        """
+        each = np.asarray(values, np.float64)
+        if each.size == 0:
+            raise UsageError("a share of no episodes; expected at least one")
+        if not ((each >= 0) & (each <= 1)).all():
+            wrong = each[~((each >= 0) & (each <= 1))]
+            raise UsageError(
+                f"{wrong.size} of {each.size} values are no shares, the first is {wrong[0]}; expected 0 to 1. "
+                "Leave out episodes without a value."
+            )
+        names, group_of = np.unique(np.asarray(groups, str), return_inverse=True)
+        return cls(names, np.bincount(group_of, each), np.bincount(group_of, np.ones(each.size)))
+
+    @property
+    def value(self) -> float:
+        """Hits over episodes."""
+        return float(self.sums.sum() / self.sizes.sum())
+
+    @property
+    def n_groups(self) -> float:
+        """G*, how many groups of equal size are worth as much: E² / Σ size²."""
+        return effective_groups(self.sizes)
+
+    @property
+    def df(self) -> float:
+        """Degrees of freedom of the variance: G* − 1, at least 1."""
+        return max(self.n_groups - 1, 1.0)
+
+    @property
+    def variance(self) -> float:
+        """Of the share, groups as the unit; infinite with a single group."""
+        return self.covariance(self)
+
+    @cached_property
+    def _residuals(self) -> Matrix:
+        rest: Matrix = (self.sums - self.value * self.sizes) / self.sizes.sum()
+        return rest
+
+    def covariance(self, other: "Share") -> float:
+        """Covariance of two shares on the same groups; 0 where the groups are not the same."""
+        if not np.array_equal(self.groups, other.groups):
+            return 0.0
+        if self.groups.size == 1:
+            return float("inf")
+        return float(self._residuals @ other._residuals) * self.groups.size / (self.groups.size - 1)
+
+    def correlation(self, other: "Share") -> float:
+        """Correlation of two shares; 0 where the groups are not the same, or one of them does not vary."""
+        if min(self.groups.size, other.groups.size) == 1:
+            return 0.0
+        scale = sqrt(self.variance * other.variance)
+        return float(np.clip(self.covariance(other) / scale, -1, 1)) if scale > _NOTHING else 0.0
+
+    def interval(self) -> Interval:
+        """95 % interval by `share_interval`; 0 to 1 with a single group."""
+        if self.groups.size == 1:
+            return Interval(0.0, 1.0)
+        low, high = share_interval(self.value, self.variance, self.n_groups, self.sizes.sum(), self.df)
+        return Interval(float(low), float(high))
+
+
+def effective_groups(sizes: Matrix) -> float:
+    """G* of (G,) sizes: as many groups of equal size vary as little, E² / Σ size²."""
+    return float(sizes.sum() ** 2 / (sizes @ sizes))
+
+
+def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
+    """Shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
+
+    variance = Σ (sum − share · size)² · G / (G − 1) / E², with E = Σ size. Needs two groups or more.
+    """
+    total, count = sizes.sum(), sizes.size
+    shares: Matrix = sums.sum(axis=1) / total
+    rest = sums - shares[:, None] * sizes
+    variances: Matrix = (rest**2).sum(axis=1) * count / (count - 1) / total**2
+    return shares, variances
+
+
+def share_interval(
+    share: ArrayLike,
+    variance: ArrayLike,
+    n_groups: float,
+    n_episodes: float,
+    df: float,
+    tail: float = TAIL,
+    never_wrong: ArrayLike = False,
+) -> tuple[Matrix, Matrix]:
+    """Clopper and Pearson's limits with as many episodes as count (Korn and Graubard 1998), for arrays of shares.
+
+    share, variance: the estimates and their variances with groups as the unit. n_episodes: E of them. df: degrees
+    of freedom of the variance. tail: chance of either side. With
+    n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the limits are
+    Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies, or never_wrong
+    says that the groups agree, n is `n_groups`.
+    """
+    from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
+
+    s, v, agree = np.broadcast_arrays(np.asarray(share, np.float64).clip(0, 1), variance, never_wrong)
+    agree = agree | (v <= _NOTHING) | (s <= 0) | (s >= 1)
+    counting = np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes)
+    lost = stdtrit(max(n_episodes - 1, 1), 1 - tail) / stdtrit(df, 1 - tail)
+    n = np.where(agree, n_groups, counting * lost**2)
+    right, wrong = s * n, n - s * n
+    none, all_ = right <= 1e-9, wrong <= 1e-9
+    low = betaincinv(np.where(none, 1.0, right), wrong + 1, tail)
+    high = betaincinv(right + 1, np.where(all_, 1.0, wrong), 1 - tail)
+    return np.where(none, 0.0, low), np.where(all_, 1.0, high)

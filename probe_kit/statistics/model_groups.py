@@ -1,0 +1,91 @@
+"""Comparison of two groups of models, with the model as the unit."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from math import comb, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.statistics.estimates.mover import NO_LIMITS
+from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+MOST_EXACT = 200_000
+"""Ways of exchanging labels that are all tried; beyond, `DRAWS` of them are drawn."""
+DRAWS = 20_000
+
+
+class ModelsP(NamedTuple):
+    """p: two-sided, over models. smallest: the least that so few models allow. exact: all ways were tried."""
+
+    p: float
+    smallest: float
+    exact: bool
+
+
+def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -> ModelsP:
+    """p of two groups of models having equal means, their labels exchanged in all ways.
+
+    first, second: one value per model. 3 + 3 models cannot be below 0.1. seed: of the draws where there are more
+    ways than `MOST_EXACT`. Raises UsageError for an empty group or a value that is not finite.
+    """
+    values, size = _values(first, second), len(first)
+    ways = comb(values.size, size)
+    turned = 2 if 2 * size == values.size else 1  # the same split with the labels exchanged has the same gap
+    if ways <= MOST_EXACT:
+        chosen = np.array(list(combinations(range(values.size), size)))
+        gaps = _gaps(values, values[chosen].sum(axis=1), size)
+        return ModelsP(float((gaps >= gaps[0] - _slack(values)).mean()), turned / ways, True)
+    generator = np.random.default_rng(seed)
+    sums = generator.permuted(np.tile(values, (DRAWS, 1)), axis=1)[:, :size].sum(axis=1)
+    gaps, observed = _gaps(values, sums, size), _gaps(values, values[:size].sum(keepdims=True), size)[0]
+    hits = int((gaps >= observed - _slack(values)).sum())
+    return ModelsP((hits + 1) / (DRAWS + 1), 1 / (DRAWS + 1), False)
+
+
+def welch_interval(first: Sequence[float], second: Sequence[float]) -> Interval:
+    """95 % interval of the first group's mean minus the second's, by Welch's t over models.
+
+    A group of one model has no spread of its own, and is given that of the other one (Student's t). No limits
+    where both have one model, or where no model differs from its group. Raises UsageError as `exchange_p` does.
+    """
+    from scipy.special import stdtrit  # type: ignore[import-untyped]
+
+    _values(first, second)
+    sizes = np.array([len(first), len(second)])
+    spreads = [float(np.var(group, ddof=1)) if len(group) > 1 else None for group in (first, second)]
+    known = [spread for spread in spreads if spread is not None]
+    if not known or max(known) == 0:
+        return NO_LIMITS
+    of_mean = np.array([known[0] if spread is None else spread for spread in spreads]) / sizes
+    if len(known) == 1:
+        df = float(sizes.max() - 1)
+    else:
+        df = float(of_mean.sum() ** 2 / (of_mean**2 / (sizes - 1)).sum())
+    gap = float(np.mean(first) - np.mean(second))
+    spread = float(stdtrit(df, 1 - SIGNIFICANCE / 2)) * sqrt(of_mean.sum())
+    return Interval(gap - spread, gap + spread)
+
+
+def _values(first: Sequence[float], second: Sequence[float]) -> NDArray[np.float64]:
+    values = np.array([*first, *second], np.float64)
+    if not (len(first) and len(second)):
+        raise UsageError(f"groups of {len(first)} and {len(second)} models; expected at least one model in each")
+    if not np.isfinite(values).all():
+        raise UsageError(
+            f"values {values.tolist()} of models; expected finite numbers. Leave out models without one."
+        )
+    return values
+
+
+def _gaps(values: NDArray[np.float64], sums: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Absolute differences of the means where the first group's values add up to `sums`."""
+    gaps: NDArray[np.float64] = np.abs(sums / size - (values.sum() - sums) / (values.size - size))
+    return gaps
+
+
+def _slack(values: NDArray[np.float64]) -> float:
+    return 1e-12 * max(1.0, float(np.abs(values).max()))

@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+
+from probe_kit.errors import TooFewGroupsError
+from probe_kit.statistics.estimates.balanced import GroupSums
+from probe_kit.statistics.estimates.shares import share_interval
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, verdict
+
+
+def drawn(seed: int, shares: np.ndarray, groups: int, size: int = 4) -> GroupSums:
+    """Sites whose groups differ from each other, right in (S,) shares."""
+    generator = np.random.default_rng(seed)
+    chance = generator.beta(3 * shares[:, None], 3 * (1 - shares[:, None]), (shares.size, groups))
+    return GroupSums(generator.binomial(size, chance).astype(float), np.full(groups, float(size)))
+
+
+def test_the_limit_is_the_highest_of_the_sites_own_limits() -> None:
+    sites = drawn(0, np.array([0.5, 0.6, 0.55]), 20)
+    each = [at_most(sites.only([row])) for row in range(3)]
+    assert at_most(sites) == max(each)
+    rest = sites.sums[0] - sites.accuracies[0] * 4
+    variance = rest @ rest * 20 / 19 / 80**2
+    assert each[0] == pytest.approx(float(share_interval(sites.accuracies[0], variance, 20, 80, 19, tail=0.05)[1]))
+
+
+@pytest.mark.parametrize("sites", [1, 4, 60])
+def test_a_best_site_at_the_bound_is_rarely_called_absent(sites: int) -> None:
+    """One site has exactly the bound, the others nothing; and all of them have it."""
+    for shares in (np.append(np.full(sites - 1, 0.5), ABSENT_BELOW), np.full(sites, ABSENT_BELOW)):
+        wrong = np.mean([at_most(drawn(seed, shares, 60)) < ABSENT_BELOW for seed in range(200)])
+        assert wrong < 0.05 + 2.5 * np.sqrt(0.05 * 0.95 / 200)
+
+
+def test_nothing_is_called_absent_with_many_groups_and_not_shown_with_few() -> None:
+    nothing = np.full(60, 0.5)
+    assert verdict(False, at_most(drawn(0, nothing, 600))) == "absent"
+    assert verdict(False, at_most(drawn(0, nothing, 12))) == "not shown"
+
+
+def test_a_signal_is_shown_whatever_it_may_be_at_most() -> None:
+    assert verdict(True, 0.55) == "shown"
+    assert verdict(True, 0.9) == "shown"
+
+
+def test_the_bound_can_be_set_and_is_not_reached_by_itself() -> None:
+    assert verdict(False, 0.62) == "absent"
+    assert verdict(False, 0.62, absent_below=0.6) == "not shown"
+    assert verdict(False, ABSENT_BELOW) == "not shown"
+
+
+def test_a_site_that_is_always_right_may_be_all() -> None:
+    assert at_most(GroupSums(np.full((2, 9), 4.0), np.full(9, 4.0))) == 1.0
+
+
+def test_one_group_sets_no_limit() -> None:
+    with pytest.raises(TooFewGroupsError, match="1 independent groups"):
+        at_most(GroupSums(np.ones((2, 1)), np.ones(1)))

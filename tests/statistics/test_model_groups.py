@@ -1,0 +1,91 @@
+from math import comb
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import permutation_test, ttest_ind
+
+from probe_kit.errors import UsageError
+from probe_kit.statistics import model_groups
+from probe_kit.statistics.estimates.mover import NO_LIMITS
+from probe_kit.statistics.model_groups import exchange_p, welch_interval
+
+
+def gap(first: np.ndarray, second: np.ndarray) -> float:
+    return float(abs(np.mean(first) - np.mean(second)))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 5))
+def test_p_is_the_exact_permutation_p(seed: int, first: int, second: int) -> None:
+    values = np.random.default_rng(seed).random(first + second)
+    found = exchange_p(values[:first], values[first:])
+    assert found.exact
+    assert found.smallest <= found.p <= 1
+    if min(first, second) > 1:
+        groups = (values[:first], values[first:])
+        expected = permutation_test(groups, gap, n_resamples=np.inf, alternative="greater")
+        assert found.p == pytest.approx(expected.pvalue)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "smallest"), [(3, 3, 0.1), (4, 4, 2 / 70), (2, 3, 0.1), (1, 4, 0.2), (6, 6, 2 / 924)]
+)
+def test_so_few_models_allow_no_smaller_p(first: int, second: int, smallest: float) -> None:
+    apart = exchange_p(np.arange(first) / 100, 1 + np.arange(second) / 100)
+    assert apart.p == pytest.approx(smallest)
+    assert apart.smallest == pytest.approx(smallest)
+
+
+def test_equal_models_give_a_p_of_one() -> None:
+    assert exchange_p([0.4, 0.4, 0.4], [0.4, 0.4, 0.4]).p == 1
+
+
+def test_p_is_below_five_percent_in_at_most_five_percent_of_equal_groups() -> None:
+    generator = np.random.default_rng(0)
+    found = [exchange_p(*generator.standard_normal((2, 4))).p for _ in range(1000)]
+    assert np.mean(np.array(found) <= 0.05) < 0.06
+
+
+def test_labels_of_very_many_models_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(1).random(10)
+    exact = exchange_p(values[:5], values[5:])
+    assert comb(10, 5) < model_groups.MOST_EXACT
+    monkeypatch.setattr(model_groups, "MOST_EXACT", 100)
+    drawn = exchange_p(values[:5], values[5:])
+    assert not drawn.exact
+    assert drawn.p == pytest.approx(exact.p, abs=0.015)
+    assert drawn == exchange_p(values[:5], values[5:]), "the same draws"
+    assert drawn.smallest == pytest.approx(1 / 20_001)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 6), st.integers(2, 6))
+def test_the_interval_is_welchs(seed: int, first: int, second: int) -> None:
+    generator = np.random.default_rng(seed)
+    one, other = generator.random(first), 3 * generator.random(second)
+    expected = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
+    found = welch_interval(one, other)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+
+
+def test_a_single_model_is_given_the_spread_of_the_other_group() -> None:
+    found = welch_interval([0.9], [0.4, 0.5, 0.6])
+    spread = 4.302653 * 0.1 * np.sqrt(1 + 1 / 3)
+    assert (found.low, found.high) == pytest.approx((0.4 - spread, 0.4 + spread))
+    mirrored = welch_interval([0.4, 0.5, 0.6], [0.9])
+    assert (mirrored.low, mirrored.high) == pytest.approx((-found.high, -found.low))
+
+
+def test_models_without_any_spread_give_no_limits() -> None:
+    assert welch_interval([0.5], [0.6]) == NO_LIMITS
+    assert welch_interval([0.5, 0.5], [0.6, 0.6]) == NO_LIMITS
+
+
+def test_empty_groups_and_missing_values_are_refused() -> None:
+    for compare in (exchange_p, welch_interval):
+        with pytest.raises(UsageError, match="groups of 0 and 2 models"):
+            compare([], [0.1, 0.2])
+        with pytest.raises(UsageError, match="expected finite numbers"):
+            compare([0.1, float("nan")], [0.2])
