@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from probe_kit.demo.organisms import ORGANISMS, RANDOM_TWIN, TRAINED, Organism, findings, probed
+from probe_kit.demo.organisms import ORGANISMS, TRAINED, UNTRAINED_NETWORK, Organism, findings, probed
 from probe_kit.demo.pipeline import PERMUTATIONS
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract import Run
@@ -217,9 +217,9 @@ def main() -> int:
     arguments = parser.parse_args()
     truth = dict(TRAINED.truth)
     suite = build_suite(arguments.folder / "suite", [*truth, ABSENT], arguments.items, seed=arguments.seed)
-    twin = acted(RANDOM_TWIN, suite, arguments.folder, arguments.steps, None)
+    twin = acted(UNTRAINED_NETWORK, suite, arguments.folder, arguments.steps, None)
     runs = [
-        (one, twin if one == RANDOM_TWIN else acted(one, suite, arguments.folder, arguments.steps, twin))
+        (one, twin if one == UNTRAINED_NETWORK else acted(one, suite, arguments.folder, arguments.steps, twin))
         for one in ORGANISMS
     ]
     run = dict(runs)[TRAINED]

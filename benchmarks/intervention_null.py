@@ -3,12 +3,12 @@
     python benchmarks/intervention_null.py FOLDER [--twins 50] [--inside 10] [--items 12] [--categories …]
                                            [--shuffles 100] [--model pi0-tiny]
 
-Random twins of a policy, each with weights of its own, infer on the first frames of a drawn suite, drawn once:
-`follow` for all of them, an interchange at every backbone layer and role for the first `--inside`. Labels are
-shuffled by item on what the trained policy itself does, once per shuffle. A *cell* is one test: a category for
-`follow`; a category, place and role for the interchange. Cells of one interchange share its episodes, so that the
-family-wise count, one cell a category and policy, is the independent one. Every policy's answers are kept in
-FOLDER: the same command continues. Prints found / cells and the one-sided binomial p of more than 5 %.
+Untrained networks of a policy, each with weights of its own, infer on the first frames of a drawn suite, drawn
+once: `follow` for all of them, an interchange at every backbone layer and role for the first `--inside`. Labels
+are shuffled by item on what the trained policy itself does, once per shuffle. A *cell* is one test: a category
+for `follow`; a category, place and role for the interchange. Cells of one interchange share its episodes, so
+that the family-wise count, one cell a category and policy, is the independent one. Every policy's answers are
+kept in FOLDER: the same command continues. Prints found / cells and the one-sided binomial p of more than 5 %.
 """
 
 import argparse
@@ -137,7 +137,7 @@ def measure(frames: Frames, model: str, folder: Path, twins: Iterable[int], insi
         draw = np.random.default_rng(number)
         count_outside(shuffled(outside, draw), suite, of_shuffles)
         count_inside(shuffled(within, draw), suite, of_shuffles)
-    report("random twins", of_twins)
+    report("untrained networks", of_twins)
     report("the trained policy, labels shuffled by item", of_shuffles)
 
 

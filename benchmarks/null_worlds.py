@@ -9,8 +9,8 @@ where it sees nothing, stands for the logistic probe; `--probe nested` fits that
 *Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the answer in a
 direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The rival flips
 items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, against a
-binding control and a twin that are as accurate. `--keep` keeps the draws of worlds, so that the same command
-goes on where it was stopped.
+random-features control and a twin that are as accurate. `--keep` keeps the draws of worlds, so that the same
+command goes on where it was stopped.
 """
 
 import argparse
@@ -126,7 +126,7 @@ def correlated(generator: np.random.Generator, sites: int, accuracy: float) -> N
 
 
 def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
-    """How often any of 19 sites is better than an equally accurate binding control, and twin."""
+    """How often any of 19 sites is better than an equally accurate random-features control, and twin."""
     groups, found = np.repeat(np.arange(75), 4), []
     for seed in range(draws):
         generator = np.random.default_rng(seed)
@@ -139,8 +139,8 @@ def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
                 better_than_best(here, there, groups, seed).min() < LEVEL,
             ]
         )
-    binding, twin = np.mean(found, axis=0)
-    return float(binding), float(twin)
+    random_features, twin = np.mean(found, axis=0)
+    return float(random_features), float(twin)
 
 
 def main() -> None:
@@ -156,10 +156,12 @@ def main() -> None:
     console = Console(width=110)
     with threadpool_limits(1):
         accuracies = (0.5, 0.6, 0.8) if arguments.control_draws else ()
-        controls = Table("accuracy", "binding", "twin", title=f"false alarms, {arguments.control_draws} draws")
+        controls = Table(
+            "accuracy", "random-features", "twin", title=f"false alarms, {arguments.control_draws} draws"
+        )
         for accuracy in accuracies:
-            binding, twin = control_alarms(accuracy, arguments.control_draws)
-            controls.add_row(f"{accuracy:.1f}", f"{binding:.1%}", f"{twin:.1%}")
+            random_features, twin = control_alarms(accuracy, arguments.control_draws)
+            controls.add_row(f"{accuracy:.1f}", f"{random_features:.1%}", f"{twin:.1%}")
         if accuracies:
             console.print(controls)
         names = tuple(arguments.worlds.split(";"))

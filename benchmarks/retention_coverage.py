@@ -19,14 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
+from probe_kit.retention.estimators.combined import area_fit, bounded_fit
+from probe_kit.retention.estimators.cross_fit import Crossfit, GroupScores, crossfit
 from rich.console import Console
 from scipy.special import ndtri
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
-from probe_kit.retention.estimators.combined import area_fit, bounded_fit
-from probe_kit.retention.estimators.cross_fit import Crossfit, GroupScores, crossfit
 from probe_kit.retention.estimators.retention import retention_interval
 
 LAYERS, ITERATIONS = 19, 10

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 from kept_draws import kept_draws
 from numpy.typing import NDArray
+from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
+from probe_kit.retention.estimators.cross_fit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from rich.console import Console
 from rich.table import Table
 from scipy.special import ndtri
 from scipy.stats import binomtest
 
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
-from probe_kit.retention.estimators.cross_fit import REPEATS, GroupScores, crossfit, held_out_scores, random_halves
 from probe_kit.retention.estimators.retention import retention_interval
 from probe_kit.statistics.fieller import Interval
 from probe_kit.statistics.label_permutations import flip_items, max_statistic_p, pointwise_p

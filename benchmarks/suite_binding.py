@@ -2,8 +2,8 @@
 
     python benchmarks/suite_binding.py [--versions 1,2] [--items 150] [--seeds 0] [--width 96] [--categories …]
 
-Accuracy in % of the control `binding`: of its five random layers the best one, and their mean, on the control's
-own nested folds. No model is asked. Several seeds: other drawings of the same version, averaged.
+Accuracy in % of the control `random-features`: of its five random layers the best one, and their mean, on the
+control's own nested folds. No model is asked. Several seeds: other drawings of the same version, averaged.
 """
 
 import argparse
@@ -46,7 +46,9 @@ def main() -> None:
                 suite = build_suite(folder, categories, asked.items, seed, version=int(version))
                 for category, scores in free_accuracy(suite, asked.width).items():
                     found.setdefault(category, {}).setdefault(version, []).append(scores)
-    table = Table(title=f"binding, {asked.items} items, width {asked.width}: best and mean of {LAYERS} layers, %")
+    table = Table(
+        title=f"random-features, {asked.items} items, width {asked.width}: best and mean of {LAYERS} layers, %"
+    )
     for heading in ("category", *(f"version {version}" for version in asked.versions.split(","))):
         table.add_column(heading)
     for category, by_version in found.items():

@@ -6,3 +6,5 @@ SceneName = Literal["bridge", "vl-think", "frontal", "act2answer"]
 """The presets of `SceneSpec.preset`; `probe_kit.env.spec.PRESETS` says what each changes."""
 ArmName = Literal["panda", "widowx"]
 Rendering = Literal["raw", "visual-matching"]
+RuleName = Literal["disc", "box", "released-on-tile"]
+"""The outcome rules; `probe_kit.env.scoring.rules.RULES` says what each counts."""

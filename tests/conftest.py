@@ -198,7 +198,7 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="session")
 def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
-    """A real run of pi0-tiny's random twin with all tokens: 48 episodes of four actions."""
+    """A real run of pi0-tiny's untrained network with all tokens: 48 episodes of four actions."""
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run, open_run
 

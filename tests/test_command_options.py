@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from probe_kit._terminal.options import Format
 from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.spec import PRESETS
 from probe_kit.extract.command_options import Size, Sizes
 from probe_kit.extract.protocols import SCENES
@@ -26,7 +27,9 @@ from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds.registry import KINDS
-from probe_kit.scene_names import ArmName, Rendering, SceneName
+from probe_kit.retention.behaviour.vlm_answers import SCORES
+from probe_kit.retention.choices import AnswerScore, TableFormat
+from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
 from probe_kit.suite.generators.couples import SUITE_VERSIONS, SuiteVersion
@@ -35,8 +38,6 @@ from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, In
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
 MOST_LINES = 100
-LONG = {"retention"}
-"""Commands whose options are not yet declared by `probe_kit._terminal.options`."""
 
 CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("extract", "--wordings"): WORDINGS,
@@ -63,6 +64,10 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
     ("export", "--format"): WRITERS,
+    ("retention", "--format"): get_args(TableFormat),
+    ("retention", "--rule"): RULES,
+    ("retention", "--score"): SCORES,
+    ("stages", "--score"): SCORES,
     ("suite build", "--suite-version"): SUITE_VERSIONS,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
 }
@@ -73,6 +78,8 @@ REQUIRED = {
     "train": ["RUN"],
     "intervene": ["RUN"],
     "export": ["RUN"],
+    "retention": ["RUN"],
+    "stages": ["VLM_RUN", "RUN"],
     "suite build": ["FOLDER"],
     "suite convert": ["--root", "ROOT", "--out", "OUT"],
 }
@@ -115,7 +122,7 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
     [
         (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
-        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS),
+        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS), (RuleName, RULES), (AnswerScore, SCORES),
     ],
 )  # fmt: skip
 def test_a_vocabulary_names_what_the_library_offers(names: Any, declared: Collection[object]) -> None:
@@ -124,8 +131,6 @@ def test_a_vocabulary_names_what_the_library_offers(names: Any, declared: Collec
 
 @pytest.mark.parametrize("command", sorted(LEAVES))
 def test_no_command_function_is_longer_than_100_lines(command: str) -> None:
-    if command in LONG:
-        pytest.skip("its options move to `probe_kit._terminal.options` with its own change")
     assert len(inspect.getsource(LEAVES[command].callback).splitlines()) <= MOST_LINES
 
 
@@ -167,7 +172,7 @@ def test_sizes_are_read_as_width_by_height_and_shown_as_typed() -> None:
     assert Size.parse("560x480") == (560, 480)
 
 
-@pytest.mark.parametrize("command", sorted(set(LEAVES) - LONG - {"join"}))
+@pytest.mark.parametrize("command", sorted(LEAVES))
 def test_help_is_short_plain_sentences(command: str) -> None:
     """At most 25 words a sentence, no personified code."""
     texts = [

@@ -3,8 +3,8 @@
 `vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
 the actions of State questions went to a random side (*encoded, unused*). `pi0-tiny-state` differs in that they
-followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; random twins
-know nothing (*absent*).
+followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; untrained
+networks know nothing (*absent*).
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
-from probe_kit.retention.columns.text import bounded_value, exceeds, number, percent
+from probe_kit.retention.columns.text import exceeds_text, number, percent, retention_value
 from probe_kit.retention.report.category_summary import CategoryVerdict, verdict
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -73,12 +73,14 @@ EARLY = Organism(
     max_steps=SHORT,
     view="mean:language",  # where a reader answers; nothing was trained that would take it from there
 )
-RANDOM_TWIN = Organism("random twin", "run-random-twin", "pi0-tiny", random_weights=True, max_steps=SHORT)
+UNTRAINED_NETWORK = Organism(
+    "untrained network", "run-untrained", "pi0-tiny", random_weights=True, max_steps=SHORT
+)
 OTHER_TWINS = tuple(
-    replace(RANDOM_TWIN, name=f"random twin {seed}", folder=f"run-random-twin-{seed}", weights_seed=seed)
+    replace(UNTRAINED_NETWORK, name=f"untrained network {seed}", folder=f"run-untrained-{seed}", weights_seed=seed)
     for seed in (1, 2)
 )
-ORGANISMS = (TRAINED, STATE_USED, EARLY, RANDOM_TWIN, *OTHER_TWINS)
+ORGANISMS = (TRAINED, STATE_USED, EARLY, UNTRAINED_NETWORK, *OTHER_TWINS)
 READER = Organism(
     "reader",
     "run-reader",
@@ -120,7 +122,7 @@ def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
 
 
 def source_of(organism: Organism, suite: Suite) -> ReplaySource:
-    """Where interventions find the organism and its pictures again; of a random twin, the one of its own seed."""
+    """Where interventions find the organism and its pictures again; of an untrained network its own seed."""
     return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
 
 
@@ -132,7 +134,7 @@ def probed(
     stage: NamedProgress,
     twin: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
-    """The organism's run on `suite`, in `folder`, and its probes, compared with binding.
+    """The organism's run on `suite`, in `folder`, and its probes, compared with random-features.
 
     What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
     total, …) for a stage of this name. twin: a run to hold it against too.
@@ -145,7 +147,7 @@ def probed(
         run,
         views=(organism.view,),
         permutations=permutations,
-        controls=("binding",),
+        controls=("random-features",),
         suite=suite.folder,
         untrained=twin,
         progress=progress,
@@ -162,14 +164,14 @@ def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgres
 
 
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge the reader and every organism on `suite`; all but the first random twin are compared with it too.
+    """Judge the reader and every organism on `suite`; the first untrained network is a control of all others.
 
     Arguments as of `probed`.
     """
-    twin, _ = probed(RANDOM_TWIN, suite, folder, permutations, stage)
+    twin, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
     runs = [(READER, answered(READER, suite, folder, stage))]
     runs += [
-        (one, twin if one == RANDOM_TWIN else probed(one, suite, folder, permutations, stage, twin)[0])
+        (one, twin if one == UNTRAINED_NETWORK else probed(one, suite, folder, permutations, stage, twin)[0])
         for one in ORGANISMS
     ]
     return findings(runs)
@@ -205,7 +207,7 @@ def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
     agree = sum(finding.agrees for finding in findings)
     return ResponsiveTable(
         title="Model organisms",
-        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention bounded",
+        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention with its interval",
         name="policy",
         names=tuple(finding.organism for finding in findings),
         styles=("",) * len(findings),
@@ -236,8 +238,8 @@ def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
 
     row = finding.row
     texts = (
-        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.accuracy),
+        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.score),
         number(row.backbone.p_fwe, 3),
-        exceeds(row), percent(row.action.accuracy), bounded_value(row),
+        exceeds_text(row.backbone), percent(row.action.score), retention_value(row),
     )  # fmt: skip
     return tuple(map(Cell, texts))

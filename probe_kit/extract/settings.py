@@ -73,7 +73,7 @@ class RunSettings:
 
     model: a family of `probe-kit models`.
     checkpoint: folder or hub id; None for the family's default.
-    weights_seed: of a random twin's weights.
+    weights_seed: of a untrained network's weights.
     options: what only some families have, such as `unnorm_key`; what they lead to is in the model's card.
     label: what tables and legends call the run; None for the model and what sets it apart, see `run_label`. It is
     no part of the run's identity.
@@ -380,7 +380,7 @@ def check_label(label: str) -> None:
 
 
 def run_label(settings: RunSettings) -> str:
-    """What tables call the run: base, fine-tune, random twins and other options of one family differ in it."""
+    """What tables call the run: checkpoints and options of one family differ in it."""
     asks = isinstance(settings, AskSettings)  # whose runs come in several, all of one label
     if settings.label is not None:
         return " · ".join([settings.label, *(settings.marks() if asks else [])])

@@ -35,7 +35,7 @@ class Family:
 
     default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
     loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
-    random_weights) gives a Model, and takes `weights_seed` if its random twins can differ; verifier(folder,
+    random_weights) gives a Model, and takes `weights_seed` if its untrained networks can differ; verifier(folder,
     recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device; it
     takes the name of one where there are `sizes`. stored_names: `module:constant`, how names of tensors in
     released files become those of the network, see `probe_kit.models.naming`.
@@ -105,7 +105,7 @@ class Family:
     ) -> "Model":
         """Load a model; `checkpoint` None means the default one.
 
-        options: by name, as text or values. weights_seed: of a random twin's weights.
+        options: by name, as text or values. weights_seed: of a untrained network's weights.
         Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
         """
         chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
@@ -115,7 +115,7 @@ class Family:
             load = imported(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
-                raise UsageError(f"{self.name} has one random twin only: its loader takes no weights_seed")
+                raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
         with while_loading(self.name, str(place or "what it brings")):
             model: Model = load(place, device, dtype, random_weights, **chosen)
@@ -128,7 +128,7 @@ class Family:
         return model
 
     def _source_of(self, card: ModelCard, place: str | None) -> dict[str, Any]:
-        """What the card says of the source: a random twin has none, a foreign checkpoint an unknown one."""
+        """What the card says of the source: a untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:
             return {"source": None, "source_weights": None}
         own = place in (self.default_checkpoint, *(row.checkpoint for row in self.protocols.values()))
@@ -150,7 +150,9 @@ class Family:
         """
         chosen = check_options(self.name, self.options, options)
         if weights_seed and not random_weights:
-            raise UsageError("weights_seed belongs to a random twin; ask for random weights too, or leave it out")
+            raise UsageError(
+                "weights_seed belongs to a untrained network; ask for random weights too, or leave it out"
+            )
         if dtype not in (None, *DTYPES):
             raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
         check_device_name(device)

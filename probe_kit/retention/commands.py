@@ -1,105 +1,52 @@
 """`probe-kit retention`."""
 
 from collections.abc import Sequence
-from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING
 
-import typer
-
-from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split, whole_number
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
 from probe_kit.errors import UsageError
+from probe_kit.retention import command_options as own
 
 if TYPE_CHECKING:
     from probe_kit.retention import RetentionTable
-    from probe_kit.retention.estimators.retention import Iterations
     from probe_kit.train.data.run_reader import RunReader
 
 
-ASKED = "VLM runs"
-
-
 def retention(
-    runs: Annotated[
-        list[str] | None,
-        typer.Argument(help="Run folders or URLs; of several on the same questions, differences are shown too."),
-    ] = None,
-    group: Annotated[
-        list[str] | None, typer.Option(help="NAME=RUN,RUN: compare groups of runs, such as co-trained or not.")
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(
-            help="Run (its folder or its name in tables) or group that every other is compared with; default: the "
-            "first run against every other, every two groups."
-        ),
-    ] = None,
-    style: Annotated[str, typer.Option("--format", help="table, json, csv, markdown or latex.")] = "table",
-    probes: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="RUN=KEY: which probes of a run, as `run show` lists them; default those asked for last."
-        ),
-    ] = None,
-    views: Annotated[str | None, typer.Option(help="Comma-separated; default all probed ones.")] = None,
-    iterations: Annotated[
-        str,
-        typer.Option(
-            help="Expert iterations or action tokens that count: all, last or a number. best: all, and layer "
-            "curves show the best of each layer only."
-        ),
-    ] = "all",
-    epsilons: Annotated[
-        str | None, typer.Option(help="Zone radii in metres at which SR is scored again, from stored positions.")
-    ] = None,
-    wording: Annotated[
-        str | None, typer.Option(help="Of runs with several wordings: the one tables are of; default their first.")
-    ] = None,
-    rule: Annotated[
-        str,
-        typer.Option(help="What counts as an answer: disc, box (the released evaluation's) or released-on-tile."),
-    ] = "disc",
-    last_steps: Annotated[
-        int,
-        typer.Option(help="Control steps at the end that are judged; the released evaluation averages 11."),
-    ] = 1,
-    html: Annotated[Path | None, typer.Option(help="File for a report to look at, without network.")] = None,
-    figures: Annotated[Path | None, typer.Option(help="Folder for all figures, as PNG and PDF.")] = None,
-    score: Annotated[
-        str,
-        typer.Option(help="Of VLM runs: text, logits, or order-balanced (no letter bias).", rich_help_panel=ASKED),
-    ] = "text",
-    vlm_vla: Annotated[
-        bool,
-        typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=ASKED),
-    ] = False,
-    with_side_words: Annotated[
-        bool,
-        typer.Option(
-            "--with-side-words", help="Count items such as 'no left turn sign' too.", rich_help_panel=ASKED
-        ),
-    ] = False,
-    partial: Annotated[bool, typer.Option("--partial", help="Accept runs that are not finished.")] = False,
+    runs: own.Runs = None,
+    group: own.Groups = None,
+    against: own.Against = None,
+    probes: own.ProbeKeys = None,
+    views: own.Views = None,
+    iterations: own.IterationChoice = "all",
+    absent_below: own.AbsentBelow = 0.65,
+    wording: common.Wording = None,
+    partial: common.Partial = False,
+    rule: own.Rule = "disc",
+    last_steps: own.LastSteps = 1,
+    epsilons: own.Epsilons = None,
+    score: own.Score = "text",
+    vlm_vla: own.VlmVla = False,
+    with_side_words: own.SideWords = False,
+    style: own.Style = "table",
+    html: own.Html = None,
+    figures: own.Figures = None,
 ) -> None:
-    """Print success rates and how much of the backbone's signal reaches the action expert."""
+    """Print success rates and how much of the backbone's signal reaches the action stream."""
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
-    from probe_kit.env.scoring.rules import check_rule
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons
 
-    check_epsilons(check_rule(rule), epsilons is not None)
-    if last_steps < 1:
-        raise UsageError(f"--last-steps {last_steps}: expected at least 1")
-    if style not in _FORMATS:
-        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(_FORMATS)}")
+    check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
     grouped = _groups(group) if group else {"": tuple(runs or ())}
     _check_doubles([path for paths in grouped.values() for path in paths])
-    steps = _iterations(iterations)
-    radii = SENSITIVITY_RADII if epsilons is None else [_radius(part) for part in split(epsilons) or ()]
+    steps = own.read_iterations(iterations)
     _check_places(html, figures)
     opened = {
         name: [open_run(p, allow_partial=partial).in_wording(wording) for p in paths]
@@ -108,9 +55,9 @@ def retention(
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
     table = make_table(
-        opened if group else listed, split(views), iterations=steps, keys=keys, epsilons=radii, rule=rule,
-        last_steps=last_steps,
-        score=score, vlm_vla=vlm_vla, with_side_words=with_side_words, against=against,
+        opened if group else listed, views, iterations=steps, keys=keys, epsilons=epsilons or SENSITIVITY_RADII,
+        rule=rule, last_steps=last_steps, absent_below=absent_below, score=score, vlm_vla=vlm_vla,
+        with_side_words=with_side_words, against=against,
     )  # fmt: skip
     if style == "table":
         out.print(table.to_rich())
@@ -184,27 +131,6 @@ def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
             raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = tuple(filter(None, map(str.strip, paths.split(","))))  # a run given twice is refused
     return groups
-
-
-def _radius(text: str) -> float:
-    try:
-        radius = float(text)
-    except ValueError:
-        raise UsageError(f"{text!r} is not a number of metres") from None
-    if not 0 < radius < inf:
-        raise UsageError(f"a zone radius is {text} m; expected a positive number")
-    return radius
-
-
-def _iterations(text: str) -> "Iterations":
-    if (number := whole_number(text)) is not None:
-        return number
-    if text not in ("all", "best", "last"):
-        raise UsageError(f"iterations {text!r}; expected all, best, last or a number")
-    return cast("Iterations", text)
-
-
-_FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
 def _save_figures(runs: "list[RunReader]", table: "RetentionTable", folder: Path) -> None:

@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from probe_kit._terminal import options as common
 from probe_kit._terminal.console import out, print_json, say
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention import command_options as own
 from probe_kit.retention.commands import check_file
 
 if TYPE_CHECKING:
@@ -14,26 +16,26 @@ if TYPE_CHECKING:
 
 
 def stages(
-    asked: Annotated[str, typer.Argument(help="A run of `probe-kit ask`.")],
-    acted: Annotated[str, typer.Argument(help="A run of `probe-kit extract` in the same scenes.")],
-    score: Annotated[str, typer.Option(help="Of the VLM run: text, logits, or order-balanced.")] = "text",
-    view: Annotated[str | None, typer.Option(help="View of the policy run's probes; default the first.")] = None,
-    probes: Annotated[str | None, typer.Option(help="Key of these probes; default those asked for last.")] = None,
-    with_side_words: Annotated[
-        bool, typer.Option("--with-side-words", help="Count items such as 'no left turn sign' too.")
-    ] = False,
-    wording: Annotated[
-        str | None, typer.Option(help="Of a policy run with several wordings: which one; default its first.")
+    asked: Annotated[str, typer.Argument(help="Run of `probe-kit ask`.", metavar="VLM_RUN")],
+    acted: Annotated[str, typer.Argument(help="Run of `probe-kit extract` in the same scenes.", metavar="RUN")],
+    score: own.Score = "text",
+    with_side_words: own.SideWords = False,
+    view: Annotated[
+        str | None,
+        typer.Option(help="View of the policy run's probes. Default: the first.", rich_help_panel=own.RUNS),
     ] = None,
-    figures: Annotated[
-        Path | None, typer.Option(help="Folder for the figure `known-used`, as PNG and PDF.")
+    probes: Annotated[
+        str | None,
+        typer.Option(help="Key of the probe results. Default: those requested last.", rich_help_panel=own.RUNS),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    wording: common.Wording = None,
+    figures: own.Figures = None,
+    as_json: common.AsJson = False,
 ) -> None:
-    """Join what a model knows, what a policy encodes and what it does, question by question.
+    """Compare what a VLM answers, a policy encodes and a policy does, question by question.
 
-    known: the model answers right. encoded: the policy's probe reads it, better than chance and controls. used:
-    the action follows. Refuses runs that did not begin with the same frames.
+    Answered: the VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls.
+    Acted: the cube ends on the correct picture. Both runs need the same first frames.
     """
     from probe_kit.extract import open_run
     from probe_kit.retention.behaviour.vlm_answers import scored

@@ -21,10 +21,11 @@ from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differ
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
-from probe_kit.retention.rows.build import RowSettings, RowWithDraws, run_rows
+from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.retention.rows.category_mean import mean_row
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_current, load_results
@@ -106,12 +107,12 @@ class RetentionTable:
 
     @property
     def probes(self) -> "pd.DataFrame":
-        """The best sites by `run`, `category`, `view` and `stream`, with the fields of `ActionPeak`."""
+        """The best sites by `run`, `category`, `view` and `stream`, with the fields of `ActionPart`."""
         return peak_frame(self.all_rows)
 
     @property
     def retention(self) -> "pd.DataFrame":
-        """Retention by `run`, `category` and `view`, with the fields of `RetentionScores`."""
+        """Retention by `run`, `category` and `view`, with the fields of `RetentionPart`."""
         return part_frame(self.all_rows, "retention")
 
     @property
@@ -193,12 +194,12 @@ def retention_table(
     iterations: Iterations = "all",
     keys: Sequence[str | None] | None = None,
     epsilons: Sequence[float] = SENSITIVITY_RADII,
-    seed: int = 0,
     score: str = "text",
     with_side_words: bool = False,
     vlm_vla: bool = False,
     rule: str = DEFAULT_RULE,
     last_steps: int = 1,
+    absent_below: float = ABSENT_BELOW,
     against: str | None = None,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
@@ -208,14 +209,14 @@ def retention_table(
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
     by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
     in order, the newest by default. epsilons: zone radii in metres at which SR is scored again, for the rule
-    `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps: control
-    steps at their end that count. A run that keeps no trajectories has no success rate by another rule than
-    `disc`. A run without activations or probes shows success rates only. score: by which VLM runs are read,
-    `text`, `logits` or `order-balanced`; they stand first. with_side_words: count their items in whose name a side
-    stands. vlm_vla: compare every VLM run with every acting one, see `vlm_vla_differences`. Raises
-    UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that is not
-    that of the runs, for a run that is given twice, or for `against` where it is none of them; SceneError for
-    overlapping zones.
+    `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps:
+    control steps at their end that count. absent_below: accuracy below which a stream without signal is called
+    absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
+    activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
+    `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
+    compare every VLM run with every acting one, see `vlm_vla_differences`. Raises UnknownSiteError for a view
+    that was not probed, UsageError for an unknown key or a number of keys that is not that of the runs, for a
+    run that is given twice, or for `against` where it is none of them; SceneError for overlapping zones.
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
@@ -231,8 +232,8 @@ def retention_table(
     if unscored and isinstance(runs, Mapping):
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
     notes += unscored
-    settings = RowSettings(views, iterations, epsilons, seed, rule, last_steps)
-    drawn: list[RowWithDraws] = []
+    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below)
+    drawn: list[RowWithEstimates] = []
     means: list[RetentionRow] = []
     for name, run in listed:
         found = run_rows(run, results.get(str(run.location)), settings, name)

@@ -20,7 +20,7 @@ class Interval:
         return not (isinf(self.low) or isinf(self.high))
 
     def __str__(self) -> str:
-        return f"[{self.low:.2f}, {self.high:.2f}]" if self.bounded else "[unbounded]"
+        return f"[{self.low:.2f}, {self.high:.2f}]" if self.bounded else "[no limits]"
 
 
 def fieller_interval(

@@ -4,7 +4,7 @@ from typing import Literal
 
 Target = Literal["correct", "chosen", "shuffled"]
 Incomplete = Literal["keep", "drop"]
-Baseline = Literal["position", "instruction", "pixels", "binding"]
+Baseline = Literal["position", "instruction", "pixels", "random-features"]
 
 TARGETS: dict[str, str] = {
     "correct": "side of the correct picture",
@@ -19,5 +19,5 @@ BASELINES: dict[str, str] = {
     "position": "the layout alone",
     "instruction": "the words of the instruction, alone and with the layout",
     "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
-    "binding": "random nonlinear features of pictures and words together, as wide as the site; needs the suite",
+    "random-features": "random nonlinear features of pictures and words, as wide as the site; needs the suite",
 }

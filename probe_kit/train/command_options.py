@@ -58,8 +58,8 @@ Controls = Annotated[
         "--controls",
         parser=some_of(BASELINES, none="none"),
         metavar=f"{choices(BASELINES)},…",
-        help="Baselines that never see the model, comma-separated, or none. Default: binding, if the pictures of "
-        "the suite are available.",
+        help="Baselines that never see the model, comma-separated, or none. Default: random-features, if the "
+        "pictures of the suite are available.",
         rich_help_panel=CONTROLS,
     ),
 ]
@@ -77,7 +77,7 @@ Suite = Annotated[
     typer.Option(
         "--suite",
         metavar="FOLDER",
-        help="Suite folder of the run, for pixels and binding. Default: the embedded suite.",
+        help="Suite folder of the run, for pixels and random-features. Default: the embedded suite.",
         rich_help_panel=CONTROLS,
     ),
 ]

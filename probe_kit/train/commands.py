@@ -81,7 +81,10 @@ def train(
     for number, reason in left_out.items():
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
     if not results.controls.excess:
-        say("signal is judged against chance only: add the control binding, or a --untrained by random weights")
+        say(
+            "signal is judged against chance only: add the control random-features, or a --untrained by random "
+            "weights"
+        )
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
@@ -187,6 +190,10 @@ def _beats(best: "pd.Series[Any]") -> str:
     from probe_kit.statistics.significance import SIGNIFICANCE
 
     chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
-    tried = {"chance": chance, "binding": best["beats_binding"], "untrained": best["beats_untrained"]}
+    tried = {
+        "chance": chance,
+        "random-features": best["exceeds_random_features"],
+        "untrained": best["exceeds_untrained"],
+    }
     found = [name if better else f"not {name}" for name, better in tried.items() if not isna(better)]
     return ", ".join(found) or "–"

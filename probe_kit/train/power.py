@@ -30,15 +30,15 @@ _NUMBERS = 200_000
 class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
-    chance: against relabellings. binding, untrained: against a control that is right half of the time; it takes
-    more if the control is better than that. spread: standard error of the three, the largest, measured over
-    `SEEDS` seeds.
+    chance: against relabellings. random_features, untrained: against a control that is right half of the time;
+    it takes more if the control is better than that. spread: standard error of the three, the largest, measured
+    over `SEEDS` seeds.
     """
 
     items: int
     above: float
     chance: float
-    binding: float
+    random_features: float
     untrained: float
     spread: float
 
@@ -74,9 +74,9 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
     signal = np.zeros(sites)
     signal[_carriers(sites)] = above
     parts = np.array([_part(items, signal, -(-draws // SEEDS), SEEDS * seed + part) for part in range(SEEDS)])
-    chance, binding, untrained = parts.mean(axis=0).tolist()
+    chance, random_features, untrained = parts.mean(axis=0).tolist()
     spread = float((parts.std(axis=0, ddof=1) / sqrt(SEEDS)).max())
-    return Power(items, above, chance, binding, untrained, spread)
+    return Power(items, above, chance, random_features, untrained, spread)
 
 
 def items_needed(above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Needed:
@@ -138,7 +138,7 @@ def _resolution(items: int) -> int:
 
 
 def _least(found: Power) -> float:
-    return min(found.chance, found.binding, found.untrained)
+    return min(found.chance, found.random_features, found.untrained)
 
 
 def _carriers(sites: int) -> slice:
@@ -166,8 +166,8 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
                 better_than_best(here, untrained, groups, draw).min() < SIGNIFICANCE,
             )
         )
-    chance, binding, beaten = np.mean(seen, axis=0).tolist()
-    return chance, binding, beaten
+    chance, random_features, beaten = np.mean(seen, axis=0).tolist()
+    return chance, random_features, beaten
 
 
 @lru_cache(maxsize=256)

@@ -56,7 +56,7 @@ def power(
         ),
     ] = None,
 ) -> None:
-    """Estimate the power of probes against chance, binding and an untrained network by simulation.
+    """Estimate the power of probes against chance, random-features and an untrained network by simulation.
 
     Assumes two items and four episodes per group, a correlation of 0.9 between neighbouring sites, and controls at
     chance.
@@ -110,14 +110,14 @@ def _print(found: "list[Power]") -> None:
     headings = (
         "signal, points",
         "against chance %",
-        "against binding %",
+        "against random-features %",
         "against an untrained network %",
         "± (standard error)",
         "red control from %",
     )
     rows = [
         (
-            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.binding, one.untrained)),
+            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.random_features, one.untrained)),
             f"{100 * one.spread:.1f}",
             f"{100 * detectable(one.items):.0f}",
         )
@@ -126,8 +126,8 @@ def _print(found: "list[Power]") -> None:
     out.print(
         ResponsiveTable(
             title="Power: how often a signal is seen",
-            caption="binding and the untrained network at chance; ±: of the three, the largest, measured over "
-            "seeds; a leaking control of that accuracy is red in 80 % of suites",
+            caption="random-features and the untrained network at chance; ±: of the three, the largest, "
+            "measured over seeds; a leaking control of that accuracy is red in 80 % of suites",
             name="items",
             names=tuple(str(one.items) for one in found),
             styles=("",) * len(found),

@@ -53,20 +53,19 @@ def train_probes(
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
     categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
-    `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'.
-    permutations: relabellings behind the p-values, of which token views, many times as dear, take the first
+    `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'. permutations:
+    relabellings behind the p-values, of which token views, many times as dear, take the first
     `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
-    out. folds: `concepts` also keeps items about the same two concepts together.
-    incomplete: `drop` leaves out items of which an episode is missing.
-    controls: baselines that never see the model, of `position`, `instruction`, and `pixels` and `binding`, which
-    need pictures; () for none. By default `binding`; where the pictures cannot be found a warning says that it was
-    left out. suite: folder of the run's suite; the embedded one is found or drawn again without it.
-    untrained: a run of the same episodes, usually by random weights, to subtract.
-    What is no better than `binding` and the untrained network is no signal, whatever its p-value.
-    jobs: processes that probe, this one alone by default; with more than one, a script needs
-    `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy without one.
-    ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
-    machine; `jobs` is then how many sites at once, by default as many as it has cores.
+    out. folds: `concepts` also keeps items about the same two concepts together. incomplete: `drop` leaves out
+    items of which an episode is missing. controls: baselines that never see the model, of `position`,
+    `instruction`, and `pixels` and `random-features`, which need pictures; () for none. By default
+    `random-features`; where the pictures cannot be found a warning says that it was left out. suite: folder of
+    the run's suite; the embedded one is found or drawn again without it. untrained: a run of the same episodes,
+    usually by random weights, to subtract. What is no better than `random-features` and the untrained network is
+    no signal, whatever its p-value. jobs: processes that probe, this one alone by default; with more than one, a
+    script needs `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy
+    without one. ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new
+    one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
     progress: by default a bar in a notebook, nothing elsewhere.
 

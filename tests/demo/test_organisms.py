@@ -10,10 +10,10 @@ from probe_kit.demo.organisms import (
     EARLY,
     ORGANISMS,
     OTHER_TWINS,
-    RANDOM_TWIN,
     READER,
     STATE_USED,
     TRAINED,
+    UNTRAINED_NETWORK,
     Finding,
     measured,
     settings_of,
@@ -43,7 +43,7 @@ def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
         run=run,
         success=SuccessRate(n_episodes=48, n_items=24, sr=sr, regime=regime(sr, 0.14, 1 - sr, 0.0)[0]),
         backbone=BackbonePeak(
-            accuracy=0.9, p_fwe=p, exceeds={"chance": chance, "binding": None, "untrained": None} | beats
+            accuracy=0.9, p_fwe=p, exceeds={"chance": chance, "random-features": None, "untrained": None} | beats
         ),
     )
 
@@ -65,9 +65,9 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
     assert verdict(row(sr, p)) == expected
 
 
-@pytest.mark.parametrize("control", ["binding", "untrained"])
+@pytest.mark.parametrize("control", ["random-features", "untrained"])
 def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
-    """Color of the random twin had p = 0.005 against chance, and knew nothing."""
+    """Color of the untrained network had p = 0.005 against chance, and knew nothing."""
     assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
     assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, not acted on"
 
@@ -78,7 +78,7 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
     assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
     assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
     twins = [one for one in ORGANISMS if one.random_weights]
-    assert twins == [RANDOM_TWIN, *OTHER_TWINS]
+    assert twins == [UNTRAINED_NETWORK, *OTHER_TWINS]
     assert [one.weights_seed for one in twins] == [0, 1, 2]
     assert {one.expected(category) for one in twins for category in ("color", "state")} == {"absent"}
 
@@ -107,7 +107,7 @@ def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_pa
     run = extract_run(settings, tmp_path / "run")
     assert len(run_intervention(run, ImageSwap(), source_of(twin, small_suite)).table) == 1
     with pytest.raises(SettingsMismatchError, match="weights"):
-        run_intervention(run, InstructionSwap(), source_of(RANDOM_TWIN, small_suite))
+        run_intervention(run, InstructionSwap(), source_of(UNTRAINED_NETWORK, small_suite))
 
 
 def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:

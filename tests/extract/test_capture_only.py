@@ -30,7 +30,7 @@ ACTING = ExtractSettings(
 
 @pytest.fixture(scope="module")
 def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The random twin again, as in `recorded_run`, but only captured, of one category; then probed."""
+    """The untrained network again, as in `recorded_run`, but only captured, of one category; then probed."""
     settings = replace(ACTING, suite=small_suite.folder, capture_only=True)
     run = extract_run(settings, tmp_path_factory.mktemp("capture_only") / "run")
     train_probes(run, views=["mean"], permutations=5, controls=())

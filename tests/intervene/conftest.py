@@ -1,4 +1,4 @@
-"""A real run of the random twin, with which interventions may be stored, and what they are made with."""
+"""A real run of the untrained network, with which interventions may be stored, and what they are made with."""
 
 import shutil
 from collections.abc import Iterator

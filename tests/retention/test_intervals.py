@@ -7,6 +7,9 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
+from probe_kit.retention.estimators.bootstrap_draws import average, probe_estimates, sr_estimate
+from probe_kit.retention.estimators.combined import area_fit, bounded_fit
+from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
 from scipy.special import stdtrit
 
 from probe_kit.hooks.contract.sites import Site
@@ -19,9 +22,6 @@ from probe_kit.retention import (
     retention_table,
 )
 from probe_kit.retention.displays import LayerCurveDisplay
-from probe_kit.retention.estimators.bootstrap_draws import average, probe_estimates, sr_estimate
-from probe_kit.retention.estimators.combined import area_fit, bounded_fit
-from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
 from probe_kit.statistics.bootstrap import group_bootstrap
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
 from probe_kit.train.controls.fit_controls import add_untrained

@@ -189,11 +189,11 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
 
 
 def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
-    beats = {"chance": True, "binding": False, "untrained": False}
+    beats = {"chance": True, "random-features": False, "untrained": False}
     both = "an untrained conjunction of pictures and words or the untrained network"
     assert _clear_words(0.01, beats) == f"above chance but no better than {both}, p = 0.010"
     assert _clear_words(0.6, beats | {"chance": False}) == f"not above chance nor better than {both}, p = 0.600"
-    assert _clear_words(0.6, {"chance": False, "binding": None}) == "not above chance, p = 0.600"
+    assert _clear_words(0.6, {"chance": False, "random-features": None}) == "not above chance, p = 0.600"
 
 
 def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: ProbedRun) -> None:

@@ -1,4 +1,4 @@
-"""Scales are the same whatever is shown: a random twin's best guess never looks like knowledge."""
+"""Scales are the same whatever is shown: a untrained network's best guess never looks like knowledge."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING

@@ -16,14 +16,14 @@ from probe_kit.train.power import _carriers, _limit, fewest, items_for_width, it
 def test_power_grows_with_items_and_with_the_signal() -> None:
     few, many = simulate(24, 0.15, draws=60), simulate(150, 0.15, draws=60)
     assert few.chance < many.chance
-    assert few.twin < many.twin
-    assert simulate(150, 0.1, draws=60).twin < simulate(150, 0.25, draws=60).twin
-    assert simulate(150, 0.25, draws=60).twin > 0.9
+    assert few.untrained < many.untrained
+    assert simulate(150, 0.1, draws=60).untrained < simulate(150, 0.25, draws=60).untrained
+    assert simulate(150, 0.25, draws=60).untrained > 0.9
 
 
 def test_without_a_signal_power_is_the_false_alarm_rate() -> None:
     found = simulate(60, 0.0, draws=200)
-    assert max(found.chance, found.binding, found.twin) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
+    assert max(found.chance, found.random_features, found.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
 
 
 def test_what_a_control_could_have_seen_at_this_size() -> None:
@@ -37,7 +37,7 @@ def test_one_site_carries_the_signal_too() -> None:
     """An independent simulation of one probe sees 25 points in nearly all experiments with 60 items."""
     found = simulate(60, 0.25, sites=1, draws=100)
     assert found.chance > 0.98
-    assert found.binding > 0.7
+    assert found.random_features > 0.7
     assert simulate(60, 0.0, sites=1, draws=100).chance < 0.12
 
 
@@ -99,7 +99,9 @@ def test_the_spread_is_the_error_over_seeds() -> None:
     """Over repetitions, shares vary as much as the spread says: more draws, less of both."""
     few = [simulate(24, 0.15, 5, draws=50, seed=seed) for seed in range(8)]
     many = [simulate(24, 0.15, 5, draws=400, seed=seed) for seed in range(4)]
-    measured = max(np.std([getattr(one, name) for one in few], ddof=1) for name in ("chance", "binding", "twin"))
+    measured = max(
+        np.std([getattr(one, name) for one in few], ddof=1) for name in ("chance", "random_features", "untrained")
+    )
     said = float(np.mean([one.spread for one in few]))
     assert 0.4 * measured < said < 2.5 * measured
     assert np.mean([one.spread for one in many]) < 0.7 * said
@@ -127,8 +129,8 @@ def test_the_items_needed_reach_the_power_and_a_step_less_does_not() -> None:
     assert needed.items is not None
     assert needed.resolution is not None
     here, less = (simulate(count, 0.25, 3, 60) for count in (needed.items, needed.items - needed.resolution))
-    assert min(here.chance, here.binding, here.twin) == needed.reached >= 0.8
-    assert min(less.chance, less.binding, less.twin) < 0.8
+    assert min(here.chance, here.random_features, here.untrained) == needed.reached >= 0.8
+    assert min(less.chance, less.random_features, less.untrained) < 0.8
 
 
 def test_the_width_of_an_interval_asks_for_items_too() -> None:
@@ -150,7 +152,7 @@ def test_the_command_prints_every_number_of_items() -> None:
     assert found.exit_code == 0, found.output
     assert [row["items"] for row in json.loads(found.stdout)] == [24, 60]
     text = CliRunner().invoke(app, ["power", "--items", "24", "--signal", "25", "--draws", "20"]).stdout
-    assert "against a twin" in text
+    assert "against an untrained network" in text
     assert CliRunner().invoke(app, ["power", "--width", "16"]).stdout.startswith("151 items")
     assert CliRunner().invoke(app, ["power", "--items", "many"]).exit_code == 2
 

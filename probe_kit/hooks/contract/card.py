@@ -23,7 +23,7 @@ class ModelCard:
 
     settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and
     the contents of every file a loader reads; part of a run's identity.
-    weights_seed: of a random twin; None for weights from a file.
+    weights_seed: of a untrained network; None for weights from a file.
     batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
     needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
     chunk, execute: actions per inference and how many of them are executed; 0 for a model that does not act.

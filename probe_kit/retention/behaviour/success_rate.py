@@ -12,7 +12,7 @@ import numpy as np
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import CAPTURE_ONLY
-from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.data.run_reader import check_several_wordings
 
@@ -49,16 +49,16 @@ class PairedItems:
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
-    ci: 95 % interval of `sr`, whole groups of items resampled. sr_original, sr_swapped: per layout, and
-    layout_mean their mean. sr_left, sr_right: per side of the correct picture. share_wrong, share_outside: ended
-    on the other picture, or on neither. share_never_moved: share that ended where it started, a failed grasp; part
-    of share_outside, None if it was not recorded. share_invalid_action: share of inferences that put out no
-    action, None for a policy that cannot tell. chance_margin_episodes: half-width of the band around 0.5 that
-    guessing explains, for N = episodes (the paper's); chance_margin_items: the same for N = items; chance_margin:
-    for as many items as count, fewer where items of a group answer alike, and what `regime` is judged by. reason:
-    why that regime, or why there is no rate. side_preference: share placed left among episodes placed in a zone.
-    normalised_score: only of a mean over categories. A rate over no episodes is None, and so is every rate of a
-    model that did not act.
+    ci: 95 % interval of `sr`, groups of items as the unit (`Share.interval`). sr_original, sr_swapped: per
+    layout, and layout_mean their mean. sr_left, sr_right: per side of the correct picture. share_wrong,
+    share_outside: ended on the other picture, or on neither. share_never_moved: share that ended where it
+    started, a failed grasp; part of share_outside, None if it was not recorded. share_invalid_action: share of
+    inferences that put out no action, None for a policy that cannot tell. chance_margin_episodes: half-width of
+    the band around 0.5 that guessing explains, for N = episodes (the paper's); chance_margin_items: the same for
+    N = items; chance_margin: for as many items as count, fewer where items of a group answer alike, and what
+    `regime` is judged by. reason: why that regime, or why there is no rate. side_preference: share placed left
+    among episodes placed in a zone. normalised_score: only of a mean over categories. A rate over no episodes is
+    None, and so is every rate of a model that did not act.
     """
 
     n_episodes: int
@@ -133,7 +133,17 @@ def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
     return episodes[[]].assign(correct=shares_of(episodes, "correct"))["correct"]
 
 
-def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
+def success_share(episodes: "pd.DataFrame", suite: str = "") -> Share:
+    """SR with groups of items as the unit; `suite` tells groups of several suites apart."""
+    return Share.of(shares_of(episodes, "correct"), group_names(episodes, suite))
+
+
+def group_names(episodes: "pd.DataFrame", suite: str) -> "NDArray[np.str_]":
+    """(E,) groups of items, named after their suite too."""
+    return np.char.add(f"{suite}/", units_of(episodes))
+
+
+def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
     episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
@@ -151,14 +161,14 @@ def success_rate(episodes: "pd.DataFrame", seed: int = 0) -> SuccessRate:
     n_items = int(episodes["item_id"].nunique())
     margin = chance_margin(independent_items(episodes))
     name, reason = regime(sr, margin, share_wrong, share_outside, "parse" in episodes)
-    low, high = group_bootstrap(correct.to_numpy()[:, None], units_of(episodes), seed)
+    interval = success_share(episodes).interval()
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
     return SuccessRate(
         n_episodes=len(episodes),
         n_items=n_items,
         sr=sr,
-        ci=(float(low[0]), float(high[0])),
+        ci=(interval.low, interval.high),
         sr_original=original,
         sr_swapped=swapped,
         layout_mean=None if original is None or swapped is None else (original + swapped) / 2,

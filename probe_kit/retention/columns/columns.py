@@ -14,21 +14,20 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.text import (
     action_place,
-    area_value,
     backbone_place,
     baseline,
-    bounded_value,
-    debiased_value,
     difference_interval,
     difference_test,
-    exceeds,
+    exceeds_text,
     number,
     p_text,
     percent,
     published_value,
     ratio_difference,
     regime_value,
+    retention_value,
     success_interval,
+    verdict_text,
     with_limits,
 )
 from probe_kit.retention.compare.differences import Difference
@@ -133,7 +132,7 @@ SR = Column(
     key="success.sr",
     heading="SR % [95 %]",
     help="Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 % "
-    "interval, whole groups of questions resampled. Two pictures: guessing gives 50 %.",
+    "interval, groups of questions as the unit. Two pictures: guessing gives 50 %.",
     text=success_interval,
     difference=lambda row: difference_interval(row.sr, row.sr_ci),
     heat=True,
@@ -144,7 +143,7 @@ ACCURACY = replace(
     SR,
     heading="accuracy % [95 %]",
     help="Share of questions that the VLM answers right, by the score that was chosen. In brackets the 95 % "
-    "interval, whole groups of questions resampled. Two pictures: guessing gives 50 %.",
+    "interval, groups of questions as the unit. Two pictures: guessing gives 50 %.",
 )
 DIFFERENCE_P = Column(
     key="difference.p",
@@ -399,102 +398,103 @@ def _where_defined(key: str) -> Sort:
     return lambda row: read(row) if row.retention.defined else None
 
 
-BOUNDED = Column(
-    key="retention.bounded",
-    heading="bounded [95 %]",
-    help="Retention between its bounds: four fifths the debiased estimate, which is too low where the best layer "
-    "is missed, and one fifth the peaks, which are too high. The number to quote for one category.",
-    text=bounded_value,
-    sort=_where_defined("retention.bounded"),
-    difference=lambda row: ratio_difference(row.retention_bounded, row.retention_bounded_ci),
-    heat=True,
-    note=lambda row: row.retention.note,
-)
-AREA = Column(
-    key="retention.area",
-    heading="area [95 %]",
-    help="The same ratio with the mean over all layers (and iterations) in place of the best: how much of the "
-    "stack carries the answer. Nothing is chosen, so nothing is biased; the number to average.",
-    text=area_value,
-    sort=_where_defined("retention.area"),
-    difference=lambda row: ratio_difference(row.retention_area, row.retention_area_ci),
-    heat=True,
-)
-DEBIASED = Column(
-    key="retention.debiased",
-    heading="debiased [95 %]",
-    help="The same with the layers chosen on other episodes than they are scored on. In brackets the 95 % "
-    "interval; “unbounded” means that with so few groups of questions the backbone's score above chance may be a "
-    "quarter of what it seems, or nothing: too little to divide by.",
-    text=debiased_value,
-    sort=_where_defined("retention.debiased"),
+RETENTION = Column(
+    key="retention.value",
+    heading="retention [95 %]",
+    help="Share of the backbone's signal that can be read where the action is made: the action's score above one "
+    "half over the backbone's. In a mean: the ratio of the mean scores. “No limits”: the backbone is not known "
+    "well enough to divide by. n/a: its signal is not shown.",
+    text=retention_value,
+    sort=_where_defined("retention.value"),
     difference=lambda row: ratio_difference(row.retention, row.retention_ci),
     heat=True,
+    note=lambda row: row.retention.note,
+    answers=(
+        "retention [95 %]",
+        "Share of the backbone's signal that can be read where the answer is made: the answer's score above one "
+        "half over the backbone's. n/a: the backbone's signal is not shown.",
+    ),
 )
 PUBLISHED = Column(
     key="retention.published",
-    heading="published",
-    help="(action − chance) / (backbone − chance): the share of what can be read in the backbone that can still "
-    "be read where the action is made. Biased upwards when signals are weak: both are maxima.",
-    answers=(
-        "published",
-        "(answer − chance) / (backbone − chance): the share of what can be read in the backbone that can still be "
-        "read where the answer is made. Biased upwards when signals are weak: both are maxima.",
-    ),
+    heading="published ratio",
+    help="The paper's formula: accuracies of the best sites above one half, action over backbone. Both are "
+    "maxima, so that it is biased where signals are weak. In a mean: the mean of these ratios.",
     text=published_value,
     sort=_where_defined("retention.published"),
-    heat=True,
 )
 PROBE_MINUS_SR = share(
     "controls.probe_minus_sr",
     "probe − SR %",
-    "Backbone accuracy minus success rate, in points: what can be read but is not acted on.",
+    "Backbone score minus success rate, in points: what can be read but is not acted on.",
     answers=(
         "probe − accuracy %",
-        "Backbone accuracy minus that of the answers, in points: what can be read but is not said.",
+        "Backbone score minus the accuracy of the answers, in points: what can be read but is not said.",
     ),
 )
 _P = (
     "Probability that the best layer of a stream looks this good when the answers are relabelled at random. It "
     "allows for having looked at all layers (family-wise)."
 )
+_PEAK = "Accuracy of the site that is best on all questions, scored on them too; too high by having been chosen."
 _LAYER = (
     "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first of "
     "several that are equally good; after +: how many others are."
 )
+_SCORE = (
+    "Accuracy of a linear probe at a site that is chosen on half of the questions and scored on the other half, "
+    "balanced between the sides: chance is 50 %. Bold: the signal is shown."
+)
+_VERDICT = (
+    "Shown: above chance, family-wise, and above every control that was run. Absent: not shown, and the best site "
+    "can be at most as accurate as stated, below 65 %. Not shown: everything else, with what it could be at most."
+)
+_EXCEEDS = (
+    "The controls that the best site is shown to exceed, paired by question: chance; random-features, an "
+    "untrained conjunction of pictures and words; untrained, the same network with random weights."
+)
 BACKBONE = interval(
-    "backbone.accuracy",
+    "backbone.score",
     "backbone.ci",
     "backbone % [95 %]",
-    "Best held-out accuracy of a probe in the vision-language backbone, over its layers.",
-    difference=lambda row: difference_interval(row.backbone_accuracy, row.backbone_ci),
+    f"In the vision-language backbone. {_SCORE}",
+    difference=lambda row: difference_interval(row.backbone, row.backbone_ci),
     strong=lambda row: row.backbone.has_signal,
+)
+BACKBONE_VERDICT = Column(
+    key="backbone.verdict",
+    heading="in the backbone",
+    help=_VERDICT,
+    text=lambda row: verdict_text(row.backbone),
+    sort=lambda row: row.backbone.at_most,
 )
 BACKBONE_LAYER = Column(key="backbone.layer", heading="backbone layer", help=_LAYER, text=backbone_place)
 BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
+BACKBONE_PEAK = share("backbone.peak", "backbone peak %", _PEAK)
 EXCEEDS = Column(
     key="backbone.exceeds",
     heading="backbone exceeds",
-    help="What the best layer is better than, family-wise and paired by question: chance; binding, an untrained "
-    "conjunction of pictures and words; untrained, the same network with random weights. Signal counts only if it "
-    "exceeds every control that was run. Compared with chance alone, even an untrained network can appear to "
-    "encode the answer.",
-    text=exceeds,
-    sort=exceeds,
+    help=_EXCEEDS,
+    text=lambda row: exceeds_text(row.backbone),
+    sort=lambda row: exceeds_text(row.backbone),
 )
+_IN_ACTION = "Where the action is made: in the action expert, or at the positions that choose action tokens."
 ACTION = interval(
-    "action.accuracy",
+    "action.score",
     "action.ci",
     "action % [95 %]",
-    "Best held-out accuracy of a probe where the action is made (the action expert, or the positions that choose "
-    "action tokens), over layers and iterations.",
-    answers=(
-        "answer % [95 %]",
-        "Best held-out accuracy of a probe where the answer is made (the position that chooses its first token), "
-        "over layers.",
-    ),
-    difference=lambda row: difference_interval(row.action_accuracy, row.action_ci),
+    f"{_IN_ACTION} {_SCORE}",
+    answers=("answer % [95 %]", f"At the position that chooses the first token of the answer. {_SCORE}"),
+    difference=lambda row: difference_interval(row.action, row.action_ci),
     strong=lambda row: row.action.has_signal,
+)
+ACTION_VERDICT = Column(
+    key="action.verdict",
+    heading="in the action",
+    help=_VERDICT,
+    text=lambda row: verdict_text(row.action),
+    sort=lambda row: row.action.at_most,
+    answers=("in the answer", _VERDICT),
 )
 ACTION_LAYER = Column(
     key="action.layer",
@@ -505,14 +505,14 @@ ACTION_LAYER = Column(
     answers=("answer layer", _LAYER),
 )
 ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
+ACTION_PEAK = share("action.peak", "action peak %", _PEAK, answers=("answer peak %", _PEAK))
 FIRST_ITERATION = share(
-    "action.first_accuracy",
+    "action.first_peak",
     "first iteration %",
     "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the decision "
     "itself, as a noisy action or as the tokens before.",
     answers=("first iteration %", "Best layer at the first iteration."),
 )
-CHANCE = share("controls.chance", "chance %", "Accuracy of always naming the more frequent side.")
 GROUPS = Column(
     key="controls.n_groups",
     heading="groups",
@@ -539,7 +539,7 @@ _BASELINES = {
     "position": f"The same probe on the layout alone.{_LEAK}",
     "instruction": f"The same probe on the words alone.{_LEAK}",
     "pixels": f"The same probe on the two pictures alone.{_LEAK}",
-    "binding": "The same probe on an untrained conjunction of pictures and words, which the backbone must exceed.",
+    "random-features": "The same probe on random features of pictures and words, which the backbone must exceed.",
 }
 BASELINES = tuple(map(_baseline, _BASELINES))
 _SELECTIVITY = "Accuracy above that of the same probe on random labels, at the best site"
@@ -561,10 +561,12 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
         ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
     ),
     "Retention": (
-        ColumnGroup("What is retained", (BOUNDED, AREA, DEBIASED, PUBLISHED, PROBE_MINUS_SR)),
-        ColumnGroup("In the backbone", (BACKBONE, BACKBONE_LAYER, BACKBONE_P, EXCEEDS)),
-        ColumnGroup("Where the action is made", (ACTION, ACTION_LAYER, ACTION_P, FIRST_ITERATION)),
-        ColumnGroup("Compared with", (CHANCE, GROUPS), True),
+        ColumnGroup("What is retained", (RETENTION, PUBLISHED, PROBE_MINUS_SR)),
+        ColumnGroup("In the backbone", (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS)),
+        ColumnGroup("Where the action is made", (ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION)),
+        ColumnGroup(
+            "Best sites, not corrected for having been chosen", (BACKBONE_PEAK, ACTION_PEAK, GROUPS), True
+        ),
     ),
     "Controls": (
         ColumnGroup("What gives the answer away without the model", BASELINES),

@@ -28,7 +28,7 @@ def behaviour_lines(rows: Sequence[RetentionRow], differences: Sequence[Differen
 def probe_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
     """Lines of probes, view by view."""
     views = dict.fromkeys(row.view for row in rows)
-    known = [row for row in differences if row.backbone_accuracy is not None or row.action_accuracy is not None]
+    known = [row for row in differences if row.backbone is not None or row.action is not None]
     return [
         line
         for view in views
@@ -46,14 +46,12 @@ def difference_legend(differences: Sequence[Difference], behaviour: bool = True)
     """How differences and their intervals are made; empty without any. behaviour: whether SR is among them."""
     if not differences:
         return ""
-    drawn = (
-        "whole groups of items drawn, the same for both sides" if any(row.paired for row in differences) else ""
-    )
-    own = "" if all(row.paired for row in differences) else "of other items: each side's own groups drawn"
+    drawn = "groups of items as pairs" if any(row.paired for row in differences) else ""
+    own = "" if all(row.paired for row in differences) else "of other items: each side's own groups"
     tests = (
         "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories and "
         "pairs)"
     )
     shown = tests if behaviour and any(row.p is not None for row in differences) else ""
-    probes = "best sites held fixed" if any(row.backbone_accuracy is not None for row in differences) else ""
-    return "differences: 95 %, " + "; ".join(filter(None, [drawn, own, probes, shown]))
+    models = "these models, other items" if any(row.sr_models for row in differences) else ""
+    return "differences: 95 %, " + "; ".join(filter(None, [drawn, own, shown, models]))

@@ -181,7 +181,7 @@ def _chance_only(rows: Sequence[RetentionRow]) -> list[str]:
     """A warning where signal was compared with chance only, because no control was run."""
     found = [row.backbone.exceeds for row in rows if row.backbone.exceeds]
     tried = any(better is not None for one in found for name, better in one.items() if name != "chance")
-    mark = "signal is judged against chance only: add the controls binding and untrained"
+    mark = "signal is judged against chance only: add the controls random-features and untrained"
     return [mark] if found and not tried else []
 
 

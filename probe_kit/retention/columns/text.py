@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.estimators.bootstrap_draws import Limits
+from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 
 NOT_ACTED = "n/a"
@@ -35,7 +36,7 @@ def with_limits(value: str, limits: Limits | None, write: Callable[[float | None
     if limits is None or value == "–":
         return value
     low, high = limits
-    return f"{value} [unbounded]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
+    return f"{value} [no limits]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
 
 
 def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
@@ -72,25 +73,11 @@ def regime_value(row: RetentionRow) -> str:
     return _REGIMES[row.success.regime]
 
 
-def bounded_value(row: RetentionRow) -> str:
-    """Bounded retention with its interval; n/a where retention is not defined."""
+def retention_value(row: RetentionRow) -> str:
+    """Retention with its interval; n/a where the backbone's signal is not shown."""
     if not row.retention.defined:
         return "n/a"
-    return with_limits(number(row.retention.bounded), row.retention.bounded_ci, number)
-
-
-def area_value(row: RetentionRow) -> str:
-    """Area retention with its interval; a dash where retention is not defined."""
-    if not row.retention.defined:
-        return "–"
-    return with_limits(number(row.retention.area), row.retention.area_ci, number)
-
-
-def debiased_value(row: RetentionRow) -> str:
-    """Debiased retention with its interval; a dash where retention is not defined."""
-    if not row.retention.defined:
-        return "–"
-    return with_limits(number(row.retention.debiased), row.retention.ci, number)
+    return with_limits(number(row.retention.value), row.retention.ci, number)
 
 
 def published_value(row: RetentionRow) -> str:
@@ -113,12 +100,27 @@ def call_words(call: int) -> str:
     return f"call {call}" + (", before anything moves" if call == 0 else ", counted from 0")
 
 
-def exceeds(row: RetentionRow) -> str:
-    """What the backbone's best site is better than, and what not; says so if only chance was tested."""
-    found = {name: better for name, better in row.backbone.exceeds.items() if better is not None}
+def verdict_text(part: StreamPart) -> str:
+    """What was found in a stream, and how much there could be where it is not shown."""
+    if part.verdict is None or part.at_most is None:
+        return "–"
+    most = f"{100 * part.at_most:.0f} %"
+    words = {
+        "shown": "shown",
+        "absent": f"absent (at most {most})",
+        "not shown": f"not shown (could be up to {most})",
+    }
+    return words[part.verdict]
+
+
+def exceeds_text(part: StreamPart) -> str:
+    """The controls that the best site is shown to exceed, and those that it is not shown to exceed."""
+    found = {name: better for name, better in part.exceeds.items() if better is not None}
     if set(found) == {"chance"}:
-        return "against chance only" if found["chance"] else "not chance"
-    return ", ".join(name if better else f"not {name}" for name, better in found.items()) or "–"
+        return "chance (no control was run)" if found["chance"] else "not shown: chance"
+    shown = [name for name, better in found.items() if better]
+    open_ = [name for name, better in found.items() if not better]
+    return "; ".join(filter(None, [", ".join(shown), f"not shown: {', '.join(open_)}" if open_ else ""])) or "–"
 
 
 def baseline(name: str) -> Callable[[RetentionRow], str]:
@@ -147,7 +149,7 @@ def difference_interval(value: float | None, limits: Limits | None, scale: float
         return f"{scale * value:+.{digits}f}"
     low, high = limits
     if low is None or high is None:
-        return f"{scale * value:+.{digits}f} [unbounded]"
+        return f"{scale * value:+.{digits}f} [no limits]"
     return f"{scale * value:+.{digits}f} [{scale * low:+.{digits}f}, {scale * high:+.{digits}f}]"
 
 

@@ -1,16 +1,29 @@
 """Runs, or groups of runs, against each other: what co-training, fine-tuning or training at all changed."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from math import isfinite
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, Estimates, Limits, average
-from probe_kit.retention.rows.build import RowWithDraws
-from probe_kit.retention.rows.category_mean import average_estimates
+from probe_kit.retention.estimators.stream_scores import (
+    ACTION,
+    BACKBONE,
+    Limits,
+    PooledScores,
+    Rate,
+    RowEstimates,
+    limits,
+)
+from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.row import MEAN
+from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
+from probe_kit.statistics.estimates.scores import Scores
+from probe_kit.statistics.model_groups import exchange_p, welch_interval
 from probe_kit.statistics.multiple_testing import corrected
 
 if TYPE_CHECKING:
@@ -18,17 +31,43 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class ModelTest:
+    """Two groups of models compared with the model as the unit.
+
+    n, n_minus: models of either group. difference: of the groups' means, with Welch's 95 % interval. p: exact and
+    two-sided, of exchanging the models' labels; smallest_p: the least that so few models allow.
+    """
+
+    n: int
+    n_minus: int
+    difference: float
+    ci: Limits
+    p: float
+    smallest_p: float
+
+    @classmethod
+    def of(cls, first: Sequence[float], second: Sequence[float]) -> "ModelTest | None":
+        """From one value per model; None for two single models, or where one has no value."""
+        if len(first) + len(second) < 3 or not (first and second and all(map(isfinite, (*first, *second)))):
+            return None
+        test = exchange_p(first, second)
+        gap = float(np.mean(first) - np.mean(second))
+        return cls(len(first), len(second), gap, limits(welch_interval(first, second)), test.p, test.smallest)
+
+
+@dataclass(frozen=True)
 class Difference:
     """`group` minus `minus` in one category and view, each the mean of its runs; 95 % intervals.
 
-    group, minus: names of groups, or of single runs, whose locations are then `run` and `minus_run`.
-    paired: whether both ran the same items, which are then drawn together; otherwise each group's on its own.
-    view: None where the two have no probed view in common.
-    p: of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at once; None unless
-    paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows `mean`.
-    `retention` is the debiased one, `retention_bounded` the one that tables lead with; None unless defined in both
-    groups. call: the captured inference that both were probed at, None without probes or where they differ. In a
-    row of category `mean`, numbers are averages over the `categories` that both groups have.
+    group, minus: names of groups, or of single runs, whose locations are then `run` and `minus_run`. paired:
+    whether both ran the same items, which then count as pairs. view: None where the two have no probed view in
+    common. sr, backbone, action: success rate and cross-fitted accuracies. retention: None unless defined on
+    both sides. p: of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at
+    once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
+    `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
+    where a side is a group of several. call: the captured inference that both were probed at, None without
+    probes or where they differ. In a row of category `mean`, numbers are averages over the `categories` that
+    both groups have.
     """
 
     group: str
@@ -38,16 +77,14 @@ class Difference:
     paired: bool
     sr: float | None = None
     sr_ci: Limits | None = None
-    backbone_accuracy: float | None = None
+    backbone: float | None = None
     backbone_ci: Limits | None = None
-    action_accuracy: float | None = None
+    action: float | None = None
     action_ci: Limits | None = None
     retention: float | None = None
     retention_ci: Limits | None = None
-    retention_bounded: float | None = None
-    retention_bounded_ci: Limits | None = None
-    retention_area: float | None = None
-    retention_area_ci: Limits | None = None
+    sr_models: ModelTest | None = None
+    retention_models: ModelTest | None = None
     call: int | None = None
     p: float | None = None
     p_holm: float | None = None
@@ -61,7 +98,7 @@ class Side:
     """One side of a comparison: what it is called, the rows of its runs, and where it lies if it is one run."""
 
     name: str
-    drawn: Sequence[RowWithDraws]
+    drawn: Sequence[RowWithEstimates]
     run: str | None = None
 
     def only(self, categories: Sequence[str]) -> "Side":
@@ -70,7 +107,7 @@ class Side:
 
 
 def group_differences(
-    groups: Mapping[str, Sequence[RowWithDraws]], against: str | None = None
+    groups: Mapping[str, Sequence[RowWithEstimates]], against: str | None = None
 ) -> list[Difference]:
     """Every group minus every later one, or minus the group `against`, per view and category and over all.
 
@@ -92,7 +129,7 @@ def _compare_sides(here: Side, there: Side) -> list[Difference]:
     calls = {one.row.run.call for one in (*here.drawn, *there.drawn)}
     call = calls.pop() if len(calls) == 1 else None
     mine, theirs = _by_view(here.drawn), _by_view(there.drawn)
-    shared = [view for view in mine if view in theirs]
+    shared: list[str | None] = [view for view in mine if view in theirs]
     if not shared:  # one was not probed, or in other views: behaviour can still be compared
         mine, theirs, shared = _behaviour(mine), _behaviour(theirs), [None]
     outcomes = _outcomes(here.drawn), _outcomes(there.drawn)
@@ -102,9 +139,11 @@ def _compare_sides(here: Side, there: Side) -> list[Difference]:
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
 """Per category, a table of outcomes of each run."""
+Drawn = Mapping[str, Sequence[RowWithEstimates]]
+"""Per category, the row of each run."""
 
 
-def _outcomes(drawn: Sequence[RowWithDraws]) -> Outcomes:
+def _outcomes(drawn: Sequence[RowWithEstimates]) -> Outcomes:
     """Once per run, whatever number of views it has."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for one in drawn:
@@ -113,83 +152,168 @@ def _outcomes(drawn: Sequence[RowWithDraws]) -> Outcomes:
     return {category: list(tables.values()) for category, tables in found.items()}
 
 
-def _behaviour(views: Mapping[str | None, Mapping[str, Estimates]]) -> dict[str | None, dict[str, Estimates]]:
+def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
     """What does not depend on the view, under the view None."""
     first = next(iter(views.values()), {})
-    return {None: {name: {"sr": found["sr"]} if "sr" in found else {} for name, found in first.items()}}
-
-
-def _by_view(drawn: Sequence[RowWithDraws]) -> dict[str | None, dict[str, Estimates]]:
-    """Estimates per view and category, averaged over runs; a quantity that a run lacks is left out."""
-    views: dict[str | None, dict[str, list[Estimates]]] = {}
-    for one in drawn:
-        views.setdefault(one.row.view, {}).setdefault(one.row.category, []).append(one.estimates)
     return {
-        view: {category: _average_common(found) for category, found in categories.items()}
-        for view, categories in views.items()
+        None: {
+            category: [replace(one, estimates=RowEstimates(one.estimates.rates)) for one in of_category]
+            for category, of_category in first.items()
+        }
     }
 
 
-def _average_common(found: Sequence[Estimates]) -> Estimates:
-    return {name: average([one[name] for one in found]) for name in found[0] if all(name in one for one in found)}
+def _by_view(drawn: Sequence[RowWithEstimates]) -> dict[str | None, Drawn]:
+    """Rows per view and category."""
+    views: dict[str | None, dict[str, list[RowWithEstimates]]] = {}
+    for one in drawn:
+        views.setdefault(one.row.view, {}).setdefault(one.row.category, []).append(one)
+    return dict(views)
+
+
+@dataclass(frozen=True)
+class _Gap:
+    """One category of two sides. accuracies: by stream. pooled: scores of either side, None without probes."""
+
+    paired: bool
+    sr: Rate | None
+    accuracies: Mapping[str, Rate] = field(default_factory=dict)
+    pooled: tuple[PooledScores, PooledScores] | None = None
+
+    @classmethod
+    def of(cls, here: Sequence[RowWithEstimates], there: Sequence[RowWithEstimates]) -> "_Gap":
+        """Means over the runs of either side; a number that a run lacks is left out."""
+        rates = [_rate(side) for side in (here, there)]
+        pooled = [_pooled(side) for side in (here, there)]
+        mine, theirs = rates
+        sr = None if mine is None or theirs is None else mine.minus(theirs)
+        first, second = pooled
+        if first is None or second is None:
+            return cls(mine is not None and theirs is not None and mine.paired_with(theirs), sr)
+        same = first.fit is not None and second.fit is not None and first.fit.seed == second.fit.seed
+        paired = same if mine is None or theirs is None else mine.paired_with(theirs)
+        names = [name for name in first.names if name in second.names]
+        gaps = {name: first.accuracy_difference(second, name) for name in names}
+        return cls(paired, sr, gaps, (first, second))
+
+    @property
+    def has_retention(self) -> bool:
+        """Whether both sides have both streams."""
+        return self.pooled is not None and all(side.names == (ACTION, BACKBONE) for side in self.pooled)
+
+
+def _rate(rows: Sequence[RowWithEstimates]) -> Rate | None:
+    shares = [one.estimates.rates["sr"] for one in rows if "sr" in one.estimates.rates]
+    return Rate.pooled(shares) if shares and len(shares) == len(rows) else None
+
+
+def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
+    streams = [one.estimates.streams for one in rows if one.estimates.streams is not None]
+    return PooledScores.of(streams) if streams and len(streams) == len(rows) else None
 
 
 def _compare(
-    sides: tuple[Side, Side],
-    view: str | None,
-    here: Mapping[str, Estimates],
-    there: Mapping[str, Estimates],
-    outcomes: tuple[Outcomes, Outcomes],
+    sides: tuple[Side, Side], view: str | None, here: Drawn, there: Drawn, outcomes: tuple[Outcomes, Outcomes]
 ) -> list[Difference]:
-    common = [category for category in here if set(here[category]) & set(there.get(category, {}))]
-    gaps = {
-        category: {
-            name: estimate - there[category][name]
-            for name, estimate in here[category].items()
-            if name in there[category]
-        }
-        for category in common
-    }
-    paired = {category: _drawn_alike(here[category], there[category]) for category in common}
+    gaps = {category: _Gap.of(here[category], there[category]) for category in here if category in there}
+    gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
     rows = [
-        _row(sides, category, view, paired[category], gap, _p(outcomes, [category], paired[category], gap))
+        _row(sides, [category], view, [gap], (here, there), _p(outcomes, [category], [gap]))
         for category, gap in gaps.items()
     ]
     if rows:
-        gap, alike = average_estimates(list(gaps.values())), all(paired.values())
-        mean = _row(sides, MEAN, view, alike, gap, _p(outcomes, common, alike, gap))
-        rows.append(replace(mean, categories=tuple(common)))
+        common, found = list(gaps), list(gaps.values())
+        mean = _row(sides, common, view, found, (here, there), _p(outcomes, common, found))
+        rows.append(replace(mean, category=MEAN, categories=tuple(common)))
     return rows
 
 
-def _p(
-    outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], paired: bool, gap: Estimates
-) -> float | None:
+def _p(outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], gaps: Sequence[_Gap]) -> float | None:
     """Of success rates, if both sides have one on the same items."""
-    if not paired or "sr" not in gap:
+    if not all(gap.paired and gap.sr is not None for gap in gaps):
         return None
     here, there = ([table for name in categories for table in side.get(name, ())] for side in outcomes)
     return gains_p(here, there)
 
 
-def _drawn_alike(here: Estimates, there: Estimates) -> bool:
-    """Whether both drew the same items: seen at the first quantity that both have, SR where both acted."""
-    name = next(name for name in here if name in there)
-    return here[name].units == there[name].units
-
-
 def _row(
-    sides: tuple[Side, Side], category: str, view: str | None, paired: bool, gap: Estimates, p: float | None
+    sides: tuple[Side, Side],
+    categories: Sequence[str],
+    view: str | None,
+    gaps: Sequence[_Gap],
+    drawn: tuple[Drawn, Drawn],
+    p: float | None,
 ) -> Difference:
-    sr = _value(gap.get("sr"))
-    backbone, action = (_value(gap.get(f"{part}_accuracy")) for part in ("backbone", "action"))
-    debiased, bounded, area = (_value(gap.get(f"retention_{part}")) for part in ("debiased", "bounded", "area"))
-    numbers = (*sr, *backbone, *action, *debiased, *bounded, *area)
-    return Difference(sides[0].name, sides[1].name, category, view, paired, *numbers, p=p)
+    """Of one category, or of the mean of several."""
+    rows = [[of_side[category] for category in categories] for of_side in drawn]
+    sr, backbone, action = (
+        _mean_rate(found)
+        for found in (
+            [gap.sr for gap in gaps],
+            [gap.accuracies.get(BACKBONE) for gap in gaps],
+            [gap.accuracies.get(ACTION) for gap in gaps],
+        )
+    )
+    defined = all(any(one.row.retention.defined for found in side for one in found) for side in rows)
+    ratio = _retention([gap for gap in gaps if gap.has_retention]) if defined else None
+    numbers: dict[str, float | Limits | None] = {}
+    for name, found in (("sr", sr), ("backbone", backbone), ("action", action), ("retention", ratio)):
+        if found is not None:
+            numbers |= {name: found.value, f"{name}_ci": limits(found.interval)}
+    return Difference(
+        sides[0].name,
+        sides[1].name,
+        categories[0],
+        view,
+        all(gap.paired for gap in gaps),
+        **numbers,  # type: ignore[arg-type]
+        sr_models=_models(rows, _sr_of_model),
+        retention_models=None if ratio is None else _models(rows, _retention_of_model),
+        p=p,
+    )
 
 
-def _value(estimate: Estimate | None) -> tuple[float | None, Limits | None]:
-    return (None, None) if estimate is None else (estimate.value, estimate.ci)
+def _mean_rate(found: Sequence[Rate | None]) -> Rate | None:
+    known = [rate for rate in found if rate is not None]
+    return Rate.mean([rate.value for rate in known], [rate.interval for rate in known]) if known else None
+
+
+def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
+    """The difference of the ratios of the sides' mean scores."""
+    pairs = [gap.pooled for gap in gaps if gap.pooled is not None]
+    if not pairs:
+        return None
+    here, there = (Scores.mean([pair[side].scores for pair in pairs]) for side in (0, 1))
+    between = np.sum([mine.covariance_with(theirs) for mine, theirs in pairs], axis=0) / len(pairs) ** 2
+    return retention_difference(here, there, between)
+
+
+# -- models as the unit --------------------------------------------------------------------------------------
+
+
+def _models(
+    sides: Sequence[Sequence[Sequence[RowWithEstimates]]],
+    value: Callable[[Sequence[RowWithEstimates]], float | None],
+) -> ModelTest | None:
+    """sides: per category, the row of each run. A value per run, over its categories."""
+    found = [
+        [value(of_run) for of_run in zip(*side, strict=True)] if len({len(one) for one in side}) == 1 else []
+        for side in sides
+    ]
+    known = [[one for one in side if one is not None] for side in found]
+    complete = all(len(some) == len(every) > 0 for some, every in zip(known, found, strict=True))
+    return ModelTest.of(*known) if complete else None
+
+
+def _sr_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
+    rates = [one.row.success.sr for one in rows if one.row.success.sr is not None]
+    return float(np.mean(rates)) if len(rates) == len(rows) else None
+
+
+def _retention_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
+    pooled = [_pooled([one]) for one in rows]
+    scores = [one.scores for one in pooled if one is not None and one.names == (ACTION, BACKBONE)]
+    return retention(Scores.mean(scores)).value if scores else None
 
 
 def _with_holm(rows: Sequence[Difference]) -> list[Difference]:

@@ -1,8 +1,9 @@
 """Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
 
-known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance, binding
-and untrained. used: the action follows. The unit is the item, right in both layouts: whoever always takes one side
-is right in exactly one, so that a habit never counts; a coin is right in both in one item of four.
+known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance,
+random-features and untrained. used: the action follows. The unit is the item, right in both layouts: whoever
+always takes one side is right in exactly one, so that a habit never counts; a coin is right in both in one item
+of four.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,6 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.estimators.cross_fit import random_halves
 from probe_kit.retention.estimators.retention import best_site
 from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import (
@@ -251,7 +251,7 @@ def encoded_decisions(curve: ProbeCurve, seed: int = 0) -> Bools:
         raise UsageError("no stream of the vision-language model was probed: there is nothing encoded to join")
     names, group_of = np.unique(curve.groups, return_inverse=True)
     generator = np.random.default_rng(derive_seed("encoded", seed))
-    half = random_halves(generator, np.arange(names.size), names.size, 1)[0][group_of]
+    half = np.where(generator.permutation(names.size) < names.size // 2, 1, -1)[group_of]
     correct = curve.correct[curve.stream(stream)]
     right = np.zeros(correct.shape[1], bool)
     for side in (1, -1):
@@ -267,7 +267,7 @@ def _signals(results: ProbeResults, view: str) -> dict[str, bool]:
         stream = curve.backbone_stream
         peak = None if stream is None or name != view else best_site(curve, stream)
         if peak is not None:
-            found[category] = has_signal(results.controls.beats(category, view, str(peak.site), peak.p_fwe))
+            found[category] = has_signal(results.controls.exceeds(category, view, str(peak.site), peak.p_fwe))
     return found
 
 

@@ -8,7 +8,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.differences import Difference, Side, pair_differences
-from probe_kit.retention.rows.build import RowWithDraws
+from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class PairedRuns:
 
 def compare_runs(
     runs: Sequence[RunReader],
-    drawn: Sequence[RowWithDraws],
+    drawn: Sequence[RowWithEstimates],
     labels: Mapping[str, str],
     against: str | None = None,
     vlm_vla: bool = False,

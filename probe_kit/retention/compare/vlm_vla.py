@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
-from probe_kit.retention.behaviour.success_rate import units_of
+from probe_kit.retention.behaviour.success_rate import success_share, units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.source_weights import Relation, grew_from
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits, average, sr_estimate
+from probe_kit.retention.estimators.stream_scores import Limits, Rate, limits
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import flip_p
@@ -80,7 +80,7 @@ def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> li
         gaps.append(gap)
     if not rows:
         return []
-    return [*rows, _mean(rows, average(gaps), reader, policy)]
+    return [*rows, _mean(rows, gaps, reader, policy)]
 
 
 def _compare(
@@ -89,11 +89,13 @@ def _compare(
     there: "pd.DataFrame",
     runs: tuple[RunReader, RunReader],
     called: Mapping[str, str],
-) -> tuple[VlmVlaDifference, Estimate]:
+) -> tuple[VlmVlaDifference, Rate]:
     reader, policy = runs
-    accuracy, sr = sr_estimate(here, reader.suite), sr_estimate(there, policy.suite)
-    gap = accuracy - sr
-    paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.units == sr.units
+    accuracy, sr = (
+        Rate.pooled([success_share(frame, run.suite)]) for frame, run in ((here, reader), (there, policy))
+    )
+    gap = accuracy.minus(sr)
+    paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.paired_with(sr)
     row = VlmVlaDifference(
         asked=called[str(reader.location)],
         acted=called[str(policy.location)],
@@ -104,7 +106,7 @@ def _compare(
         accuracy=accuracy.value,
         sr=sr.value,
         difference=gap.value,
-        difference_ci=gap.ci,
+        difference_ci=limits(gap.interval),
         p=_p(here, there) if paired else None,
     )
     return row, gap
@@ -125,8 +127,9 @@ def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
 
 
 def _mean(
-    rows: Sequence[VlmVlaDifference], gap: Estimate, reader: RunReader, policy: RunReader
+    rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate], reader: RunReader, policy: RunReader
 ) -> VlmVlaDifference:
+    gap = Rate.mean([one.value for one in gaps], [one.interval for one in gaps])
     categories = [row.category for row in rows]
     paired = all(row.paired for row in rows)
     kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (reader, policy)]
@@ -139,6 +142,6 @@ def _mean(
         accuracy=sum(row.accuracy for row in rows) / len(rows),
         sr=sum(row.sr for row in rows) / len(rows),
         difference=gap.value,
-        difference_ci=gap.ci,
+        difference_ci=limits(gap.interval),
         p=_p(*kept) if paired else None,
     )

@@ -38,6 +38,7 @@ from probe_kit.retention.estimators.by_call import (
     event_calls,
 )
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_results import ProbeResults
@@ -91,7 +92,7 @@ class CallCurveDisplay(Display):
         return cls(
             category=category,
             view=curves.view,
-            chance=curves.chance,
+            chance=CHANCE,
             lines=tuple(map(curves.line, curves.streams)),
             events=tuple(curves.event_times()),
             aligned={event: lines for event, lines in aligned.items() if lines},
@@ -169,8 +170,9 @@ def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
 def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> None:
     style = PARTS[line.part]
     accuracy = 100 * line.accuracy
-    arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
-    axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
+    if isinstance(line, CallLine):
+        arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
+        axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
     axes.plot(
         places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",
         label=label_of(line.stream),

@@ -177,9 +177,9 @@ class SideTableDisplay(HeatTableDisplay):
 class RetentionTableDisplay(HeatTableDisplay):
     """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
 
-    title = "Retention: bounded | published ratio"
+    title = "Retention | published ratio"
     note = "dash: no backbone signal, so the ratio has no meaning"
-    parts = ("bounded", "published")
+    parts = ("retention", "published")
     scale, digits = 1.0, 2
 
     @classmethod
@@ -187,7 +187,7 @@ class RetentionTableDisplay(HeatTableDisplay):
         """From a retention table with probes. Raises UsageError if no run was probed."""
 
         def cell(row: RetentionRow) -> Cell:
-            values = (row.retention.bounded, row.retention.published) if row.retention.defined else (None, None)
+            values = (row.retention.value, row.retention.published) if row.retention.defined else (None, None)
             return Cell(values)
 
         return cls._of([row for row in table.all_rows if row.view is not None], cell)

@@ -15,6 +15,7 @@ from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, 
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class IterationMapDisplay(Display):
             view=view,
             stream=str(stream),
             part=str(scores["part"].iloc[0]),
-            chance=curve.chance,
+            chance=CHANCE,
             layers=grid["accuracy"].columns.to_numpy(dtype=np.int64),
             iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),

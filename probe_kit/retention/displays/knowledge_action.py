@@ -109,7 +109,7 @@ class KnowledgeActionDisplay(Display):
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
     prefix = stream == "backbone"
-    accuracy = row.backbone.accuracy if prefix else row.action.accuracy
+    accuracy = row.backbone.score if prefix else row.action.score
     if accuracy is None or row.success.sr is None or row.success.ci is None:
         return None
     return GapPoint(
@@ -176,7 +176,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     acted = [row for row in source.table.rows if row.success.sr is not None]
     modes = modes_of(acted)
-    if any(row.backbone.accuracy is not None for row in acted):
+    if any(row.backbone.score is not None for row in acted):
         answers = modes == "answers"
         yield ReportFigure(
             "knowledge-action", f"Knowledge and {'answers' if answers else 'action'}", "retention",

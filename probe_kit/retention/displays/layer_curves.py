@@ -34,6 +34,7 @@ from probe_kit.retention.displays.base.style import (
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -52,9 +53,9 @@ _PEAK = "best of its stream (all, where several tie)"
 class LayerCurveDisplay(Display):
     """Held-out accuracy by layer, for one category in one view.
 
-    Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above binding
-    and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the accuracies under
-    relabelling; None below 20 relabellings.
+    Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above
+    random-features and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the
+    accuracies under relabelling; None below 20 relabellings.
     """
 
     category: str
@@ -82,7 +83,7 @@ class LayerCurveDisplay(Display):
         return cls(
             category=category,
             view=view,
-            chance=curve.chance,
+            chance=CHANCE,
             null_band=None if band is None else (float(band[0]), float(band[1])),
             streams=tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False)),
             certificate=ProvenanceLine.of_results(results, view),
@@ -122,11 +123,11 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
     """Held-out accuracy by layer for every category, as a matplotlib figure (`figure.savefig(…)`).
 
     Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
-    for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only where
-    there are several lines. Filled markers are above chance against the best site of their stream (family-wise p <
-    0.05), and above binding and untrained where those were run. Grey: chance, and the band that holds 95 % of the
-    accuracies under relabelling. view: the first probed one by default. Raises UnknownSiteError for a view that
-    was not probed, UsageError for an iteration.
+    for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only
+    where there are several lines. Filled markers are above chance against the best site of their stream
+    (family-wise p < 0.05), and above random-features and untrained where those were run. Grey: chance, and the
+    band that holds 95 % of the accuracies under relabelling. view: the first probed one by default. Raises
+    UnknownSiteError for a view that was not probed, UsageError for an iteration.
     """
     view, names = known_view(results, view), results.settings.categories
     displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]

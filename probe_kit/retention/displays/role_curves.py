@@ -26,6 +26,7 @@ from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import StreamCurve
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class RoleCurvesDisplay(Display):
         return cls(
             category=category,
             stream=stream,
-            chance=curve_of(results, category, shown).chance,
+            chance=CHANCE,
             curves=found,
             certificate=ProvenanceLine.of_results(results, shown),
         )

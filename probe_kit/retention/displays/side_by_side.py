@@ -33,6 +33,7 @@ from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -67,8 +68,7 @@ def curves_side_by_side(
     for (category, part), axes in zip(panels_of, grid, strict=True):
         found = [(at, _curve(one, category, view, part, iterations)) for at, one in known]
         curves = [(at, curve) for at, curve in found if curve is not None]
-        chances = [one.curves[category, view].chance for _, one in known if (category, view) in one.curves]
-        _draw_panel(axes, curves, names, chances)
+        _draw_panel(axes, curves, names)
         axes.set_title(f"{spell(category)}: {PARTS[part]}", fontsize=9, loc="left")
     handles: dict[str, Artist] = {}
     for axes in grid:
@@ -95,12 +95,9 @@ def _curve(
     return StreamCurve.of(own, "best" if iterations == "all" else iterations)
 
 
-def _draw_panel(
-    axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: Sequence[str], chances: Sequence[float]
-) -> None:
+def _draw_panel(axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: Sequence[str]) -> None:
     """curves: with the position of their run, which decides the line's looks whatever else is shown."""
-    for chance in sorted({round(100 * chance, 6) for chance in chances}):
-        axes.axhline(chance, color="0.45", lw=1, ls="--", label="chance")
+    axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
     depths = {int(curve.layers.max()) for _, curve in curves}
     for place, (at, curve) in enumerate(curves):
         line = _at_depths(curve.lines[0], curve) if len(depths) > 1 else curve.lines[0]

@@ -16,9 +16,10 @@ from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
-from probe_kit.retention.displays.base.selection import curve_of, scores_of
+from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.retention.text import spell
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
@@ -81,7 +82,7 @@ class SiteEffectDisplay(Panelled):
         read = [row for row in rows if _stream(row) == KV_STREAM]
         return cls(
             category=category,
-            chance=curve_of(results, category, view).chance,
+            chance=CHANCE,
             readable=Points(
                 scores["layer"].to_numpy(int), 100 * scores["accuracy"].to_numpy(float),
                 (scores["p_fwe"] < SIGNIFICANCE).to_numpy(bool),

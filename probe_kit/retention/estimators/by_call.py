@@ -1,6 +1,6 @@
 """What can be read at each captured inference of an episode, counted from its beginning or from an event."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.scoring.events import EVENTS, Events
-from probe_kit.errors import UsageError
+from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.retention.estimators.retention import best_site
-from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.retention.estimators.stream_scores import score_streams
 from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
@@ -25,7 +25,8 @@ _ENOUGH = 20  # relabellings, fewer than which have no 95 % point
 class CallLine:
     """Held-out accuracy of a stream's best site by captured inference; arrays (C,), accuracies as shares.
 
-    low, high: 95 % interval over groups, the site held fixed. significant: above chance against all sites of the
+    accuracy: of a site chosen on half of the groups of items and scored on the other half; low, high: its 95 %
+    interval, NaN with too few groups. significant: above chance against all sites of the
     stream, and above the controls that were run. null: what the best site of relabelled data stays below in 95 %,
     NaN with few relabellings. episodes: how many got that far. part: of the model, see `Stream.part`.
     """
@@ -44,15 +45,14 @@ class CallLine:
 @dataclass(frozen=True)
 class AlignedLine:
     """The same counted from an event of each episode: 0 is the last inference before the action that brought it
-    about. Sites are those that are best at their call; (O,) offsets with at least `FEWEST` episodes.
+    about. Sites are those that are best at their call, so that an accuracy is too high by the luck of that choice
+    and has no interval; (O,) offsets with at least `FEWEST` episodes.
     """
 
     stream: str
     part: str
     offsets: NDArray[np.int64]
     accuracy: Shares
-    low: Shares
-    high: Shares
     episodes: NDArray[np.int64]
 
 
@@ -101,11 +101,6 @@ class CallCurves:
         return cls(results, category, view, events or {})
 
     @property
-    def chance(self) -> float:
-        """Of the first call."""
-        return self._curves[next(iter(self._curves))].chance
-
-    @property
     def streams(self) -> tuple[str, ...]:
         """Those that were probed at every call, in order."""
         curves = list(self._curves.values())
@@ -121,23 +116,20 @@ class CallCurves:
 
     def aligned(self, stream: str, event: str) -> AlignedLine | None:
         """The stream's best sites counted from an event; None where too few episodes have it."""
-        pools: dict[int, list[tuple[str, bool]]] = {}
+        pools: dict[int, list[bool]] = {}
         for call, curve in self._curves.items():
             right = curve.correct[curve.best(stream)]
-            for episode, group, hit in zip(curve.episodes, curve.groups, right, strict=True):
+            for episode, hit in zip(curve.episodes, right, strict=True):
                 due = self.events.get(event, {}).get(str(episode))
                 if due is not None:
-                    pools.setdefault(call - due, []).append((str(group), bool(hit)))
+                    pools.setdefault(call - due, []).append(bool(hit))
         kept = {offset: pools[offset] for offset in sorted(pools) if len(pools[offset]) >= FEWEST}
         if not kept:
             return None
-        found = [
-            self._interval(np.array([hit for _, hit in pool]), [g for g, _ in pool]) for pool in kept.values()
-        ]
-        accuracy, low, high = map(np.array, zip(*found, strict=True))
+        accuracy = np.array([np.mean(pool) for pool in kept.values()])
         sizes = np.array([len(pool) for pool in kept.values()], np.int64)
         offsets = np.array(list(kept), np.int64)
-        return AlignedLine(stream, self._part(stream), offsets, accuracy, low, high, sizes)
+        return AlignedLine(stream, self._part(stream), offsets, accuracy, sizes)
 
     def event_times(self) -> list[EventTimes]:
         """When the events of this category's episodes fell due; those that no episode has are left out."""
@@ -158,22 +150,25 @@ class CallCurves:
         curve = next(iter(self._curves.values()))
         return curve.parts[int(curve.stream(stream)[0])]
 
-    def _interval(self, right: NDArray[np.bool_], groups: Sequence[Any]) -> tuple[float, float, float]:
+    def _accuracy(self, curve: ProbeCurve, stream: str) -> tuple[float, float, float]:
         suite = next(iter(self.results.values())).settings.suite
-        names = np.asarray(groups, dtype=str)
-        low, high = group_bootstrap(right[:, None], names, units_seed(names, suite))
-        return float(right.mean()), float(low[0]), float(high[0])
+        try:
+            found = score_streams(curve, {stream: curve.stream(stream)}, suite)
+        except TooFewGroupsError:
+            return float(curve.sums.only(curve.stream(stream)).accuracies.max()), np.nan, np.nan
+        assert found is not None, "one stream was given"
+        interval = found.interval(stream)
+        return found.accuracy(stream), interval.low, interval.high
 
     def _point(self, call: int, curve: ProbeCurve, stream: str) -> tuple[float, float, float, bool, float, int]:
         peak = best_site(curve, stream)
         assert peak is not None, "the stream was probed at every call"
-        row = curve.sites.index(peak.site)
-        beats = self.results[call].controls.beats(self.category, self.view, str(peak.site), peak.p_fwe)
+        exceeds = self.results[call].controls.exceeds(self.category, self.view, str(peak.site), peak.p_fwe)
         best_null = curve.null[curve.stream(stream)]
         null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= _ENOUGH else np.nan
         return (
-            *self._interval(curve.correct[row], list(curve.groups)),
-            has_signal(beats),
+            *self._accuracy(curve, stream),
+            has_signal(exceeds),
             float(null),
             curve.labels.size,
         )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from probe_kit.retention.columns.text import model_name, once_per_category
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.rows.parts import RetentionScores
+from probe_kit.retention.rows.parts import RetentionPart
 from probe_kit.retention.rows.row import RetentionRow
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
             for row in rows
             if row.view is not None
             for stream in ("backbone", "action")
-            if getattr(row, stream).accuracy is not None
+            if getattr(row, stream).peak is not None
         ]
     )
 
@@ -72,7 +72,7 @@ def _defined(row: Any) -> Any:
     """The row without numbers of retention where it is not defined."""
     if not isinstance(row, RetentionRow) or row.retention.defined:
         return row
-    return replace(row, retention=RetentionScores(note=row.retention.note))
+    return replace(row, retention=RetentionPart(note=row.retention.note))
 
 
 def _flat(part: Any, before: str = "") -> _Flat:

@@ -9,7 +9,7 @@ from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.lines import TableRow
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of, views_of
-from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, is_vlm, model_name, percent
+from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, is_vlm, model_name
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -159,8 +159,6 @@ def _sizes(rows: Sequence[RetentionRow]) -> str:
         parts.append(f"{_span(groups)} groups")
     if calls := sorted({row.run.call for row in single if row.run.call is not None}):
         parts.append("; ".join(map(call_words, calls)))
-    if chances := {percent(row.controls.chance) for row in single if row.controls.chance is not None}:
-        parts.append(f"chance {' or '.join(sorted(chances))} %")
     return ", ".join(parts)
 
 

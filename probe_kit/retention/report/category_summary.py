@@ -141,7 +141,7 @@ def policy_summaries(rows: Sequence[RetentionRow]) -> list[PolicySummary]:
             row.run.mode == "acts"
             and row.category != MEAN
             and not row.run.capture_only
-            and row.backbone.accuracy is not None
+            and row.backbone.score is not None
         ):
             acted.setdefault(row.run.location, []).append(row)
     return [_story([row for row in own if row.view == own[0].view], asked) for own in acted.values()]
@@ -168,7 +168,7 @@ def _chapter(row: RetentionRow, asked: RetentionRow | None) -> CategorySummary:
         reader_above_chance=None if asked is None else verdict(asked) == "known",
         reader_sr=None if asked is None else asked.success.sr,
         encoded=row.backbone.has_signal,
-        backbone=row.backbone.accuracy,
+        backbone=row.backbone.score,
         verdict=verdict(row),
         sr=row.success.sr,
     )

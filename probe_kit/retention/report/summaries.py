@@ -9,7 +9,7 @@ from probe_kit.retention.columns.text import NOT_ACTED, is_vlm, model_name, perc
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.results.control_scores import Beats
+from probe_kit.train.results.control_scores import Exceeds
 
 _MOSTLY = 0.5  # share of episodes above which something is said first
 
@@ -58,35 +58,31 @@ def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headlin
         if mean.run.capture_only
         else rate
     ]
-    if mean.backbone.accuracy is not None:
-        found.append(
-            Headline(f"{percent(mean.backbone.accuracy)} %", "backbone", "best probe, mean of categories")
-        )
-    if mean.action.accuracy is not None:
-        found.append(
-            Headline(f"{percent(mean.action.accuracy)} %", mean.run.action_name, "best probe, mean of categories")
-        )
-    if mean.backbone.accuracy is not None and mean.action.accuracy is not None:
+    if mean.backbone.score is not None:
+        found.append(Headline(f"{percent(mean.backbone.score)} %", "backbone", "mean of categories"))
+    if mean.action.score is not None:
+        found.append(Headline(f"{percent(mean.action.score)} %", mean.run.action_name, "mean of categories"))
+    if mean.backbone.score is not None and mean.action.score is not None:
         found.append(_retention_headline(mean, rows))
     return found
 
 
 def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
-    if not mean.retention.defined or mean.retention.bounded is None:
+    if not mean.retention.defined or mean.retention.value is None:
         return Headline("n/a", "retention", _why_not(rows))
-    return Headline(f"{mean.retention.bounded:.2f}", "retention, bounded", _interval_words(mean))
+    return Headline(f"{mean.retention.value:.2f}", "retention", _interval_words(mean))
 
 
 def _interval_words(row: RetentionRow) -> str:
-    if row.retention.bounded_ci is None:
+    if row.retention.ci is None:
         return "no interval"
-    low, high = row.retention.bounded_ci
-    return "interval unbounded" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
+    low, high = row.retention.ci
+    return "no limits" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
 
 
 def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = [_behaviour(mean, rows)]
-    if any(row.backbone.accuracy is not None for row in rows):
+    if any(row.backbone.score is not None for row in rows):
         found.append(_knowledge(rows))
     if any(row.retention.published is not None for row in rows):
         found.append(_retention(mean, rows))
@@ -117,7 +113,7 @@ def _knowledge(rows: Sequence[RetentionRow]) -> str:
     backbone = [row for row in rows if row.backbone.has_signal]
     expert = [row for row in rows if row.action.has_signal]
     text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
-    if any(row.action.accuracy is not None for row in rows):
+    if any(row.action.score is not None for row in rows):
         text += f", and in the {rows[0].run.action_name} in {_of(expert, rows)}"
     return f"{text}."
 
@@ -126,7 +122,7 @@ def _judge(rows: Sequence[RetentionRow]) -> str:
     """What had to be beaten."""
     names = [
         name
-        for name in ("binding", "untrained")
+        for name in ("random-features", "untrained")
         if any(row.backbone.exceeds.get(name) is not None for row in rows)
     ]
     *first, last = ["chance", *names]
@@ -135,11 +131,11 @@ def _judge(rows: Sequence[RetentionRow]) -> str:
 
 def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
     counted = [row for row in rows if row.retention.defined]
-    if not counted or mean.retention.bounded is None:
+    if not counted or mean.retention.value is None:
         return f"Retention is not defined: {_why_not(rows)}."
     left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
     return (
-        f"Of what can be read in the backbone above chance, a share of {mean.retention.bounded:.2f} can still be "
+        f"Of what can be read in the backbone above chance, a share of {mean.retention.value:.2f} can still be "
         f"read in the {mean.run.action_name} ({_interval_words(mean)}), "
         f"over {_of(counted, rows, names=False)}{left}."
     )
@@ -214,20 +210,20 @@ def read_row(row: RetentionRow) -> list[str]:
     if (paired := row.success.paired) is not None:
         items = paired.both + paired.one + paired.none
         found.append(f"{paired.both} of {items} questions right in both layouts.")
-    if row.backbone.accuracy is not None:
+    if row.backbone.score is not None:
         found.append(
-            f"In the backbone a probe is right in {percent(row.backbone.accuracy)} % at best, at depth "
+            f"In the backbone a probe is right in {percent(row.backbone.score)} %, best at depth "
             f"{row.backbone.depth:.2f}{_ties_words(row.backbone.ties)}: "
             f"{_clear_words(row.backbone.p_fwe, row.backbone.exceeds)}."
         )
-    if row.action.accuracy is not None:
+    if row.action.score is not None:
         step = "" if row.action.iteration is None else f", iteration {row.action.iteration}"
         found.append(
-            f"In the {row.run.action_name} {percent(row.action.accuracy)} %, at depth {row.action.depth:.2f}{step}"
-            f"{_ties_words(row.action.ties)}: {_clear_words(row.action.p_fwe, row.action.exceeds)}."
+            f"In the {row.run.action_name} {percent(row.action.score)} %, best at depth {row.action.depth:.2f}"
+            f"{step}{_ties_words(row.action.ties)}: {_clear_words(row.action.p_fwe, row.action.exceeds)}."
         )
-    if row.retention.defined and row.retention.bounded is not None:
-        found.append(f"Bounded retention {row.retention.bounded:.2f} ({_interval_words(row)}).")
+    if row.retention.defined and row.retention.value is not None:
+        found.append(f"Retention {row.retention.value:.2f} ({_interval_words(row)}).")
     return found
 
 
@@ -235,11 +231,14 @@ def _ties_words(ties: int | None) -> str:
     return f" and at {ties} other site{'s' * (ties > 1)} as well" if ties else ""
 
 
-def _clear_words(p: float | None, beats: Beats) -> str:
+def _clear_words(p: float | None, exceeds: Exceeds) -> str:
     if p is None:
         return "not tested, for lack of relabellings"
-    controls = {"binding": "an untrained conjunction of pictures and words", "untrained": "the untrained network"}
-    equals = [words for name, words in controls.items() if beats.get(name) is False]
+    controls = {
+        "random-features": "an untrained conjunction of pictures and words",
+        "untrained": "the untrained network",
+    }
+    equals = [words for name, words in controls.items() if exceeds.get(name) is False]
     clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
     return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
@@ -15,33 +15,33 @@ from probe_kit.retention.behaviour.success_rate import (
     capture_only,
     sensitivity,
     success_rate,
-    units_of,
+    success_share,
 )
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.estimators.bootstrap_draws import (
-    UNBOUNDED,
-    Estimate,
-    Estimates,
-    Limits,
-    probe_estimates,
-    sr_estimate,
+from probe_kit.retention.estimators.retention import (
+    Iterations,
+    Peak,
+    best_site,
+    curve_scores,
+    missing_signal,
+    published_ratio,
 )
-from probe_kit.retention.estimators.retention import Iterations, Peak, Retention, best_site, measure_retention
+from probe_kit.retention.estimators.stream_scores import RowEstimates, StreamScores, limits
 from probe_kit.retention.rows.interventions import add_image_swap
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
 from probe_kit.retention.rows.parts import (
-    ActionPeak,
+    ActionPart,
     AnswerStats,
-    BackbonePeak,
+    BackbonePart,
     ControlScores,
-    RetentionScores,
+    RetentionPart,
     RunInfo,
 )
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.statistics.bootstrap import units_seed
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.estimates.retention import retention
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import Controls, UntrainedScore
+from probe_kit.train.results.control_scores import Controls, UntrainedScore, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RowWithDraws:
+class RowWithEstimates:
     """A row and the estimates behind its numbers. outcomes: the episodes of its success rate, if it has one."""
 
     row: RetentionRow
-    estimates: Estimates
+    estimates: RowEstimates
     outcomes: "pd.DataFrame | None" = None
 
 
@@ -62,21 +62,21 @@ class RowWithDraws:
 class RowSettings:
     """What a table is asked to show.
 
-    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. seed: of the splits.
-    rule, last_steps: see `probe_kit.env.scoring.rules.judge`.
+    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. rule, last_steps: see
+    `probe_kit.env.scoring.rules.judge`. absent_below: accuracy below which a stream's best site counts as absent.
     """
 
     views: Sequence[str] | None
     iterations: Iterations
     epsilons: Sequence[float]
-    seed: int
     rule: str = DEFAULT_RULE
     last_steps: int = 1
+    absent_below: float = ABSENT_BELOW
 
 
 def run_rows(
     run: RunReader, results: ProbeResults | None, settings: RowSettings, group: str | None = None
-) -> list[RowWithDraws]:
+) -> list[RowWithEstimates]:
     """One row per category and view of `run`, in the order of its episodes; without `results`, success rates only.
 
     Raises UnknownSiteError for a view that was not probed.
@@ -103,17 +103,17 @@ def _row(
     category: str,
     episodes: "pd.DataFrame",
     view: str | None,
-) -> RowWithDraws:
+) -> RowWithEstimates:
     run, heard = judged.run, capture_only(episodes)
     scored = judged.scored and not heard
-    success = _success(run, episodes) if scored else _no_success(episodes, heard)
+    success = success_rate(episodes) if scored else _no_success(episodes, heard)
     rules = OutcomeRuleScores(rule=judged.rule, rule_words=judged.words)
-    estimates: dict[str, Estimate] = {}
+    estimates = RowEstimates()
     if scored:
         radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
         by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
         rules = replace(judged.part(episodes), sr_by_epsilon=by_radius)
-        estimates = {"sr": sr_estimate(episodes, run.suite), **judged.estimates(episodes)}
+        estimates = RowEstimates({"sr": success_share(episodes, run.suite), **judged.shares(episodes)})
     row = RetentionRow(
         category=category,
         view=view,
@@ -124,30 +124,30 @@ def _row(
         answers=_answers(run, episodes),
     )
     if results is not None and view is not None:
-        row, more = _with_probes(row, run, results, settings)
-        estimates |= more
-    return RowWithDraws(row, estimates, episodes if scored else None)
+        row, streams = _with_probes(row, run, results, settings)
+        estimates = replace(estimates, streams=streams)
+    return RowWithEstimates(row, estimates, episodes if scored else None)
 
 
 def _with_probes(
     row: RetentionRow, run: RunReader, results: ProbeResults, settings: RowSettings
-) -> tuple[RetentionRow, dict[str, Estimate]]:
-    """The row with the parts of its category's probes, and their estimates."""
+) -> tuple[RetentionRow, StreamScores | None]:
+    """The row with the parts of its category's probes, and their scores."""
     curve = None if row.view is None else results.curves.get((row.category, row.view))
     if row.view is None or curve is None:
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
-        return replace(row, retention=RetentionScores(note=note)), {}
-    probed = _ProbePeaks(results.controls, row.category, row.view, curve, _peaks(curve, settings.iterations))
-    retention = measure_retention(curve, settings.iterations, settings.seed, probed.beats.get("backbone"))
-    estimates = probe_estimates(curve, probed.peaks, retention, run.suite)
+        return replace(row, retention=RetentionPart(note=note)), None
+    streams = curve_scores(curve, settings.iterations, run.suite)
+    peaks = _peaks(curve, settings.iterations)
+    probed = _ProbedCategory(results.controls, row.category, row.view, curve, peaks, streams, settings)
     row = replace(
         row,
-        backbone=probed.backbone(estimates),
-        action=probed.action(estimates),
-        retention=_retention_scores(retention),
+        backbone=probed.backbone(),
+        action=probed.action(),
+        retention=probed.retention(),
         controls=probed.controls_of(row.success),
     )
-    return row, dict(estimates)
+    return row, streams
 
 
 def _run_info(run: RunReader, results: ProbeResults | None, heard: bool) -> RunInfo:
@@ -189,10 +189,6 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     )
 
 
-def _success(run: RunReader, episodes: "pd.DataFrame") -> SuccessRate:
-    return success_rate(episodes, units_seed(units_of(episodes), run.suite))
-
-
 def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     """Of a model that did not act, or whose run keeps nothing to judge by."""
     reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
@@ -207,78 +203,91 @@ def _peaks(curve: ProbeCurve, iterations: Iterations) -> dict[str, Peak]:
 
 
 @dataclass(frozen=True)
-class _ProbePeaks:
-    """The probes of one category in one view, and their best sites, `backbone` and `action`."""
+class _ProbedCategory:
+    """The probes of one category in one view: their best sites, `backbone` and `action`, and their scores."""
 
-    controls: Controls
+    controls_run: Controls
     category: str
     view: str
     curve: ProbeCurve
     peaks: dict[str, Peak]
+    streams: StreamScores | None
+    settings: RowSettings
 
-    @property
-    def beats(self) -> dict[str, dict[str, bool | None]]:
-        """Per best site, which controls it is better than."""
-        return {
-            name: self.controls.beats(self.category, self.view, str(peak.site), peak.p_fwe)
-            for name, peak in self.peaks.items()
-        }
+    def exceeds(self, peak: Peak) -> dict[str, bool | None]:
+        """Which controls a best site is better than."""
+        return self.controls_run.exceeds(self.category, self.view, str(peak.site), peak.p_fwe)
 
-    def backbone(self, estimates: Estimates) -> BackbonePeak:
+    def backbone(self) -> BackbonePart:
         """Of the backbone's best site."""
-        peak, untrained = self.peaks.get("backbone"), self._untrained("backbone")
+        peak = self.peaks.get("backbone")
+        return BackbonePart() if peak is None else BackbonePart(**self._part("backbone", peak))
+
+    def action(self) -> ActionPart:
+        """Of the best site where the action is made."""
+        peak = self.peaks.get("action")
         if peak is None:
-            return BackbonePeak()
-        return BackbonePeak(
-            accuracy=peak.accuracy,
-            ci=estimates["backbone_accuracy"].ci,
-            layer=peak.site.layer,
-            depth=self.curve.depth(peak.site),
-            p_fwe=_number(peak.p_fwe),
-            selectivity=self._selectivity(peak),
-            exceeds=self.beats["backbone"],
-            minus_untrained=None if untrained is None else untrained.difference,
-            minus_untrained_ci=None if untrained is None else untrained.ci,
-            ties=peak.ties,
+            return ActionPart()
+        first = self._first_iteration(peak)
+        return ActionPart(
+            iteration=peak.site.iteration,
+            first_peak=None if first is None else first.accuracy,
+            first_layer=None if first is None else first.site.layer,
+            **self._part("action", peak),
         )
 
-    def action(self, estimates: Estimates) -> ActionPeak:
-        """Of the best site where the action is made."""
-        peak, untrained = self.peaks.get("action"), self._untrained(self.curve.action_stream)
-        if peak is None:
-            return ActionPeak()
-        first = self._first_iteration(peak)
-        return ActionPeak(
-            accuracy=peak.accuracy,
-            ci=estimates["action_accuracy"].ci,
-            layer=peak.site.layer,
-            depth=self.curve.depth(peak.site),
-            iteration=peak.site.iteration,
-            p_fwe=_number(peak.p_fwe),
-            selectivity=self._selectivity(peak),
-            exceeds=self.beats["action"],
-            minus_untrained=None if untrained is None else untrained.difference,
-            minus_untrained_ci=None if untrained is None else untrained.ci,
-            first_accuracy=None if first is None else first.accuracy,
-            first_layer=None if first is None else first.site.layer,
-            ties=peak.ties,
+    def _part(self, name: str, peak: Peak) -> dict[str, Any]:
+        untrained, scored = self._untrained(peak.site.stream), self.streams
+        exceeds = self.exceeds(peak)
+        most = None if scored is None else scored.at_most[name]
+        return {
+            "score": None if scored is None else scored.accuracy(name),
+            "ci": None if scored is None else limits(scored.interval(name)),
+            "peak": peak.accuracy if scored is None else scored.peak(name),
+            "at_most": most,
+            "verdict": None if most is None else verdict(has_signal(exceeds), most, self.settings.absent_below),
+            "site": str(peak.site),
+            "layer": peak.site.layer,
+            "depth": self.curve.depth(peak.site),
+            "ties": peak.ties,
+            "p_fwe": _number(peak.p_fwe),
+            "exceeds": exceeds,
+            "selectivity": self._selectivity(peak),
+            "minus_untrained": None if untrained is None else untrained.difference,
+            "minus_untrained_ci": None if untrained is None else untrained.ci,
+        }
+
+    def retention(self) -> RetentionPart:
+        """Of both streams."""
+        if len(self.peaks) < 2:
+            return RetentionPart(note="n/a (one stream only)")
+        if self.streams is None:
+            return RetentionPart(note="n/a (too few groups of items)")
+        found, exceeds = retention(self.streams.scores), self.exceeds(self.peaks["backbone"])
+        return RetentionPart(
+            value=_number(found.value),
+            ci=limits(found.interval),
+            published=_number(published_ratio(self.streams)),
+            defined=has_signal(exceeds),
+            note=missing_signal(exceeds, self.streams.at_most),
         )
 
     def controls_of(self, success: SuccessRate) -> ControlScores:
         """What the best sites are compared with."""
-        baselines, peak = self.controls.of_category(self.category), self.peaks.get("backbone")
-        untrained = [self._untrained(stream) for stream in ("backbone", self.curve.action_stream)]
+        baselines = self.controls_run.of_category(self.category)
+        untrained = [self._untrained(peak.site.stream) for peak in self.peaks.values()]
+        score = None if self.streams is None or "backbone" not in self.peaks else self.streams.accuracy("backbone")
         return ControlScores(
             n_groups=self.curve.n_groups,
-            chance=self.curve.chance,
-            probe_minus_sr=None if peak is None or success.sr is None else peak.accuracy - success.sr,
+            missing=missing_episodes(self.curve),
+            probe_minus_sr=None if score is None or success.sr is None else score - success.sr,
             baselines={name: score.accuracy for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
-            untrained=next((untrained.untrained for untrained in untrained if untrained is not None), None),
+            untrained=next((one.untrained for one in untrained if one is not None), None),
         )
 
-    def _untrained(self, stream: str | None) -> UntrainedScore | None:
-        return None if stream is None else self.controls.untrained_peak(self.category, self.view, stream)
+    def _untrained(self, stream: str) -> UntrainedScore | None:
+        return self.controls_run.untrained_peak(self.category, self.view, stream)
 
     def _selectivity(self, peak: Peak) -> float | None:
         return _number(peak.accuracy - float(self.curve.control_accuracy[self.curve.sites.index(peak.site)]))
@@ -290,24 +299,11 @@ class _ProbePeaks:
         return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
 
 
-def _retention_scores(retention: Retention | None) -> RetentionScores:
-    if retention is None:
-        return RetentionScores(note="n/a (one stream only)")
-    return RetentionScores(
-        published=_number(retention.plain),
-        defined=retention.defined,
-        note=retention.note,
-        debiased=_number(retention.debiased),
-        ci=_limits(retention.interval),
-        bounded=_number(retention.bounded),
-        bounded_ci=_limits(retention.bounded_interval),
-        area=_number(retention.area),
-        area_ci=_limits(retention.area_interval),
-    )
-
-
-def _limits(interval: Interval) -> Limits:
-    return (interval.low, interval.high) if interval.bounded else UNBOUNDED
+def missing_episodes(curve: ProbeCurve) -> dict[str, float]:
+    """By side, the share of items that lack their episode of that side."""
+    items = len(set(curve.items.tolist()))
+    sides = {"left": curve.labels, "right": ~curve.labels}
+    return {side: 1 - len(set(curve.items[chosen].tolist())) / items for side, chosen in sides.items()}
 
 
 def _number(value: float) -> float | None:

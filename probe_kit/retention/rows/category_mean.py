@@ -7,22 +7,25 @@ from statistics import fmean
 from typing import Any
 
 from probe_kit.retention.behaviour.success_rate import SuccessRate, normalised_score
-from probe_kit.retention.estimators.bootstrap_draws import UNBOUNDED, Estimates, Limits, average
-from probe_kit.retention.rows.build import RowWithDraws
+from probe_kit.retention.estimators.stream_scores import Limits, Rate, RowEstimates, StreamScores, limits
+from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
-from probe_kit.retention.rows.parts import ActionPeak, BackbonePeak, ControlScores, RetentionScores, SwapEffect
+from probe_kit.retention.rows.parts import ActionPart, BackbonePart, ControlScores, RetentionPart, SwapEffect
 from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.statistics.estimates.retention import retention
+from probe_kit.statistics.estimates.scores import Scores
 
 
-def mean_row(drawn: Sequence[RowWithDraws], averaged: Sequence[str]) -> RetentionRow:
-    """The category average of rows of one run and view; retention over the categories where it is defined.
+def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
+    """The category average of rows of one run and view; retention is the ratio of the mean scores.
 
     averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
-    them, see `probe_kit.retention.columns.columns`. Intervals: items, or groups for probes, drawn within each
-    category.
+    them, see `probe_kit.retention.columns.columns`. Intervals: of independent
+    categories, see `probe_kit.statistics.estimates`.
     """
     rows = [one.row for one in drawn]
-    estimates = average_estimates([one.estimates for one in drawn])
+    estimates = [one.estimates for one in drawn]
+    probed = _probed(estimates)
     first = rows[0]
     means = _means(rows, averaged)
     return RetentionRow(
@@ -35,11 +38,12 @@ def mean_row(drawn: Sequence[RowWithDraws], averaged: Sequence[str]) -> Retentio
         success=_success(rows, estimates, means["success"]),
         rules=_rules(rows, estimates, means["rules"]),
         answers=replace(first.answers, **means["answers"]),
-        backbone=BackbonePeak(ci=_limits(estimates, "backbone_accuracy"), **means["backbone"]),
-        action=ActionPeak(ci=_limits(estimates, "action_accuracy"), **means["action"]),
-        retention=_retention(rows, estimates),
+        backbone=BackbonePart(ci=_accuracy_limits(probed, "backbone"), **means["backbone"]),
+        action=ActionPart(ci=_accuracy_limits(probed, "action"), **means["action"]),
+        retention=_retention(rows, probed),
         controls=ControlScores(
             baselines=_mean_by_key([row.controls.baselines for row in rows]),
+            missing=_mean_by_key([row.controls.missing for row in rows]),
             leaks=tuple(dict.fromkeys(name for row in rows for name in row.controls.leaks)),
             untrained=first.controls.untrained,
             **means["controls"],
@@ -48,10 +52,19 @@ def mean_row(drawn: Sequence[RowWithDraws], averaged: Sequence[str]) -> Retentio
     )
 
 
-def average_estimates(estimates: Sequence[Estimates]) -> Estimates:
-    """Every quantity averaged over those that have it."""
-    names = dict.fromkeys(name for found in estimates for name in found)
-    return {name: average([found[name] for found in estimates if name in found]) for name in names}
+def _probed(estimates: Sequence[RowEstimates]) -> list[StreamScores]:
+    """Scores of the probed categories; none where they are of different streams."""
+    found = [one.streams for one in estimates if one.streams is not None]
+    return found if len({streams.names for streams in found}) == 1 else []
+
+
+def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None:
+    if not probed or name not in probed[0].names:
+        return None
+    if len(probed) == 1:
+        return limits(probed[0].interval(name))
+    mean = Scores.mean([streams.scores for streams in probed])
+    return limits(mean.accuracy_interval(probed[0].names.index(name)))
 
 
 _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
@@ -66,18 +79,22 @@ def _means(rows: Sequence[RetentionRow], averaged: Sequence[str]) -> dict[str, d
     return means
 
 
-def _success(rows: Sequence[RetentionRow], estimates: Estimates, means: dict[str, Any]) -> SuccessRate:
+def _success(
+    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+) -> SuccessRate:
     rates = [row.success.sr for row in rows if row.success.sr is not None]
     return SuccessRate(
         n_episodes=sum(row.success.n_episodes for row in rows),
         n_items=sum(row.success.n_items for row in rows),
-        ci=_limits(estimates, "sr"),
+        ci=_rate_limits(estimates, "sr"),
         normalised_score=normalised_score(rates) if len(rates) == len(rows) else None,
         **means,
     )
 
 
-def _rules(rows: Sequence[RetentionRow], estimates: Estimates, means: dict[str, Any]) -> OutcomeRuleScores:
+def _rules(
+    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+) -> OutcomeRuleScores:
     found = [row.rules for row in rows]
     sides = {one.idle_side for one in found}
     return OutcomeRuleScores(
@@ -86,8 +103,8 @@ def _rules(rows: Sequence[RetentionRow], estimates: Estimates, means: dict[str, 
         last_steps=found[0].last_steps,
         n_answered=_sum([one.n_answered for one in found]),
         n_grasped=_sum([one.n_grasped for one in found]),
-        sr_answered_ci=_limits(estimates, "sr_answered"),
-        sr_grasped_ci=_limits(estimates, "sr_grasped"),
+        sr_answered_ci=_rate_limits(estimates, "sr_answered"),
+        sr_grasped_ci=_rate_limits(estimates, "sr_grasped"),
         idle_side=sides.pop() if len(sides) == 1 else "both",
         sr_by_rule=_mean_by_key([one.sr_by_rule for one in found]),
         sr_by_epsilon=_mean_by_key([one.sr_by_epsilon for one in found]),
@@ -101,39 +118,26 @@ def _left_out(rows: Sequence[RetentionRow]) -> tuple[str, ...]:
     return tuple(row.category for row in rows if row.view is not None and not row.retention.defined)
 
 
-def _retention(rows: Sequence[RetentionRow], estimates: Estimates) -> RetentionScores:
-    counted = [row for row in rows if row.retention.defined]
-    if not counted:
-        return RetentionScores(note=rows[0].retention.note)
-    left_out = _left_out(rows)
-    scores: dict[str, Any] = {
-        name: _mean(counted, f"retention.{name}") for name in ("published", "debiased", "bounded", "area")
-    }
-    for name, limits in (("debiased", "ci"), ("bounded", "bounded_ci"), ("area", "area_ci")):
-        scores[limits] = _retention_limits(counted, estimates, f"retention_{name}", limits)
-    note = f"without {', '.join(left_out)}" if left_out else ""
-    return RetentionScores(defined=True, note=note, **scores)
+def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> RetentionPart:
+    counted, missing = [row for row in rows if row.retention.defined], _left_out(rows)
+    if not probed or len(probed[0].names) < 2:
+        return RetentionPart(note=rows[0].retention.note)
+    found = retention(Scores.mean([streams.scores for streams in probed]))
+    note = f"published ratios without {', '.join(missing)}" if counted and missing else ""
+    return RetentionPart(
+        value=found.value,
+        ci=limits(found.interval),
+        published=_mean(counted, "retention.published"),
+        defined=bool(counted),
+        note=note if counted else rows[0].retention.note,
+    )
 
 
-def _limits(estimates: Estimates, name: str) -> Limits | None:
-    found = estimates.get(name)
-    return None if found is None else found.ci
-
-
-def _retention_limits(
-    counted: Sequence[RetentionRow], estimates: Estimates, name: str, limits: str
-) -> Limits | None:
-    """The category's own where there is one, and none where one category has none: a mean knows no more.
-
-    Those of several are around their mean, as ratios are skewed.
-    """
-    own: list[Limits | None] = [getattr(row.retention, limits) for row in counted]
-    if len(counted) == 1:
-        return own[0]
-    if UNBOUNDED in own:
-        return UNBOUNDED
-    found = estimates.get(name)
-    return None if found is None else found.centred.ci
+def _rate_limits(estimates: Sequence[RowEstimates], name: str) -> Limits | None:
+    shares = [one.rates[name] for one in estimates if name in one.rates]
+    if not shares:
+        return None
+    return limits(Rate.mean([one.value for one in shares], [one.interval() for one in shares]).interval)
 
 
 def _mean(rows: Sequence[RetentionRow], path: str) -> Any:

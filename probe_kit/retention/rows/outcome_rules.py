@@ -8,10 +8,10 @@ import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import capture_only, shares_of, units_of
+from probe_kit.retention.behaviour.success_rate import capture_only, group_names, shares_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, Limits
-from probe_kit.statistics.bootstrap import bootstrap_ratios, group_means, units_seed
+from probe_kit.retention.estimators.stream_scores import Limits, limits
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -110,19 +110,19 @@ class RunUnderRule:
             n_answered=int((episodes["outcome"] != "oob").sum()),
             share_answered=float(answered.mean()),
             sr_answered=None if rate is None else rate.value,
-            sr_answered_ci=None if rate is None else rate.ci,
+            sr_answered_ci=None if rate is None else limits(rate.interval()),
             **facts,
         )
 
-    def estimates(self, episodes: "pd.DataFrame") -> dict[str, Estimate]:
-        """`sr_answered` and `sr_grasped` with their draws, where they are defined."""
+    def shares(self, episodes: "pd.DataFrame") -> dict[str, Share]:
+        """`sr_answered` and `sr_grasped`, where they are defined."""
         if not self.scored:
             return {}
         found = {"sr_answered": self._conditional(episodes, 1 - shares_of(episodes, "oob"))}
         if self.behaviour is not None:
             grasped = self.behaviour["grasped"].to_numpy(float)[episodes.index]
             found["sr_grasped"] = self._conditional(episodes, grasped)
-        return {name: estimate for name, estimate in found.items() if estimate is not None}
+        return {name: share for name, share in found.items() if share is not None}
 
     def _facts(
         self, episodes: "pd.DataFrame", answered: "np.ndarray[Any, np.dtype[np.float64]]"
@@ -137,7 +137,7 @@ class RunUnderRule:
         return {
             "n_grasped": int(grasped.sum()),
             "sr_grasped": None if rate is None else rate.value,
-            "sr_grasped_ci": None if rate is None else rate.ci,
+            "sr_grasped_ci": None if rate is None else limits(rate.interval()),
             "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
             "sr_idle": float((own["idle"] == "correct").mean()),
             "idle_side": _idle_side(own["idle"], episodes["side_correct"]),
@@ -146,17 +146,13 @@ class RunUnderRule:
             "behaviour": _behaviour(acted),
         }
 
-    def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Estimate | None:
-        """Success where the weights are, whole groups of items drawn; None where there is no weight."""
+    def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Share | None:
+        """Success where the weights are, groups of items as the unit; None where there is no weight."""
         if not weights.any():
             return None
-        groups = units_of(episodes)
-        units = units_seed(groups, self.run.suite)
-        right = shares_of(episodes, "correct") * (weights > 0)
-        draws = bootstrap_ratios(right, weights, groups, units)
-        counts, tops = (group_means(part[:, None], groups)[:, 0] for part in (weights, right))
-        each = np.divide(tops, counts, out=np.full(counts.size, np.nan), where=counts > 0)
-        return Estimate(float(right.sum() / weights.sum()), draws, units, int((counts > 0).sum()), each)
+        counted = weights > 0
+        right = np.divide(shares_of(episodes, "correct"), weights, out=np.zeros(weights.size), where=counted)
+        return Share.of(right.clip(0, 1), group_names(episodes, self.run.suite), weights)
 
 
 def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:

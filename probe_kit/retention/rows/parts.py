@@ -9,7 +9,8 @@ from typing import Literal
 
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_name
-from probe_kit.retention.estimators.bootstrap_draws import Limits
+from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.statistics.estimates.verdict import Verdict
 from probe_kit.train.results.control_scores import has_signal
 
 Mode = Literal["answers", "acts"]
@@ -93,24 +94,34 @@ class SwapEffect:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamPeak:
-    """The best site of a stream, the first one on ties.
+class StreamPart:
+    """What can be read in one stream.
 
-    ties: how many other sites are as accurate. selectivity: its accuracy above that of the same probe on random
-    labels of items. exceeds: whether it is better than `chance`, `binding` and `untrained`, family-wise; None for
-    a control that was not run. minus_untrained: how much more accurate it is than the untrained network's best.
+    score: accuracy of a site chosen on half of the groups of items, on the other half; balanced between the sides,
+    so that chance is one half. ci: its 95 % interval. peak: accuracy of the site that is best on all of them,
+    which is too high by the luck of being chosen. at_most: an upper 95 % limit of the best site's accuracy.
+    verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown, and
+    `at_most` below a bound), or `not shown`. site, layer, depth: the first of the best sites, a place without an
+    interval of its own; ties: how many others are as accurate. p_fwe: of that site, family-wise. exceeds: whether
+    it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
+    that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
+    untrained network's best.
     """
 
-    accuracy: float | None = None
+    score: float | None = None
     ci: Limits | None = None
+    peak: float | None = None
+    at_most: float | None = None
+    verdict: Verdict | None = None
+    site: str | None = None
     layer: int | None = None
     depth: float | None = None
+    ties: int | None = None
     p_fwe: float | None = None
-    selectivity: float | None = None
     exceeds: dict[str, bool | None] = field(default_factory=dict)
+    selectivity: float | None = None
     minus_untrained: float | None = None
     minus_untrained_ci: Limits | None = None
-    ties: int | None = None
 
     @property
     def has_signal(self) -> bool:
@@ -119,54 +130,52 @@ class StreamPeak:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackbonePeak(StreamPeak):
-    """The best site of the backbone; see `StreamPeak`."""
+class BackbonePart(StreamPart):
+    """What can be read in the backbone; see `StreamPart`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActionPeak(StreamPeak):
-    """The best site where the action is made; see `StreamPeak`.
+class ActionPart(StreamPart):
+    """What can be read where the action is made; see `StreamPart`.
 
-    iteration: the flow-matching step or action token of the site. first_accuracy, first_layer: of the best layer
-    at the first iteration, which has seen no action. All three are None where the stream runs once.
+    iteration: the flow-matching step or action token of the site. first_peak, first_layer: of the best layer at
+    the first iteration, which has seen no action. All three are None where the stream runs once.
     """
 
     iteration: int | None = None
-    first_accuracy: float | None = None
+    first_peak: float | None = None
     first_layer: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class RetentionScores:
+class RetentionPart:
     """Share of the backbone's signal that can be read where the action is made.
 
-    `published` is the published ratio even when `defined` is False, and then no category mean contains it. `ci` is
-    the 95 % interval of `debiased`, (None, None) when the data set no limit; `bounded` lies between `debiased` and
-    the peaks, `area` is the ratio of means over all sites. note: why it is not defined; in a mean, what it omits.
+    value: score of the action above one half over that of the backbone; in a mean the ratio of the mean scores of
+    all probed categories. ci: its 95 % interval, (None, None) where the backbone is not known well enough to
+    divide by. published: the ratio of the peaks; in a mean the mean of these ratios over the categories whose
+    backbone signal is shown. defined: whether the backbone's signal is shown, in a mean in any category; note: why
+    not.
     """
 
+    value: float | None = None
+    ci: Limits | None = None
     published: float | None = None
     defined: bool = False
     note: str = "n/a (no probes)"
-    debiased: float | None = None
-    ci: Limits | None = None
-    bounded: float | None = None
-    bounded_ci: Limits | None = None
-    area: float | None = None
-    area_ci: Limits | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControlScores:
     """What the probes are compared with.
 
-    n_groups: independent groups of items. chance: accuracy of always naming the larger class. probe_minus_sr:
-    backbone accuracy − success rate. baselines: accuracy of each control that never sees the model; leaks: those
-    above chance. untrained: name of the untrained network's run.
+    n_groups: independent groups of items. missing: by side, the share of items without their episode of that
+    side. probe_minus_sr: backbone score − success rate. baselines: accuracy of each control that never sees the
+    model; leaks: those above chance. untrained: name of the untrained network's run.
     """
 
     n_groups: int | None = None
-    chance: float | None = None
+    missing: dict[str, float] = field(default_factory=dict)
     probe_minus_sr: float | None = None
     baselines: dict[str, float] = field(default_factory=dict)
     leaks: tuple[str, ...] = ()

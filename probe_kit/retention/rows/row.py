@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from probe_kit.retention.behaviour.success_rate import SuccessRate
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
 from probe_kit.retention.rows.parts import (
-    ActionPeak,
+    ActionPart,
     AnswerStats,
-    BackbonePeak,
+    BackbonePart,
     ControlScores,
-    RetentionScores,
+    RetentionPart,
     RunInfo,
     SwapEffect,
 )
@@ -35,9 +35,9 @@ class RetentionRow:
     success: SuccessRate
     rules: OutcomeRuleScores = field(default_factory=OutcomeRuleScores)
     answers: AnswerStats = field(default_factory=AnswerStats)
-    backbone: BackbonePeak = field(default_factory=BackbonePeak)
-    action: ActionPeak = field(default_factory=ActionPeak)
-    retention: RetentionScores = field(default_factory=RetentionScores)
+    backbone: BackbonePart = field(default_factory=BackbonePart)
+    action: ActionPart = field(default_factory=ActionPart)
+    retention: RetentionPart = field(default_factory=RetentionPart)
     controls: ControlScores = field(default_factory=ControlScores)
     image_swap: SwapEffect = field(default_factory=SwapEffect)
 

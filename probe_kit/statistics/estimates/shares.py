@@ -35,12 +35,16 @@ class Share:
     sizes: Matrix
 
     @classmethod
-    def of(cls, values: ArrayLike, groups: ArrayLike) -> "Share":
+    def of(cls, values: ArrayLike, groups: ArrayLike, weights: ArrayLike | None = None) -> "Share":
         """The mean of (E,) values from 0 to 1 over the episodes of (E,) groups.
 
-        Raises UsageError for no episode, or a value that is NaN or outside 0 … 1.
+        weights: (E,) how much of an episode counts, such as whether it has an answer; each 1 by default. Groups
+        without weight are left out. Raises UsageError for no episode, or a value that is NaN or outside 0 … 1.
         """
         each = np.asarray(values, np.float64)
+        if weights is not None:
+            counted = np.asarray(weights, np.float64)
+            each, groups = each[counted > 0], np.asarray(groups, str)[counted > 0]
         if each.size == 0:
             raise UsageError("a share of no episodes; expected at least one")
         if not ((each >= 0) & (each <= 1)).all():
@@ -50,7 +54,9 @@ class Share:
                 "Leave out episodes without a value."
             )
         names, group_of = np.unique(np.asarray(groups, str), return_inverse=True)
-        return cls(names, np.bincount(group_of, each), np.bincount(group_of, np.ones(each.size)))
+        own: Matrix = np.ones(each.size) if weights is None else counted[counted > 0]
+        sums, sizes = (np.bincount(group_of, part).astype(np.float64) for part in (each * own, own))
+        return cls(names, sums, sizes)
 
     @property
     def value(self) -> float:

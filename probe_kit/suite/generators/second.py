@@ -1,9 +1,9 @@
 """Version 2 of the suite: the concepts and words of version 1, drawn so that pixels recur less.
 
 Concepts recur in other pictures, so a probe can learn by itself which pixels answer which word (see the control
-`binding`). What recurs here is the concept and little else: backgrounds of any hue instead of pale grey ones, and
-where size means nothing, drawings of other sizes anywhere on their tile. No word is new, as a policy may know no
-others.
+`random-features`). What recurs here is the concept and little else: backgrounds of any hue instead of pale grey
+ones, and where size means nothing, drawings of other sizes anywhere on their tile. No word is new, as a policy
+may know no others.
 """
 
 import colorsys

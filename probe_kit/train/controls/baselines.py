@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from probe_kit.suite import Suite
 
-PICTURED: frozenset[Baseline] = frozenset({"pixels", "binding"})
+PICTURED: frozenset[Baseline] = frozenset({"pixels", "random-features"})
 """Those that need the pictures of the run's suite."""
-DEFAULT: tuple[Baseline, ...] = ("binding",)
+DEFAULT: tuple[Baseline, ...] = ("random-features",)
 """Those that are run unless others, or none, are asked for."""
 THUMBNAIL = 32
 
@@ -25,7 +25,7 @@ Features = NDArray[np.float32]
 
 
 def baseline_features(run: RunReader, name: Baseline, suite: "Suite | None") -> Features:
-    """(E, D) features of a baseline but `binding`, rows in the order of the run's episodes.
+    """(E, D) features of a baseline but `random-features`, rows in the order of the run's episodes.
 
     suite: the run's, for `pixels`. Raises UsageError for an unknown name or a missing column.
     """

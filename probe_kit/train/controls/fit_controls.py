@@ -10,20 +10,22 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.estimates.mover import difference_interval
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.choices import Baseline
 from probe_kit.train.controls.baselines import DEFAULT, PICTURED, baseline_features
 from probe_kit.train.controls.random_features import RandomFeatureInputs, random_feature_scores
 from probe_kit.train.crossval.category_problem import POOLED, category_problem
-from probe_kit.train.crossval.metrics import chance_level, correctness
+from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.data.labels import target_labels
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.control_scores import (
-    BINDING,
+    RANDOM_FEATURES,
     UNTRAINED,
     BaselineScore,
     ControlComparison,
@@ -36,10 +38,10 @@ from probe_kit.train.settings import ProbeSettings
 
 @dataclass(frozen=True)
 class PreparedControls:
-    """Baselines that are still to be probed: features (E, D) by name, and what `binding` sees if it is one."""
+    """Baselines that are still to be probed: features (E, D) by name, and the input of `random-features`."""
 
     features: Mapping[Baseline, NDArray[np.float32]]
-    binding: RandomFeatureInputs | None
+    random_features: RandomFeatureInputs | None
 
 
 def prepare_baselines(
@@ -61,9 +63,11 @@ def prepare_baselines(
                 raise
             _warn_of_no_control(missing, error)
             missing = []
-    features = {name: baseline_features(run, name, suite) for name in missing if name != BINDING}
-    binding = RandomFeatureInputs.of(run, suite) if suite is not None and BINDING in missing else None
-    return PreparedControls(features, binding)
+    features = {name: baseline_features(run, name, suite) for name in missing if name != RANDOM_FEATURES}
+    random_features = (
+        RandomFeatureInputs.of(run, suite) if suite is not None and RANDOM_FEATURES in missing else None
+    )
+    return PreparedControls(features, random_features)
 
 
 def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError) -> None:
@@ -75,12 +79,12 @@ def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError
 
 
 def add_baselines(results: ProbeResults, run: RunReader, prepared: PreparedControls) -> ProbeResults:
-    """`results` with these baselines for every category; with `binding`, every site is compared with it."""
+    """`results` with these baselines for every category; `random-features` is compared with every site."""
     controls = results.controls
     for name, features in prepared.features.items():
         controls = controls.with_baselines(_baseline_scores(results, run, name, features))
-    if prepared.binding is not None:
-        scores, excess = random_feature_scores(results, run, prepared.binding)
+    if prepared.random_features is not None:
+        scores, excess = random_feature_scores(results, run, prepared.random_features)
         controls = controls.with_baselines(scores).with_excess(excess)
     return replace(results, controls=controls)
 
@@ -98,15 +102,15 @@ def _baseline_scores(
         problem = category_problem(run.episodes, category, settings)
         probe = problem.probe(samples)
         right = correctness(probe.decisions, problem.labels)
-        low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, settings.suite))
+        share = problem.accuracy(probe)
         p = float(pointwise_p(right.mean(keepdims=True), probe.null[None, :])[0])
         yield BaselineScore(
             name=name,
             category=category,
-            accuracy=float(right.mean()),
-            ci=(float(low[0]), float(high[0])),
+            accuracy=share.value,
+            ci=(share.interval().low, share.interval().high),
             p=None if np.isnan(p) else p,
-            chance=chance_level(problem.labels),
+            chance=CHANCE,
             n=problem.labels.size,
         )
 
@@ -155,9 +159,7 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
     Raises UsageError if that one saw other episodes.
     """
     scores = [
-        score
-        for place, curve in results.curves.items()
-        for score in _untrained_scores(results, place, curve, untrained)
+        score for place, curve in results.curves.items() for score in _untrained_scores(place, curve, untrained)
     ]
     excess = [
         one
@@ -184,7 +186,7 @@ def _untrained_excess(
 
 
 def _untrained_scores(
-    results: ProbeResults, place: tuple[str, str], curve: ProbeCurve, untrained: ProbeResults
+    place: tuple[str, str], curve: ProbeCurve, untrained: ProbeResults
 ) -> Iterator[UntrainedScore]:
     other = untrained.curves[place]
     if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
@@ -198,8 +200,6 @@ def _untrained_scores(
     here, there = (
         c.correct[[pair[side] for pair in pairs]].T.astype(float) for side, c in enumerate((curve, other))
     )
-    seed = units_seed(curve.groups, results.settings.suite)
-    low, high = group_bootstrap(here - there, curve.groups, seed, bounds=GAINS)
     for column, (row, untrained_row, peak) in enumerate(pairs):
         yield UntrainedScore(
             *place,
@@ -209,6 +209,17 @@ def _untrained_scores(
             accuracy=float(here[:, column].mean()),
             untrained_accuracy=float(there[:, column].mean()),
             difference=float((here - there)[:, column].mean()),
-            ci=(float(low[column]), float(high[column])),
+            ci=_gain_limits(here[:, column], there[:, column], curve.groups),
             untrained=untrained.label + (" (random weights)" if untrained.settings.random_weights else ""),
         )
+
+
+def _gain_limits(
+    here: NDArray[np.float64], there: NDArray[np.float64], groups: NDArray[np.str_]
+) -> tuple[float, float]:
+    """95 % interval of the difference of two accuracies on the same episodes."""
+    mine, theirs = Share.of(here, groups), Share.of(there, groups)
+    gap = difference_interval(
+        mine.value, mine.interval(), theirs.value, theirs.interval(), mine.correlation(theirs)
+    )
+    return gap.low, gap.high

@@ -1,4 +1,4 @@
-"""The control `binding`: accuracy of an untrained conjunction of picture and word features.
+"""The control `random-features`: accuracy of an untrained conjunction of picture and word features.
 
 Concepts recur in other groups of pictures, so a probe can itself learn which pixels answer which word, as soon as
 its features hold products of both. Any random nonlinear layer does. The control is such a layer, as wide as the
@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.paired_bootstrap import better_than_reference
 from probe_kit.train.controls.baselines import Features, tile_pixels, word_counts
 from probe_kit.train.crossval.category_problem import CategoryProblem, category_problem
-from probe_kit.train.crossval.metrics import chance_level, correctness
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.control_scores import BINDING, BaselineScore, ControlComparison
+from probe_kit.train.results.control_scores import RANDOM_FEATURES, BaselineScore, ControlComparison
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -68,31 +69,30 @@ def random_feature_scores(
             for name, stream in run.streams.items()
         }
         first = references.get("backbone", next(iter(references.values())))
-        scores.append(_score(first, problem, category, results.settings.suite))
-        found += list(_held_against(results, category, references))
+        scores.append(_score(first, problem, category))
+        right = {name: correctness(probe.decisions, problem.labels) for name, probe in references.items()}
+        found += list(_held_against(results, category, right))
     return scores, found
 
 
-def _reference(inputs: RandomFeatureInputs, problem: CategoryProblem, width: int, seed: int) -> NDArray[np.bool_]:
-    """(E,) where the best of the random layers is right."""
+def _reference(inputs: RandomFeatureInputs, problem: CategoryProblem, width: int, seed: int) -> SiteProbe:
+    """The probe of the best of the random layers."""
     nothing = np.empty((problem.labels.size, 0), bool)
     layers = (inputs.layer(problem.rows, width, derive_seed("binding", seed, number)) for number in range(LAYERS))
-    right = [
-        correctness(problem.fit(Samples.pooled(layer), nothing).decisions, problem.labels) for layer in layers
-    ]
-    return max(right, key=lambda one: int(one.sum()))
+    probes = [problem.fit(Samples.pooled(layer), nothing) for layer in layers]
+    return max(probes, key=lambda one: int(correctness(one.decisions, problem.labels).sum()))
 
 
-def _score(right: NDArray[np.bool_], problem: CategoryProblem, category: str, suite: str) -> BaselineScore:
-    low, high = group_bootstrap(right[:, None], problem.groups, units_seed(problem.groups, suite))
+def _score(probe: SiteProbe, problem: CategoryProblem, category: str) -> BaselineScore:
+    share = problem.accuracy(probe)
     return BaselineScore(
-        name=BINDING,
+        name=RANDOM_FEATURES,
         category=category,
-        accuracy=float(right.mean()),
-        ci=(float(low[0]), float(high[0])),
+        accuracy=share.value,
+        ci=(share.interval().low, share.interval().high),
         p=None,
-        chance=chance_level(problem.labels),
-        n=right.size,
+        chance=CHANCE,
+        n=problem.labels.size,
     )
 
 
@@ -104,11 +104,11 @@ def _held_against(
             continue
         for stream in dict.fromkeys(site.stream for site in curve.sites):
             rows, reference = curve.stream(stream), references[stream]
-            seed = derive_seed(BINDING, results.settings.seed, category, view, stream)
+            seed = derive_seed("binding", results.settings.seed, category, view, stream)
             p = better_than_reference(curve.correct[rows], reference.astype(float), curve.groups, seed)
             for row, of_site in zip(rows, p, strict=True):
                 yield ControlComparison(
-                    BINDING, category, view, str(curve.sites[row]), float(reference.mean()), float(of_site)
+                    RANDOM_FEATURES, category, view, str(curve.sites[row]), float(reference.mean()), float(of_site)
                 )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from probe_kit.statistics.significance import SIGNIFICANCE
 
-BINDING, UNTRAINED = "binding", "untrained"
+RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
 """The controls that a site must beat, where they were run, before its signal counts as knowledge."""
 
 
@@ -58,8 +58,8 @@ class UntrainedScore:
 class ControlComparison:
     """Whether a site's probe is more accurate than a control: paired by group, family-wise over its stream.
 
-    control: `binding`, or `untrained` for the best site of that stream in the untrained network. reference: the
-    control's accuracy.
+    control: `random-features`, or `untrained` for the best site of that stream in the untrained network.
+    reference: the control's accuracy.
     """
 
     control: str
@@ -70,28 +70,28 @@ class ControlComparison:
     p: float
 
 
-Beats = dict[str, bool | None]
-"""Whether a site is better than `chance`, `binding` and `untrained`; None for what was not run."""
+Exceeds = dict[str, bool | None]
+"""Whether a site is better than `chance`, `random-features` and `untrained`; None for what was not run."""
 
 
-def has_signal(beats: Beats) -> bool:
+def has_signal(exceeds: Exceeds) -> bool:
     """Whether that is knowledge: better than chance, and than every control that was run."""
-    return beats["chance"] is True and False not in beats.values()
+    return exceeds["chance"] is True and False not in exceeds.values()
 
 
 @dataclass(frozen=True)
 class Controls:
-    """Scores of the controls so far. excess: every site compared with binding and untrained."""
+    """Scores of the controls so far. excess: every site compared with random-features and untrained."""
 
     baselines: tuple[BaselineScore, ...] = ()
     untrained: tuple[UntrainedScore, ...] = ()
     excess: tuple[ControlComparison, ...] = ()
 
-    def beats(self, category: str, view: str, site: str, p_fwe: float) -> Beats:
+    def exceeds(self, category: str, view: str, site: str, p_fwe: float) -> Exceeds:
         """What a site with this family-wise p is better than."""
         found = self._beaten.get((category, view, site), {})
         chance = None if isnan(p_fwe) else bool(p_fwe < SIGNIFICANCE)
-        return {"chance": chance, BINDING: found.get(BINDING), UNTRAINED: found.get(UNTRAINED)}
+        return {"chance": chance, RANDOM_FEATURES: found.get(RANDOM_FEATURES), UNTRAINED: found.get(UNTRAINED)}
 
     @cached_property
     def _beaten(self) -> dict[tuple[str, str, str], dict[str, bool]]:
@@ -130,7 +130,7 @@ class Controls:
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> "Controls":
-        """What `to_json` gave, also by versions that called the untrained network a twin."""
+        """What `to_json` gave, also by versions with former names of the controls."""
         stored = _in_present_words(stored)
         return cls(
             tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
@@ -139,7 +139,12 @@ class Controls:
         )
 
 
-_FORMER_WORDS = {"twin": "untrained", "twin_site": "untrained_site", "twin_accuracy": "untrained_accuracy"}
+_FORMER_WORDS = {
+    "twin": "untrained",
+    "twin_site": "untrained_site",
+    "twin_accuracy": "untrained_accuracy",
+    "binding": "random-features",
+}
 
 
 def _in_present_words(stored: dict[str, Any]) -> dict[str, Any]:
@@ -147,7 +152,9 @@ def _in_present_words(stored: dict[str, Any]) -> dict[str, Any]:
     return {
         _FORMER_WORDS.get(part, part): [
             {
-                _FORMER_WORDS.get(key, key): _FORMER_WORDS.get(value, value) if key == "control" else value
+                _FORMER_WORDS.get(key, key): _FORMER_WORDS.get(value, value)
+                if key in ("control", "name")
+                else value
                 for key, value in one.items()
             }
             for one in scores

@@ -1,14 +1,16 @@
 """The probes of one category in one view, with all that later statistics need."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
+from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.label_permutations import max_statistic_p
-from probe_kit.train.crossval.metrics import chance_level, correctness
+from probe_kit.train.crossval.metrics import correctness
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,13 @@ class ProbeCurve:
         """(S, E) whether each episode's held-out decision is right."""
         return correctness(self.decisions, self.labels[None, :])
 
-    @property
-    def chance(self) -> float:
-        """Accuracy of always naming the larger class."""
-        return chance_level(self.labels)
+    @cached_property
+    def sums(self) -> GroupSums:
+        """Correct decisions per site and group of items, balanced between the sides: chance is one half.
+
+        Raises UnbalancedEpisodesError where a fold was trained on one side only.
+        """
+        return balanced_sums(self.decisions, self.labels, self.fold_of, self.groups)
 
     @property
     def n_groups(self) -> int:

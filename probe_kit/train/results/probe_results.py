@@ -11,9 +11,10 @@ import numpy as np
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.statistics.bootstrap import group_bootstrap, units_seed
+from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.estimates.shares import group_shares, share_interval
 from probe_kit.statistics.label_permutations import pointwise_p, smallest_p
-from probe_kit.train.crossval.metrics import balanced_accuracy, fold_auc, log_loss
+from probe_kit.train.crossval.metrics import fold_auc, log_loss
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -63,12 +64,12 @@ class ProbeResults:
         """One row per category, view and site.
 
         `accuracy` with its 95 % interval over groups (`ci_low`, `ci_high`), `p` of the site alone, `p_fwe`
-        against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per
-        outer fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are
-        consistent within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`:
-        no p-value can be lower with so many relabellings. `beats_binding`, `beats_untrained`: whether the site is
-        better than that control, missing where it was not run; `has_signal`: than chance, family-wise, and every
-        control that was run.
+        against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per outer
+        fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are consistent
+        within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`: no p-value
+        can be lower with so many relabellings. `exceeds_random_features`, `exceeds_untrained`: whether the site
+        is better than that control, missing where it was not run; `has_signal`: than chance, family-wise, and
+        every control that was run.
         """
         import pandas as pd
 
@@ -77,7 +78,7 @@ class ProbeResults:
             for (category, view), curve in self.curves.items()
             for row in _score_rows(self, category, view, curve)
         ]
-        kinds = {"iteration": "Int64", "beats_binding": "boolean", "beats_untrained": "boolean"}
+        kinds = {"iteration": "Int64", "exceeds_random_features": "boolean", "exceeds_untrained": "boolean"}
         return pd.DataFrame(rows).astype(kinds)
 
     def direction(self, category: str, view: str, site: Site) -> Direction:
@@ -98,11 +99,12 @@ def episodes_sha256(run: RunReader) -> str:
 
 def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCurve) -> list[dict[str, Any]]:
     settings, folds, correct = results.settings, curve.folds(), curve.correct
-    accuracy = correct.mean(axis=1)
-    low, high = group_bootstrap(correct.T, curve.groups, units_seed(curve.groups, settings.suite))
+    accuracy, sums = correct.mean(axis=1), curve.sums
+    shares, variances = group_shares(sums.sums, sums.sizes)
+    low, high = share_interval(shares, variances, sums.n_groups, sums.n_episodes, sums.n_groups - 1)
     p, p_fwe, control = pointwise_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
-    beats = [
-        results.controls.beats(category, view, str(site), float(p_site))
+    exceeds = [
+        results.controls.exceeds(category, view, str(site), float(p_site))
         for site, p_site in zip(curve.sites, p_fwe, strict=True)
     ]
     return [
@@ -118,10 +120,9 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCur
             "layer": site.layer,
             "depth": curve.depth(site),
             "iteration": site.iteration,
-            "accuracy": accuracy[row],
+            "accuracy": shares[row],
             "ci_low": low[row],
             "ci_high": high[row],
-            "balanced_accuracy": balanced_accuracy(curve.decisions[row], curve.labels),
             "auc": fold_auc(curve.decisions[row], curve.labels, folds),
             "log_loss": float(log_loss(curve.decisions[row], curve.labels)),
             "p": p[row],
@@ -131,14 +132,14 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCur
             "n": curve.labels.size,
             "items": np.unique(curve.items).size,
             "groups": curve.n_groups,
-            "chance": curve.chance,
+            "chance": CHANCE,
             "C": " ".join(f"{strength:g}" for strength in curve.strengths[row]),
             "fold_accuracy": " ".join(f"{correct[row, fold.test].mean():.4f}" for fold in folds),
             "settings": settings.key,
             "smallest_p": smallest_p(curve.null.shape[1]),
-            "beats_binding": beats[row]["binding"],
-            "beats_untrained": beats[row]["untrained"],
-            "signal": has_signal(beats[row]),
+            "exceeds_random_features": exceeds[row]["random-features"],
+            "exceeds_untrained": exceeds[row]["untrained"],
+            "signal": has_signal(exceeds[row]),
         }
         for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True))
     ]

@@ -5,7 +5,7 @@ Results are there when their settings are, which are written last, with the hash
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -158,10 +158,14 @@ def _now() -> str:
 def _pack(curves: Mapping[tuple[str, str], ProbeCurve]) -> dict[str, Any]:
     """Arrays by `category/view/member`; views hold no slash."""
     return {
-        f"{category}/{view}/{name}": np.array([str(own) for own in value]) if isinstance(value, tuple) else value
+        f"{category}/{view}/{member.name}": _as_array(getattr(curve, member.name))
         for (category, view), curve in curves.items()
-        for name, value in vars(curve).items()
+        for member in fields(curve)
     }
+
+
+def _as_array(value: Any) -> Any:
+    return np.array([str(own) for own in value]) if isinstance(value, tuple) else value
 
 
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:

@@ -47,7 +47,7 @@ QWEN_32B = card("qwen3-vl", "Qwen/Qwen3-VL-32B-Instruct", 33_357_000_000)
 OTHERS = {
     "the same folder's size": (replace(QWEN_4B, checkpoint="my/copy"), "unknown"),
     "a folder of another size": (replace(QWEN_32B, checkpoint="my/copy"), "no"),
-    "a random twin": (replace(QWEN_4B, random_weights=True), "no"),
+    "a untrained network": (replace(QWEN_4B, random_weights=True), "no"),
     "another network": (card("paligemma", "google/paligemma-3b-pt-224", 2_923_466_480), "no"),
 }
 

@@ -41,22 +41,22 @@ def run_of(suite: Suite, path: Path, knowledge: float = 0.0) -> ArrayRun:
 
 def probed(suite: Suite, path: Path, knowledge: float = 0.0) -> ProbeResults:
     run = run_of(suite, path, knowledge)
-    return train_probes(run, permutations=39, controls=("binding",), suite=suite.folder)
+    return train_probes(run, permutations=39, controls=("random-features",), suite=suite.folder)
 
 
 def test_a_random_network_is_no_better_than_binding(suite: Suite, tmp_path: Path) -> None:
     scores = probed(suite, tmp_path / "random").scores
-    assert not scores["beats_binding"].any()
+    assert not scores["exceeds_random_features"].any()
     assert not scores["signal"].any()
-    assert scores["beats_untrained"].isna().all()
+    assert scores["exceeds_untrained"].isna().all()
 
 
 def test_a_network_that_knows_the_answer_is_better_than_binding(suite: Suite, tmp_path: Path) -> None:
     results = probed(suite, tmp_path / "knowing", knowledge=1.5)
     best = results.scores.loc[results.scores["accuracy"].idxmax()]
-    assert best["beats_binding"]
+    assert best["exceeds_random_features"]
     assert best["signal"]
-    control = results.controls.of_category("color")["binding"]
+    control = results.controls.of_category("color")["random-features"]
     assert control.ci[0] < control.accuracy < control.ci[1]
     assert not control.above_chance  # what it has for free is no leak
 

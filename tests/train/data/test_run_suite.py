@@ -28,7 +28,7 @@ from probe_kit.train.data.run_suite import suite_of
 from tests.support.little_run import STREAMS, certify, episode, little_settings
 
 SHORT = SceneSpec(max_steps=2)
-BINDING_LEFT_OUT = "the control binding is on by default and was NOT run"
+CONTROL_LEFT_OUT = "the control random-features is on by default and was NOT run"
 
 
 @pytest.fixture
@@ -142,16 +142,16 @@ def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_a
 ) -> None:
     built = build_suite(tmp_path / "suite", ["color"], 12, **drawing)
     run = run_on(replace(built, name=name or built.name), tmp_path / "run")
-    with pytest.warns(UserWarning, match=f"{BINDING_LEFT_OUT}.*{reason}.*--suite, suite=.*controls=\\(\\)"):
-        assert train_probes(run, permutations=1).scores["beats_binding"].isna().all()
-    for asked in ("binding", "pixels"):
+    with pytest.warns(UserWarning, match=f"{CONTROL_LEFT_OUT}.*{reason}.*--suite, suite=.*controls=\\(\\)"):
+        assert train_probes(run, permutations=1).scores["exceeds_random_features"].isna().all()
+    for asked in ("random-features", "pixels"):
         with pytest.raises(SuiteNotFoundError, match=f"{reason}.*--suite, suite="):
             train_probes(run, permutations=1, controls=(asked,))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         train_probes(run, permutations=1, controls=())
         found = train_probes(run, permutations=1, suite=tmp_path / "suite")
-    assert found.scores["beats_binding"].notna().all()
+    assert found.scores["exceeds_random_features"].notna().all()
 
 
 def test_the_same_control_is_the_default_in_python_and_on_the_command_line(filled: Path, tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_the_same_control_is_the_default_in_python_and_on_the_command_line(fille
     assert answer.exit_code == 0, answer.stderr
     assert "chance only" not in answer.stderr
     by_command = train_probes(runs[1], permutations=1, controls=())  # read back
-    assert by_python.scores["beats_binding"].notna().all()
+    assert by_python.scores["exceeds_random_features"].notna().all()
     assert by_python.controls == by_command.controls
 
 
@@ -197,10 +197,10 @@ def test_a_cache_that_cannot_be_written_is_named_as_the_reason(
     run = run_on(build_suite(tmp_path / "suite", ["color"], 12), tmp_path / "run")
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path / "file"))
-    with pytest.warns(UserWarning, match=f"{BINDING_LEFT_OUT}.*PROBE_KIT_CACHE"):
+    with pytest.warns(UserWarning, match=f"{CONTROL_LEFT_OUT}.*PROBE_KIT_CACHE"):
         train_probes(run, permutations=1)
 
 
 def test_features_from_elsewhere_are_probed_with_the_same_warning(planted_run: Callable[..., ArrayRun]) -> None:
-    with pytest.warns(UserWarning, match=f"{BINDING_LEFT_OUT}.*noise@1"):
+    with pytest.warns(UserWarning, match=f"{CONTROL_LEFT_OUT}.*noise@1"):
         train_probes(planted_run(), permutations=1)

@@ -42,16 +42,24 @@ def test_the_twin_of_a_stream_is_its_peak() -> None:
 
 def test_signal_must_beat_every_control_that_was_run() -> None:
     site = "backbone.01.residual"
-    controls = Controls().with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.2)])
-    assert controls.beats("color", "mean", site, 0.001) == {"chance": True, "binding": False, "untrained": None}
-    assert not has_signal(controls.beats("color", "mean", site, 0.001))
-    better = controls.with_excess([ControlComparison("binding", "color", "mean", site, 0.6, 0.01)])
-    assert has_signal(better.beats("color", "mean", site, 0.001))
-    assert not has_signal(better.beats("color", "mean", site, 0.2))
-    assert better.beats("shape", "mean", site, 0.001) == {"chance": True, "binding": None, "untrained": None}
-    assert has_signal({"chance": True, "binding": None, "untrained": None})
-    assert better.beats("color", "mean", site, float("nan"))["chance"] is None
-    assert not has_signal(better.beats("color", "mean", site, float("nan")))
+    controls = Controls().with_excess([ControlComparison("random-features", "color", "mean", site, 0.6, 0.2)])
+    assert controls.exceeds("color", "mean", site, 0.001) == {
+        "chance": True,
+        "random-features": False,
+        "untrained": None,
+    }
+    assert not has_signal(controls.exceeds("color", "mean", site, 0.001))
+    better = controls.with_excess([ControlComparison("random-features", "color", "mean", site, 0.6, 0.01)])
+    assert has_signal(better.exceeds("color", "mean", site, 0.001))
+    assert not has_signal(better.exceeds("color", "mean", site, 0.2))
+    assert better.exceeds("shape", "mean", site, 0.001) == {
+        "chance": True,
+        "random-features": None,
+        "untrained": None,
+    }
+    assert has_signal({"chance": True, "random-features": None, "untrained": None})
+    assert better.exceeds("color", "mean", site, float("nan"))["chance"] is None
+    assert not has_signal(better.exceeds("color", "mean", site, float("nan")))
 
 
 def test_json_gives_the_same_controls_back() -> None:

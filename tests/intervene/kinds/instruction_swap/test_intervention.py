@@ -1,4 +1,5 @@
-"""Words as donors, what one step owes to them, and the memory as a place: on a real run of the random twin."""
+"""Words as donors, what one step owes to them, and the memory as a place: on a real run of the untrained
+network."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any

@@ -1,0 +1,8 @@
+"""Closed vocabularies of the retention commands. Importing them loads no statistics."""
+
+from typing import Literal
+
+AnswerScore = Literal["text", "logits", "order-balanced"]
+"""How the answers of a VLM are read: from its text, from the logits of the options, or from logits averaged over
+both orders of the options."""
+TableFormat = Literal["table", "json", "csv", "markdown", "latex"]

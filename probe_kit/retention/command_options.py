@@ -1,0 +1,173 @@
+"""Options of `probe-kit retention` and `probe-kit stages`, by help panel."""
+
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from probe_kit._terminal.console import split, whole_number
+from probe_kit._terminal.options import Names
+from probe_kit.errors import UsageError
+from probe_kit.retention.choices import AnswerScore, TableFormat
+from probe_kit.scene_names import RuleName
+
+if TYPE_CHECKING:
+    from probe_kit.retention.estimators.retention import Iterations
+
+RUNS = "Runs and probes"
+RULES = "Outcome rule"
+VLM_RUNS = "VLM runs"
+OUTPUT = "Output"
+
+
+class Radii(tuple[float, ...]):
+    """Zone radii in metres."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: "str | Radii") -> "Radii":
+        """The numbers of a comma-separated text. Raises UsageError for one that is not positive."""
+        return cls(map(_radius, split(text) or ())) if isinstance(text, str) else text
+
+    def __str__(self) -> str:
+        """As it is typed."""
+        return ",".join(f"{radius:g}" for radius in self)
+
+
+def _radius(text: str) -> float:
+    try:
+        radius = float(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a number of metres") from None
+    if not 0 < radius < inf:
+        raise UsageError(f"a zone radius is {text} m; expected a positive number")
+    return radius
+
+
+def read_iterations(text: str) -> "Iterations":
+    """all, best, last or a number. Raises UsageError for another text."""
+    if (number := whole_number(text)) is not None:
+        return number
+    if text not in ("all", "best", "last"):
+        raise UsageError(f"iterations {text!r}; expected all, best, last or a number")
+    return cast("Iterations", text)
+
+
+# -- runs and probes ---------------------------------------------------------------------------------------------
+
+Runs = Annotated[
+    list[str] | None,
+    typer.Argument(help="Run folders or URLs. Several runs of the same questions are compared.", metavar="RUN…"),
+]
+Groups = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--group", metavar="NAME=RUN,RUN", help="Compare groups of models. Repeat per group.", rich_help_panel=RUNS
+    ),
+]
+Against = Annotated[
+    str | None,
+    typer.Option(
+        "--against",
+        metavar="NAME",
+        help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
+        rich_help_panel=RUNS,
+    ),
+]
+ProbeKeys = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--probes",
+        metavar="RUN=KEY",
+        help="Probe results of a run; `probe-kit run show` lists them. Default: those requested last.",
+        rich_help_panel=RUNS,
+    ),
+]
+Views = Annotated[
+    Names | None,
+    typer.Option(
+        "--views",
+        parser=Names.parse,
+        metavar="A,B,…",
+        help="Token views, comma-separated. Default: all that were probed.",
+        rich_help_panel=RUNS,
+    ),
+]
+IterationChoice = Annotated[
+    str,
+    typer.Option(
+        "--iterations",
+        metavar="all|best|last|N",
+        help="Iterations of the action stream that count. best: layer curves show the best iteration only.",
+        rich_help_panel=RUNS,
+    ),
+]
+AbsentBelow = Annotated[
+    float,
+    typer.Option(
+        "--absent-below",
+        min=0.5,
+        max=1.0,
+        help="Accuracy below which a stream without signal is called absent.",
+        rich_help_panel=RUNS,
+    ),
+]
+
+# -- outcome rule ------------------------------------------------------------------------------------------------
+
+Rule = Annotated[
+    RuleName,
+    typer.Option(
+        "--rule", help="What counts as an answer. box: the released evaluation's.", rich_help_panel=RULES
+    ),
+]
+LastSteps = Annotated[
+    int,
+    typer.Option(
+        "--last-steps",
+        min=1,
+        help="Control steps at the end that are judged. The released evaluation averages 11.",
+        rich_help_panel=RULES,
+    ),
+]
+Epsilons = Annotated[
+    Radii | None,
+    typer.Option(
+        "--epsilons",
+        parser=Radii.parse,
+        metavar="A,B,…",
+        help="Zone radii in metres at which the rule disc is scored again, from stored positions.",
+        rich_help_panel=RULES,
+    ),
+]
+
+# -- VLM runs ----------------------------------------------------------------------------------------------------
+
+Score = Annotated[
+    AnswerScore,
+    typer.Option("--score", help="How the answers of VLM runs are read.", rich_help_panel=VLM_RUNS),
+]
+VlmVla = Annotated[
+    bool,
+    typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=VLM_RUNS),
+]
+SideWords = Annotated[
+    bool,
+    typer.Option(
+        "--with-side-words", help="Count items such as 'no left turn sign' too.", rich_help_panel=VLM_RUNS
+    ),
+]
+
+# -- output ------------------------------------------------------------------------------------------------------
+
+Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.", rich_help_panel=OUTPUT)]
+Html = Annotated[
+    Path | None,
+    typer.Option("--html", metavar="FILE", help="Write a report that needs no network.", rich_help_panel=OUTPUT),
+]
+Figures = Annotated[
+    Path | None,
+    typer.Option("--figures", metavar="FOLDER", help="Write all figures as PNG and PDF.", rich_help_panel=OUTPUT),
+]

@@ -1,0 +1,176 @@
+"""Cross-fitted scores of a category's streams, and what averages and differences of them are made of."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.statistics.bootstrap import units_seed
+from probe_kit.statistics.estimates.balanced import CHANCE, balanced_sums
+from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
+from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
+from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.estimates.verdict import at_most
+from probe_kit.statistics.fieller import Interval
+from probe_kit.train.results.probe_curve import ProbeCurve
+
+ACTION, BACKBONE = "action", "backbone"
+"""Names of the two streams, in the order of the scores: retention is the first over the second."""
+Limits = tuple[float | None, float | None]
+"""A 95 % interval as rows, JSON and data frames hold it; (None, None) where the data set no limits."""
+
+
+def limits(interval: Interval) -> Limits:
+    """The interval as two numbers."""
+    return (interval.low, interval.high) if interval.bounded else (None, None)
+
+
+@dataclass(frozen=True)
+class StreamScores:
+    """Cross-fitted scores of K streams of one category and view.
+
+    names: `action` and `backbone` in this order, as far as they were probed. fit: their scores, on the same
+    halvings. at_most: by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
+    """
+
+    names: tuple[str, ...]
+    fit: CrossFit
+    at_most: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def scores(self) -> Scores:
+        """Scores above one half with their covariance."""
+        return Scores.of(self.fit)
+
+    def accuracy(self, name: str) -> float:
+        """Accuracy of a site chosen on half of the groups, on the other half."""
+        return CHANCE + float(self.fit.above[self.names.index(name)])
+
+    def interval(self, name: str) -> Interval:
+        """Its 95 % interval (Korn and Graubard)."""
+        return accuracy_interval(self.fit, self.names.index(name))
+
+    def peak(self, name: str) -> float:
+        """Accuracy of the site that is best on all groups, scored on them too."""
+        return float(self.fit.peaks[self.names.index(name)])
+
+
+def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], suite: str) -> StreamScores | None:
+    """The scores of streams by their rows of a curve; None without any.
+
+    Raises TooFewGroupsError for fewer than 4 groups, UnbalancedEpisodesError for a fold trained on one side only.
+    """
+    if not rows:
+        return None
+    sums = balanced_sums(curve.decisions, curve.labels, curve.fold_of, curve.groups)
+    own = {name: sums.only(found) for name, found in rows.items()}
+    streams = []
+    for name, found in rows.items():
+        sites = [curve.sites[row] for row in found]
+        streams.append(Stream.of(own[name], [s.layer for s in sites], [s.iteration or 0 for s in sites]))
+    fit = crossfit(streams, units_seed(curve.groups, suite))
+    return StreamScores(tuple(rows), fit, {name: at_most(part) for name, part in own.items()})
+
+
+# -- averages and differences --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RowEstimates:
+    """Estimates behind a row. rates: shares of episodes by name, such as `sr`. streams: None without probes."""
+
+    rates: Mapping[str, Share] = field(default_factory=dict)
+    streams: StreamScores | None = None
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A share of episodes with its 95 % interval. share: by groups, None where it averages over other groups."""
+
+    value: float
+    interval: Interval
+    share: Share | None = None
+
+    @classmethod
+    def pooled(cls, shares: Sequence[Share]) -> "Rate":
+        """The mean of several runs' shares; of runs on the same groups their common group means count."""
+        first = shares[0]
+        if all(np.array_equal(first.groups, one.groups) for one in shares):
+            sums, sizes = ([getattr(one, name) for one in shares] for name in ("sums", "sizes"))
+            both = Share(first.groups, np.mean(sums, axis=0), np.mean(sizes, axis=0))
+            return cls(both.value, both.interval(), both)
+        return cls.mean([one.value for one in shares], [one.interval() for one in shares])
+
+    @classmethod
+    def mean(cls, values: Sequence[float], intervals: Sequence[Interval]) -> "Rate":
+        """The mean of independent shares."""
+        return cls(float(np.mean(values)), mean_interval(values, intervals))
+
+    def minus(self, other: "Rate") -> "Rate":
+        """The difference, paired where both are of the same groups."""
+        correlation = 0.0 if self.share is None or other.share is None else self.share.correlation(other.share)
+        gap = difference_interval(self.value, self.interval, other.value, other.interval, correlation)
+        return Rate(self.value - other.value, gap)
+
+    def paired_with(self, other: "Rate") -> bool:
+        """Whether both are of the same groups."""
+        if self.share is None or other.share is None:
+            return False
+        return np.array_equal(self.share.groups, other.share.groups)
+
+
+@dataclass(frozen=True)
+class PooledScores:
+    """Scores of one or more runs in one category. fit: their mean on common halvings, None on other groups."""
+
+    names: tuple[str, ...]
+    scores: Scores
+    fit: CrossFit | None
+
+    @classmethod
+    def of(cls, runs: Sequence[StreamScores]) -> "PooledScores | None":
+        """The mean over runs, of the streams that all have; None without any."""
+        names = tuple(name for name in runs[0].names if all(name in run.names for run in runs)) if runs else ()
+        if not names:
+            return None
+        fits = [_only(run, names) for run in runs]
+        if len({(fit.seed, fit.n_groups) for fit in fits}) > 1:
+            return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), None)
+        above, peaks, gaps = (
+            np.mean([getattr(fit, part) for fit in fits], axis=0) for part in ("above", "peaks", "differences")
+        )
+        fit = CrossFit(above, peaks, gaps, fits[0].n_groups, fits[0].n_episodes, fits[0].seed)
+        return cls(names, Scores.of(fit), fit)
+
+    def accuracy(self, name: str) -> Rate:
+        """Accuracy of a stream's chosen site with its interval."""
+        row = self.names.index(name)
+        interval = self.scores.accuracy_interval(row) if self.fit is None else accuracy_interval(self.fit, row)
+        return Rate(CHANCE + float(self.scores.above[row]), interval)
+
+    def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
+        """(K, L) covariance of the scores; 0 on other groups."""
+        if self.fit is None or other.fit is None:
+            return np.zeros((len(self.names), len(other.names)))
+        return self.fit.covariance_with(other.fit)
+
+    def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
+        """Accuracy of a stream here minus there."""
+        here, there = self.accuracy(name), other.accuracy(name)
+        row, column = self.names.index(name), other.names.index(name)
+        variances = self.scores.covariance[row, row] * other.scores.covariance[column, column]
+        between = self.covariance_with(other)[row, column]
+        correlation = float(np.clip(between / sqrt(variances), -1, 1)) if variances > 0 else 0.0
+        gap = difference_interval(here.value, here.interval, there.value, there.interval, correlation)
+        return Rate(here.value - there.value, gap)
+
+
+def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
+    rows = [run.names.index(name) for name in names]
+    fit = run.fit
+    return CrossFit(
+        fit.above[rows], fit.peaks[rows], fit.differences[rows], fit.n_groups, fit.n_episodes, fit.seed
+    )
