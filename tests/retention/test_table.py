@@ -21,11 +21,13 @@ CONTRACT_KEYS = {
         "n_episodes", "n_items", "sr", "sr_original", "sr_swapped", "share_wrong", "share_outside",
         "chance_margin_episodes", "regime",
     },
-    "backbone": {"accuracy", "layer", "p_fwe"},
-    "action": {"accuracy", "layer", "iteration"},
-    "retention": {"published", "debiased", "ci"},
-    "controls": {"chance", "probe_minus_sr"},
+    "backbone": {"score", "ci", "peak", "at_most", "verdict", "site", "layer", "ties", "p_fwe", "exceeds"},
+    "action": {"score", "ci", "peak", "at_most", "verdict", "site", "layer", "ties", "iteration", "first_peak"},
+    "retention": {"value", "ci", "published", "defined", "note"},
+    "controls": {"missing", "probe_minus_sr", "n_groups"},
 }  # fmt: skip
+FORMER_KEYS = {"accuracy", "debiased", "bounded", "area", "chance", "beats", "plain"}
+"""A key that changed its meaning would be read as before."""
 
 
 @pytest.fixture
@@ -43,26 +45,49 @@ def test_a_row_joins_behaviour_peaks_and_retention(table: RetentionTable) -> Non
         100,
     )
     assert (row.success.sr, row.success.share_wrong, row.success.share_outside) == (0.6, 0.3, 0.1)
-    assert (row.backbone.accuracy, row.backbone.layer, row.backbone.depth) == (0.9, 1, 0.5)
-    assert (row.action.accuracy, row.action.layer, row.action.iteration) == (0.7, 1, 0)
+    assert (row.backbone.peak, row.backbone.layer, row.backbone.depth) == (pytest.approx(0.9), 1, 0.5)
+    assert (row.action.peak, row.action.layer, row.action.iteration) == (pytest.approx(0.7), 1, 0)
+    assert (row.backbone.site, row.action.site) == ("backbone.01.residual", "expert.01.residual@0")
+    assert (row.backbone.score, row.backbone.verdict) == (pytest.approx(0.9), "shown")
+    assert row.action.score is not None
+    assert 0.6 < row.action.score <= 0.7
     assert row.retention.published == pytest.approx(0.5)
+    assert row.retention.value == pytest.approx((row.action.score - 0.5) / 0.4)
     assert row.controls.probe_minus_sr == pytest.approx(0.3)
+    assert row.controls.missing == {"left": 0, "right": 0}
 
 
-def test_the_mean_averages_ratios_and_names_the_categories_left_out(table: RetentionTable) -> None:
+def test_retention_of_the_mean_is_the_ratio_of_the_two_columns_beside_it(table: RetentionTable) -> None:
+    """Over all probed categories: leaving out those without signal would choose lucky backbones."""
+    (mean,) = table.means
+    for part in ("backbone", "action"):
+        own = [getattr(row, part).score for row in table.rows]
+        assert getattr(mean, part).score == pytest.approx(sum(own) / 3)
+    assert mean.retention.value == pytest.approx((mean.action.score - 0.5) / (mean.backbone.score - 0.5))  # type: ignore[operator]
+    assert mean.categories == ("color", "shape", "counting")
+
+
+def test_the_published_mean_averages_ratios_and_names_the_categories_left_out(table: RetentionTable) -> None:
     (mean,) = table.means
     assert mean.retention.published == pytest.approx((0.2 / 0.4 + 0.3 / 0.3) / 2)
-    assert mean.backbone.accuracy == pytest.approx((0.9 + 0.8 + 0.55) / 3)
-    assert mean.categories == ("color", "shape", "counting")
+    assert mean.backbone.peak == pytest.approx((0.9 + 0.8 + 0.55) / 3)
     assert mean.left_out == ("counting",)
-    assert mean.retention.note == "without counting"
+    assert mean.retention.note == "published ratios without counting"
+
+
+def test_other_categories_change_no_number_of_a_category(probed_run: ProbedRun) -> None:
+    alone = retention_table([probed_run({"color": SIGNAL}, "alone")]).rows[0]
+    among = retention_table([probed_run({"shape": WEAK, "counting": NONE, "color": SIGNAL}, "among")]).rows[2]
+    assert (among.backbone, among.action, among.retention) == (alone.backbone, alone.action, alone.retention)
+    assert among.success == alone.success
 
 
 def test_an_undefined_ratio_stays_in_the_machine_readable_output(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[2]
     assert row["retention"]["published"] == pytest.approx(0.08 / 0.05)
     assert row["retention"]["defined"] is False
-    assert row["retention"]["note"] == "n/a (no backbone signal)"
+    most = 100 * row["backbone"]["at_most"]
+    assert row["retention"]["note"] == f"n/a (backbone not shown, could be up to {most:.0f} %)"
 
 
 def test_json_rows_have_the_keys_of_the_contract(table: RetentionTable) -> None:
@@ -71,6 +96,7 @@ def test_json_rows_have_the_keys_of_the_contract(table: RetentionTable) -> None:
     assert all({"category", "view"} <= set(row) for row in rows)
     for part, keys in CONTRACT_KEYS.items():
         assert all(set(row[part]) >= keys for row in rows), part
+        assert not any(FORMER_KEYS & set(row[part]) for row in rows), part
 
 
 def test_csv_has_one_line_per_row_and_numbers_in_every_interval_column(table: RetentionTable) -> None:
@@ -85,7 +111,7 @@ def test_a_run_without_activations_shows_success_rates_only(probed_run: ProbedRu
     probed = probed_run({"color": SIGNAL})
     scripted = ArrayRun(probed.path.parent / "scripted", "expert", probed.suite, probed.episodes, {})
     (row,) = retention_table([scripted]).rows
-    assert (row.success.sr, row.view, row.backbone.accuracy, row.retention.note) == (
+    assert (row.success.sr, row.view, row.backbone.score, row.retention.note) == (
         0.6,
         None,
         None,
@@ -135,7 +161,7 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
     frame = table.to_frame()
     undefined = frame[~frame["retention.defined"]]
     assert len(undefined) == 2 + 4, "two categories without signal, and the run without probes"
-    for name in ("retention.published", "retention.debiased", "retention.ci_low", "retention.ci_high"):
+    for name in ("retention.published", "retention.value", "retention.ci_low", "retention.ci_high"):
         assert undefined[name].map(math.isnan).all(), name
         assert frame[name].notna().any()
     assert math.isnan(frame["success.chance_margin_episodes"][3]), "a mean has none"
@@ -143,16 +169,15 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
     assert raw[1] == pytest.approx(0.08 / 0.05), "json keeps the raw ratio"
 
 
-FLOATS = (".sr", "margin", "accuracy", "ci_", "_ci_", "retention.", "share_", "depth", "minus", "chance", "p_fwe")
-TEXTS = ("retention.note", "minus", "minus_run")
+FLOATS = (".sr", "margin", "accuracy", ".score", ".peak", "at_most", "ci_", "_ci_", "retention.", "share_", "depth", "minus", "chance", "p_fwe")
+TEXTS = ("retention.note", "answers.score", "minus", "minus_run")
 
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:
     """Late iterations hold the decision itself as a noisy action; the first sees pure noise."""
     table = retention_table([probed_run({"color": ([0.5, 0.9], [[0.6, 0.8], [0.55, 0.95]])})])
     row, mean = table.all_rows
-    assert row.action.first_accuracy is not None
-    assert row.action.accuracy is not None
-    assert row.action.first_accuracy < row.action.accuracy
+    assert row.action.first_peak == 0.8
+    assert row.action.peak == pytest.approx(0.95)
     assert (row.run.call, mean.run.call) == (0, 0)
-    assert mean.action.first_accuracy == row.action.first_accuracy
+    assert mean.action.first_peak == row.action.first_peak

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import sqrt
+from math import isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 
 ACTION, BACKBONE = "action", "backbone"
 """Names of the two streams, in the order of the scores: retention is the first over the second."""
+_NOTHING = 1e-12
+"""A variance below this is the rounding of 0."""
 Limits = tuple[float | None, float | None]
 """A 95 % interval as rows, JSON and data frames hold it; (None, None) where the data set no limits."""
 
@@ -111,7 +113,11 @@ class Rate:
 
     def minus(self, other: "Rate") -> "Rate":
         """The difference, paired where both are of the same groups."""
-        correlation = 0.0 if self.share is None or other.share is None else self.share.correlation(other.share)
+        correlation = 0.0
+        if self.share is not None and other.share is not None and self.paired_with(other):
+            variances = self.share.variance, other.share.variance
+            shared = _not_surer(self.share.covariance(other.share), variances, self.share.groups.size, 1.0)
+            correlation = _correlation(shared, variances)
         gap = difference_interval(self.value, self.interval, other.value, other.interval, correlation)
         return Rate(self.value - other.value, gap)
 
@@ -152,20 +158,44 @@ class PooledScores:
         return Rate(CHANCE + float(self.scores.above[row]), interval)
 
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
-        """(K, L) covariance of the scores; 0 on other groups."""
-        if self.fit is None or other.fit is None:
+        """(K, L) covariance of the scores; 0 on other groups.
+
+        Of a stream with itself it leaves room for groups that nobody has seen, in which one run holds nothing.
+        """
+        if self.fit is None or other.fit is None or self.fit.seed != other.fit.seed:
             return np.zeros((len(self.names), len(other.names)))
-        return self.fit.covariance_with(other.fit)
+        between = self.fit.covariance_with(other.fit)
+        for name in set(self.names) & set(other.names):
+            row, column = self.names.index(name), other.names.index(name)
+            variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
+            most = max(abs(self.scores.above[row]), abs(other.scores.above[column]))
+            between[row, column] = _not_surer(between[row, column], variances, self.fit.n_groups, most)
+        return between
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
         """Accuracy of a stream here minus there."""
         here, there = self.accuracy(name), other.accuracy(name)
         row, column = self.names.index(name), other.names.index(name)
-        variances = self.scores.covariance[row, row] * other.scores.covariance[column, column]
-        between = self.covariance_with(other)[row, column]
-        correlation = float(np.clip(between / sqrt(variances), -1, 1)) if variances > 0 else 0.0
+        variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
+        correlation = _correlation(float(self.covariance_with(other)[row, column]), variances)
         gap = difference_interval(here.value, here.interval, there.value, there.interval, correlation)
         return Rate(here.value - there.value, gap)
+
+
+def _not_surer(covariance: float, variances: tuple[float, float], n_groups: int, most: float) -> float:
+    """The covariance of two estimates on the same groups, less where their difference would be known too well.
+
+    Two runs that agree in all G groups may differ in those that nobody has seen: in a share t of them, by `most`
+    each, with t² = 2 / ((G + 1)(G + 2)) on average, see `CrossFit.covariance`.
+    """
+    unseen = 2 * most**2 / ((n_groups + 1) * (n_groups + 2))
+    return min(covariance, max(0.0, (sum(variances) - unseen) / 2))
+
+
+def _correlation(covariance: float, variances: tuple[float, float]) -> float:
+    """0 where one of them does not vary, or is of a single group."""
+    scale = sqrt(variances[0] * variances[1]) if all(map(isfinite, variances)) else 0.0
+    return float(np.clip(covariance / scale, -1, 1)) if scale > _NOTHING else 0.0
 
 
 def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:

@@ -238,9 +238,12 @@ def _clear_words(p: float | None, exceeds: Exceeds) -> str:
         "random-features": "an untrained conjunction of pictures and words",
         "untrained": "the untrained network",
     }
-    equals = [words for name, words in controls.items() if exceeds.get(name) is False]
-    clear, link = ("above chance", "but no") if p < SIGNIFICANCE else ("not above chance", "nor")
-    return f"{clear}{f' {link} better than {" or ".join(equals)}' if equals else ''}, p = {p:.3f}"
+    missed = [words for name, words in controls.items() if exceeds.get(name) is False]
+    clear = p < SIGNIFICANCE
+    unshown = " or ".join(missed if clear else ["chance", *missed])
+    words = ["above chance"] if clear else []
+    words += [f"not shown to beat {unshown}"] if unshown else []
+    return f"{' but '.join(words)}, p = {p:.3f}"
 
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:

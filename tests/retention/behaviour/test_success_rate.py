@@ -3,7 +3,7 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import beta, binomtest, t
 
 from probe_kit.errors import SceneError, UsageError
 from probe_kit.retention import Regime, chance_margin, normalised_score, sensitivity, success_rate
@@ -69,7 +69,7 @@ def test_items_right_twice_are_tested_against_items_wrong_twice(outcome_table: O
     assert paired.p == pytest.approx(binomtest(14, 20, alternative="greater").pvalue)
 
 
-def twins(groups: int, knows: Callable[[int, int], bool]) -> pd.DataFrame:
+def doubles(groups: int, knows: Callable[[int, int], bool]) -> pd.DataFrame:
     """Groups of two items, each right in both layouts or wrong in both."""
     rows = [
         {
@@ -83,8 +83,8 @@ def twins(groups: int, knows: Callable[[int, int], bool]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_twins_that_answer_alike_count_as_one_item() -> None:
-    alike = success_rate(twins(40, lambda group, _: group % 5 < 3))
+def test_pairs_of_items_that_answer_alike_count_as_one_item() -> None:
+    alike = success_rate(doubles(40, lambda group, _: group % 5 < 3))
     assert alike.chance_margin == pytest.approx(chance_margin(40))
     assert alike.chance_margin_items == pytest.approx(chance_margin(80))
     assert alike.regime is Regime.NO_RELIABLE_KNOWLEDGE, "0.60 of 160 episodes, but only 40 answers"
@@ -92,15 +92,15 @@ def test_twins_that_answer_alike_count_as_one_item() -> None:
     assert alike.ci[1] - alike.ci[0] > 0.25
 
 
-def test_twins_that_answer_apart_count_as_items() -> None:
-    apart = success_rate(twins(40, lambda group, item: (group % 5 < 3) == (item == 0) or group % 4 == 0))
+def test_pairs_of_items_that_answer_apart_count_as_items() -> None:
+    apart = success_rate(doubles(40, lambda group, item: (group % 5 < 3) == (item == 0) or group % 4 == 0))
     assert apart.chance_margin == apart.chance_margin_items
 
 
 def test_a_guesser_with_a_fixed_preference_per_item_is_not_called_knowing() -> None:
     """Over episodes, which repeat the preference, it was in 9 % of categories."""
     generator = np.random.default_rng(0)
-    regimes = [success_rate(twins(75, lambda *_: bool(generator.random() < 0.5))).regime for _ in range(150)]
+    regimes = [success_rate(doubles(75, lambda *_: bool(generator.random() < 0.5))).regime for _ in range(150)]
     assert np.mean([found is Regime.KNOWLEDGE for found in regimes]) <= 0.025 + 3 * 0.0128
 
 
@@ -142,6 +142,23 @@ def test_a_table_without_distances_has_no_sensitivity(outcome_table: Outcomes) -
 @pytest.mark.parametrize(
     ("outcome", "expected"), [("correct", (0.025 ** (1 / 10), 1)), ("oob", (0, 1 - 0.025 ** (1 / 10)))]
 )
+def test_twelve_groups_of_four_that_are_all_right_are_known_like_twelve_tosses() -> None:
+    found = success_rate(doubles(12, lambda *_: True)).ci
+    exact = binomtest(12, 12).proportion_ci(0.95, "exact")
+    assert found == pytest.approx((exact.low, exact.high))
+    assert found == pytest.approx((0.735, 1), abs=5e-4)
+
+
+def test_the_interval_is_korn_and_graubards() -> None:
+    """Clopper and Pearson's, with as many episodes as count where groups answer alike."""
+    found = success_rate(doubles(40, lambda group, item: group % 5 < 2 or (group % 5 == 2 and item == 0)))
+    hits = np.array([4.0, 4, 2, 0, 0] * 8)
+    variance = np.sum((hits - 4 * 0.5) ** 2) * 40 / 39 / 160**2
+    count = 0.25 / variance * (t.ppf(0.975, 159) / t.ppf(0.975, 39)) ** 2
+    wanted = beta.ppf(0.025, count / 2, count / 2 + 1), beta.ppf(0.975, count / 2 + 1, count / 2)
+    assert (found.sr, found.ci) == (0.5, pytest.approx(wanted))
+
+
 def test_an_interval_has_a_width_even_where_all_episodes_agree(
     outcome: str, expected: tuple[float, float]
 ) -> None:

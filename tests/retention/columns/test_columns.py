@@ -100,8 +100,9 @@ def test_parts_are_frames_keyed_by_run_category_and_view(table: RetentionTable) 
         assert frame[["run", "category", "view"]].values.tolist()[0] == ["pi0", "color", "mean"]
         assert len(frame) == 3
     assert table.probes[["category", "stream"]].values.tolist()[:2] == [["color", "backbone"], ["color", "action"]]
-    assert table.probes.loc[0, "accuracy"] == 0.9
-    assert table.retention.loc[0, "bounded"] == table.rows[0].retention.bounded
+    assert table.probes.loc[0, "score"] == pytest.approx(0.9)
+    assert table.probes.loc[0, "verdict"] == "shown"
+    assert table.retention.loc[0, "value"] == table.rows[0].retention.value
     assert table.answers.empty
     assert table.interventions.empty
     assert "sr_answered" in table.rules

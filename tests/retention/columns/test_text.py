@@ -12,7 +12,7 @@ from probe_kit.train import ArrayRun, BaselineScore, Controls, UntrainedScore, l
 
 @pytest.fixture
 def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
-    """Pictures that give the answer away, an instruction that does not, and a twin."""
+    """Pictures that give the answer away, an instruction that does not, and an untrained network."""
     run = probed_run({"color": ([0.5, 0.9, 0.7], [[0.6, 0.7]])})
     sites = ("backbone.01.residual", "expert.01.residual@0")
     controls = Controls(
@@ -21,7 +21,7 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
             BaselineScore("instruction", "color", 0.51, (0.45, 0.57), 0.4, 0.5, 200),
         ),
         tuple(
-            UntrainedScore("color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "twin")
+            UntrainedScore("color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "pi0 (random weights)")
             for site, gain in zip(sites, (0.3, 0.2), strict=True)
         ),
     )
@@ -47,7 +47,7 @@ def test_json_has_controls_by_name_and_csv_a_column_each(table: RetentionTable) 
         row["controls"]["untrained"],
         row["backbone"]["minus_untrained"],
         row["action"]["minus_untrained"],
-    ) == ("twin", 0.3, 0.2)
+    ) == ("pi0 (random weights)", 0.3, 0.2)
     frame = table.to_frame()
     assert frame["controls.baselines.pixels"].tolist() == [0.75, 0.75]
     assert frame["action.minus_untrained_ci_high"][0] == pytest.approx(0.3)

@@ -1,7 +1,10 @@
 import json
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy import stats
 
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
@@ -25,12 +28,12 @@ def test_a_difference_is_the_first_group_minus_the_second(table: RetentionTable)
     color, shape, mean = table.differences
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
-    assert color.backbone_accuracy == pytest.approx(0.9 - 0.8)
-    assert color.action_accuracy == pytest.approx(0.7 - 0.8)
-    assert color.retention == pytest.approx(
-        table.rows[0].retention.debiased - table.rows[2].retention.debiased  # type: ignore[operator]
-    )
-    assert mean.backbone_accuracy == pytest.approx((0.1 + 0.35) / 2)
+    one, _, other, weaker = table.rows
+    assert color.backbone == pytest.approx(0.9 - 0.8)
+    assert color.action == pytest.approx(one.action.score - other.action.score)  # type: ignore[operator]
+    assert color.retention == pytest.approx(one.retention.value - other.retention.value)  # type: ignore[operator]
+    assert weaker.backbone.score is not None
+    assert mean.backbone == pytest.approx((0.1 + 0.9 - weaker.backbone.score) / 2)
     assert shape.backbone_ci is not None
     assert shape.backbone_ci[0] is not None
     assert shape.backbone_ci[0] > 0
@@ -38,8 +41,12 @@ def test_a_difference_is_the_first_group_minus_the_second(table: RetentionTable)
 
 def test_retention_is_compared_only_where_both_groups_have_it(table: RetentionTable) -> None:
     color, shape, mean = table.differences
-    assert shape.retention is None
-    assert mean.retention == color.retention
+    assert (shape.retention, shape.retention_ci) == (None, None)
+    assert color.retention is not None
+    first, second = (row.retention.value for row in table.means)
+    assert mean.retention == pytest.approx(first - second)  # type: ignore[operator]
+    assert mean.retention_ci is not None
+    assert mean.retention_ci[0] < mean.retention < mean.retention_ci[1]  # type: ignore[operator]
 
 
 def test_equal_behaviour_on_the_same_items_is_no_proof_of_equality(table: RetentionTable) -> None:
@@ -67,7 +74,7 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
     alone = probed_run({"color": SIGNAL}, "alone")
     table = retention_table({"both": [strong, weak], "strong": [alone]})
-    assert table.differences[0].backbone_accuracy == pytest.approx((0.9 + 0.8) / 2 - 0.9)
+    assert table.differences[0].backbone == pytest.approx((0.9 + 0.8) / 2 - 0.9)
     assert table.differences[0].paired
     assert [(mean.group, mean.run.model) for mean in table.means] == [
         ("both", "strong"), ("both", "weak"), ("strong", "alone"),
@@ -83,11 +90,50 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     assert "| with VQA: vqa |" in table.to_markdown()
     assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
     frame = table.differences_frame()
-    assert frame["backbone_accuracy"].round(6).tolist() == [0.1, 0.35, 0.225]
-    assert (frame["backbone_ci_low"] < frame["backbone_accuracy"]).all()
+    assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
+    assert frame["backbone"][0] == pytest.approx(0.1)
+    assert (frame["backbone_ci_low"] < frame["backbone"]).all()
 
 
 def test_keys_follow_the_runs_of_all_groups(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     with pytest.raises(UsageError, match="1 keys for 2 runs"):
         retention_table({"a": [run], "b": [run]}, keys=[None])
+
+
+# -- models as the unit --------------------------------------------------------------------------------------
+
+
+def test_groups_of_models_have_a_p_over_models_and_the_least_that_so_few_allow(probed_run: ProbedRun) -> None:
+    """Three against three cannot be below 0.1, whatever their questions say."""
+    groups = {
+        name: [probed_run({"color": ([0.5, 0.95], [[top + 0.02 * at]])}, f"{name}{at}") for at in range(3)]
+        for name, top in (("high", 0.85), ("low", 0.65))
+    }
+    table = retention_table(groups)
+    color, mean = table.differences
+    own = {row.run.model: row.retention.value for row in table.rows}
+    values = [[float(own[f"{name}{at}"] or 0) for at in range(3)] for name in groups]
+    for row in (color, mean):
+        found = row.retention_models
+        assert found is not None
+        assert (found.n, found.n_minus) == (3, 3)
+        assert found.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
+        assert found.smallest_p == pytest.approx(0.1)
+        assert found.difference == pytest.approx(np.mean(values[0]) - np.mean(values[1]))
+        welch = stats.ttest_ind(*values, equal_var=False).confidence_interval()
+        assert found.ci == pytest.approx((welch.low, welch.high))
+    assert color.sr_models is not None
+    assert (color.sr_models.p, color.sr_models.difference) == (1, 0), "all did the same"
+
+
+def test_a_single_model_against_another_has_no_p_over_models(table: RetentionTable) -> None:
+    assert all(row.sr_models is None and row.retention_models is None for row in table.differences)
+
+
+def test_a_group_with_a_model_without_probes_has_no_p_of_retention(probed_run: ProbedRun, tmp_path: Path) -> None:
+    one, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
+    bare = ArrayRun(tmp_path / "bare", "bare", one.suite, one.episodes, {})
+    rows = retention_table({"a": [one, other], "b": [bare]}).differences
+    assert all(row.retention is None and row.retention_models is None for row in rows)
+    assert all(row.sr_models is not None and row.sr_models.n_minus == 1 for row in rows)

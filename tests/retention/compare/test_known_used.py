@@ -157,9 +157,9 @@ def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(t
 def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
     reader, policy = runs
     assert match_runs(scored(reader, "logits"), policy).rows[-1].answered_correctly == 0, "it always says left"
-    debiased = match_runs(scored(reader, "order-balanced"), policy)
-    assert debiased.rows[-1].answered_correctly == 26
-    assert debiased.score == "order-balanced"
+    balanced = match_runs(scored(reader, "order-balanced"), policy)
+    assert balanced.rows[-1].answered_correctly == 26
+    assert balanced.score == "order-balanced"
 
 
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:

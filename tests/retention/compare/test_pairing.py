@@ -87,7 +87,7 @@ def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_r
         right = (curve.decisions[backbone] > 0) == curve.labels
         best.append(right[right.mean(axis=1).argmax()].astype(float))
     value, low, high, _ = oracle(pd.Series(best[0] - best[1]), pd.Series(curve.groups))
-    assert found.backbone_accuracy == pytest.approx(value)
+    assert found.backbone == pytest.approx(value)
     assert found.backbone_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
 
 
@@ -149,11 +149,11 @@ def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_
 
 
 def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
-    runs = [run(tmp_path / name, hits(0.5, at), called="twin") for at, name in enumerate("ab")]
-    with pytest.raises(UsageError, match=r"--against 'c' is none of the runs a \(twin · .*\), b"):
+    runs = [run(tmp_path / name, hits(0.5, at), called="pi0") for at, name in enumerate("ab")]
+    with pytest.raises(UsageError, match=r"--against 'c' is none of the runs a \(pi0 · .*\), b"):
         retention_table(runs, against="c")
-    with pytest.raises(UsageError, match="--against 'twin' is several of the runs"):
-        retention_table(runs, against="twin")
+    with pytest.raises(UsageError, match="--against 'pi0' is several of the runs"):
+        retention_table(runs, against="pi0")
     with pytest.raises(UsageError, match="there is no group 'z' to compare with; there are x, y"):
         retention_table({"x": runs[:1], "y": runs[1:]}, against="z")
     with pytest.raises(UsageError, match="needs a second run"):
@@ -229,7 +229,7 @@ def test_a_run_without_probes_is_compared_in_what_it_did(probed_run: ProbedRun, 
     bare = ArrayRun(tmp_path / "bare", "bare", probed.suite, probed.episodes, {})
     table = retention_table([probed, bare])
     assert [(row.category, row.view) for row in table.differences] == [("color", None), ("mean", None)]
-    assert all(row.sr == 0 and row.backbone_accuracy is None for row in table.differences)
+    assert all(row.sr == 0 and row.backbone is None for row in table.differences)
 
 
 # -- names ---------------------------------------------------------------------------------------------------

@@ -81,13 +81,13 @@ def test_runs_of_before_whose_cards_hold_a_family_only_are_unknown(tmp_path: Pat
 
 def test_the_embedded_policies_grew_from_the_embedded_reader_and_only_from_it(tmp_path: Path) -> None:
     own = reader(tmp_path / "r", load_model("vlm-tiny").card)
-    twin = reader(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)
+    untrained = reader(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)
     place = tmp_path / "copy of the reader"
     shutil.copytree(embedded_checkpoint("vlm-tiny"), place)
     copied = reader(tmp_path / "c", load_model("paligemma", str(place)).card)
     for name in ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state"):
         acting = policy(tmp_path / name, load_model(name).card)
-        assert [grew_from(acting, one) for one in (own, twin, copied)] == ["yes", "no", "yes"]
+        assert [grew_from(acting, one) for one in (own, untrained, copied)] == ["yes", "no", "yes"]
     assert grew_from(policy(tmp_path / "x", load_model("pi0-tiny", random_weights=True).card), own) == "no"
 
 

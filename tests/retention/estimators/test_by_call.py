@@ -73,7 +73,8 @@ def test_a_line_has_the_best_site_of_every_call_filled_where_it_is_evidence(
     assert curves.streams == ("backbone", "expert")
     line = curves.line("backbone")
     assert line.calls.tolist() == [0, 1, 2, 3]
-    np.testing.assert_allclose(line.accuracy, [0.5, 0.52, 0.9, 0.9])
+    np.testing.assert_allclose(line.accuracy[2:], 0.9)
+    np.testing.assert_allclose(line.accuracy[:2], 0.5, atol=0.03, err_msg="without the luck of the best site")
     assert line.significant.tolist() == [False, False, True, True]
     assert ((line.low < line.accuracy) & (line.accuracy < line.high)).all()
     assert line.null == pytest.approx([0.59] * 4, abs=0.01)

@@ -18,8 +18,8 @@ def test_text_is_escaped_and_only_defined_retention_is_coloured(table: Retention
     assert r"[95 \%]" not in text, "percent stands close to its number in every heading"
     lines = {line.split(" & ")[3]: line for line in text.splitlines() if line.startswith("pi0-tiny (random")}
     row = table.rows[0]
-    assert row.retention.bounded is not None
-    shown = rf"\cellcolor{{{heat_colour(row.retention.bounded)}}}{row.retention.bounded:.2f}"
+    assert row.retention.value is not None
+    shown = rf"\cellcolor{{{heat_colour(row.retention.value)}}}{row.retention.value:.2f}"
     assert shown in lines["color"]
     assert "cellcolor" not in lines[r"traffic\_sign"]
     assert text.count("{") == text.count("}")

@@ -19,8 +19,10 @@ def test_titles_and_rows_mark_random_weights(table: RetentionTable) -> None:
 
 
 def test_undefined_retention_says_why(table: RetentionTable) -> None:
-    assert table.to_markdown().count("| n/a | – | – | – |") == 1
-    assert "n/a (no backbone signal): counting." in table.to_markdown()
+    most = table.rows[1].backbone.at_most
+    assert most is not None
+    assert table.to_markdown().count("| n/a | – |") == 1
+    assert f"n/a (backbone not shown, could be up to {100 * most:.0f} %): counting." in table.to_markdown()
 
 
 def test_rows_have_as_many_cells_as_the_heading(table: RetentionTable) -> None:

@@ -28,7 +28,7 @@ def printed(table: RetentionTable, width: int = 80) -> str:
 
 @pytest.fixture
 def table(probed_run: ProbedRun) -> RetentionTable:
-    """Wide numbers: long names, 100 %, negative limits, controls, a twin, two groups."""
+    """Wide numbers: long names, 100 %, negative limits, controls, an untrained network, two groups."""
     accuracies = {"facial_emotion": SIGNAL, "traffic_sign": PERFECT, "counting": NONE}
     runs = [probed_run(accuracies, name) for name in ("one", "other")]
     for run in runs:
@@ -40,7 +40,7 @@ def table(probed_run: ProbedRun) -> RetentionTable:
                 for category in accuracies
             ),
             tuple(
-                UntrainedScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "a twin")
+                UntrainedScore(category, "mean", site, site, True, 0.9, 1.0, -0.1, (-0.2345, -0.0123), "untrained")
                 for site in ("backbone.01.residual", "expert.01.residual@0")
                 for category in accuracies
             ),
@@ -79,7 +79,12 @@ def rounded(values: list[object], scales: list[tuple[float, int]]) -> list[float
 SHARE, RATIO, WHOLE, PLACE, P = (100, 1), (1, 2), (100, 0), (1, 0), (1, 3)
 
 
-RETENTIONS = ("bounded", "bounded_ci", "area", "area_ci", "debiased", "ci", "published")
+RETENTIONS = ("value", "ci", "published")
+
+
+def could_be(stream: dict[str, object]) -> object:
+    """The limit that a verdict names; one that is shown needs none."""
+    return None if stream["verdict"] == "shown" else stream["at_most"]
 
 
 def expected(row: dict[str, dict[str, object]]) -> dict[str, list[float]]:
@@ -98,14 +103,21 @@ def expected(row: dict[str, dict[str, object]]) -> dict[str, list[float]]:
             [
                 *(row["retention"][name] if defined else None for name in RETENTIONS),
                 controls["probe_minus_sr"],
-                *(backbone[name] for name in ("accuracy", "ci", "layer")),
+                *(backbone[name] for name in ("score", "ci")),
+                could_be(backbone),
+                backbone["layer"],
                 backbone["ties"] or None,
                 backbone["p_fwe"],
-                *(action[name] for name in ("accuracy", "ci", "layer", "iteration")),
+                *(action[name] for name in ("score", "ci")),
+                could_be(action),
+                *(action[name] for name in ("layer", "iteration")),
                 action["ties"] or None,
-                *(action[name] for name in ("p_fwe", "first_accuracy")),
+                *(action[name] for name in ("p_fwe", "first_peak")),
             ],
-            [*[RATIO] * 7, SHARE, SHARE, SHARE, PLACE, PLACE, P, SHARE, SHARE, PLACE, PLACE, PLACE, P, SHARE],
+            [
+                *[RATIO] * 3, SHARE, SHARE, SHARE, WHOLE, PLACE, PLACE, P,
+                SHARE, SHARE, WHOLE, PLACE, PLACE, PLACE, P, SHARE,
+            ],
         ),
         "Controls": rounded(
             [
@@ -188,8 +200,8 @@ def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:
 
 def test_the_caption_says_why_retention_is_missing(probed_run: ProbedRun) -> None:
     text = printed(retention_table([probed_run({"color": SIGNAL, "counting": NONE})]))
-    assert "n/a (no backbone signal)" in " ".join(text.split())
-    assert "without counting" in " ".join(text.split())
+    assert "n/a (backbone not shown, could be up to" in " ".join(text.split())
+    assert "published ratios without counting" in " ".join(text.split())
 
 
 def test_several_runs_stand_in_one_table_under_a_title_that_names_all(probed_run: ProbedRun) -> None:
@@ -206,6 +218,6 @@ def test_a_policy_without_an_expert_has_the_same_columns(probed_run: ProbedRun) 
     runs = [probed_run({"color": SIGNAL}, "openvla", action_stream="action"), probed_run({"color": SIGNAL}, "pi0")]
     table = retention_table(runs)
     assert [row.run.action_stream for row in (*table.rows, *table.means)] == ["action", "expert"] * 2
-    assert [row.retention.bounded for row in table.rows] == [table.rows[0].retention.bounded] * 2 != [None, None]
+    assert [row.retention.value for row in table.rows] == [table.rows[0].retention.value] * 2 != [None, None]
     headings = [line for line in printed(table, 160).splitlines() if "backbone %" in line]
     assert len(headings) == 1

@@ -7,7 +7,7 @@ from probe_kit._terminal.console import out
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.report.category_summary import policy_summaries, verdict
-from probe_kit.retention.rows.parts import AnswerStats, BackbonePeak, RunInfo, SwapEffect
+from probe_kit.retention.rows.parts import AnswerStats, BackbonePart, RunInfo, SwapEffect
 from probe_kit.retention.rows.row import MEAN
 
 
@@ -37,7 +37,7 @@ def acts(category: str, backbone: float | None, used: str | None, sr: float = 0.
     return replace(
         row("acts", category, sr, Regime.KNOWLEDGE if sr > 0.7 else None, **run),
         view="mean",
-        backbone=BackbonePeak(accuracy=backbone, exceeds={"chance": chance}),
+        backbone=BackbonePart(score=backbone, exceeds={"chance": chance}),
         image_swap=SwapEffect(used=used),
     )
 
@@ -83,10 +83,10 @@ def test_a_category_that_was_not_asked_about_is_told_without_the_reader() -> Non
 
 def test_every_probed_policy_has_its_story_by_its_first_view() -> None:
     again = replace(acts("color", 0.6, "absent"), view="mean:language")
-    rows = [*ROWS, again, acts("color", 0.5, "absent", location="twin", random_weights=True)]
-    first, twin = policy_summaries(rows)
-    assert (first.policy, twin.policy) == ("pi0-tiny", "pi0-tiny (random weights)")
-    assert [len(one.categories) for one in (first, twin)] == [3, 1]
+    rows = [*ROWS, again, acts("color", 0.5, "absent", location="untrained", random_weights=True)]
+    first, untrained = policy_summaries(rows)
+    assert (first.policy, untrained.policy) == ("pi0-tiny", "pi0-tiny (random weights)")
+    assert [len(one.categories) for one in (first, untrained)] == [3, 1]
 
 
 def test_a_run_that_did_not_act_or_was_not_probed_has_none() -> None:
