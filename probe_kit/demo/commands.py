@@ -38,7 +38,6 @@ def demo(
         return
     with progress() as bar:
         made = run_demo(out_folder, lambda stage: counter(bar, stage))
-    out.print(made.table.to_rich())
     out.print(made.next_steps(), soft_wrap=True)
     out.print()
-    out.print(made.story.to_rich())  # last: the finding stays in view
+    out.print(made.table.to_rich())  # last: the finding stays in view

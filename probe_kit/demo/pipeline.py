@@ -14,7 +14,6 @@ from probe_kit.extract.run_layout import VIDEOS
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
-from probe_kit.retention.report.category_summary import PolicySummary, policy_summaries
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "counting")
@@ -30,11 +29,6 @@ class Demo:
     asked: Run
     run: Run
     table: RetentionTable
-
-    @property
-    def story(self) -> PolicySummary:
-        """What the reader knows, what can be read in the policy, and what it acts on."""
-        return policy_summaries(self.table.rows)[0]
 
     def next_steps(self) -> Text:
         """Where to look, and what to try."""

@@ -5,4 +5,6 @@ from typing import Literal
 AnswerScore = Literal["text", "logits", "order-balanced"]
 """How the answers of a VLM are read: from its text, from the logits of the options, or from logits averaged over
 both orders of the options."""
+Section = Literal["success", "rules", "answers", "probes", "retention", "controls", "interventions"]
+"""Groups of tables that `retention --details` shows."""
 TableFormat = Literal["table", "json", "csv", "markdown", "latex"]

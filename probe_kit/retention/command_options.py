@@ -2,14 +2,14 @@
 
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
 from probe_kit._terminal.console import split, whole_number
-from probe_kit._terminal.options import Names
+from probe_kit._terminal.options import Names, choices, some_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.choices import AnswerScore, TableFormat
+from probe_kit.retention.choices import AnswerScore, Section, TableFormat
 from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
@@ -162,6 +162,17 @@ SideWords = Annotated[
 
 # -- output ------------------------------------------------------------------------------------------------------
 
+Details = Annotated[
+    Names,
+    typer.Option(
+        "--details",
+        parser=some_of((*get_args(Section), "all")),
+        metavar=f"{choices((*get_args(Section), 'all'))},…",
+        help="Tables to print above the summary, comma-separated.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+NO_DETAILS = Names()
 Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.", rich_help_panel=OUTPUT)]
 Html = Annotated[
     Path | None,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
@@ -11,6 +11,7 @@ from probe_kit.retention import command_options as own
 
 if TYPE_CHECKING:
     from probe_kit.retention import RetentionTable
+    from probe_kit.retention.choices import Section
     from probe_kit.train.data.run_reader import RunReader
 
 
@@ -30,6 +31,7 @@ def retention(
     score: own.Score = "text",
     vlm_vla: own.VlmVla = False,
     with_side_words: own.SideWords = False,
+    details: own.Details = own.NO_DETAILS,
     style: own.Style = "table",
     html: own.Html = None,
     figures: own.Figures = None,
@@ -60,7 +62,7 @@ def retention(
         with_side_words=with_side_words, against=against,
     )  # fmt: skip
     if style == "table":
-        out.print(table.to_rich())
+        out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
     else:
         show = print_json_text if style == "json" else print_text
         show(getattr(table, f"to_{style}")())

@@ -1,8 +1,8 @@
 """The retention table: several runs joined, and the ways to write it down."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
@@ -13,7 +13,9 @@ from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
 from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings, wording_pairs
+from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import averaged_fields
+from probe_kit.retention.columns.summary import RunSummary, summarise_runs
 from probe_kit.retention.columns.text_table import TextTable, size_table, vlm_vla_tables
 from probe_kit.retention.compare.differences import Difference, group_differences
 from probe_kit.retention.compare.pairing import PairedRuns, compare_runs
@@ -172,13 +174,22 @@ class RetentionTable:
         further = [*wording_tables(self.wordings), *self.further_tables]
         return latex(self.all_rows, self.differences, self.notes, further, self.unpaired)
 
-    def to_rich(self) -> "Group":
-        """Success rates, retention, controls and differences as tables for a rich console."""
+    @property
+    def summary(self) -> list[RunSummary]:
+        """Per run a row and a sentence for every category: what the table found."""
+        return summarise_runs(self.rows, self.means)
+
+    def to_rich(self, details: Collection[Section] | Literal["all"] = ()) -> "Group":
+        """The summary for a rich console: one table, and a sentence per category as the last lines.
+
+        details: sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by "all".
+        """
         from probe_kit.retention.formats.terminal import rich_tables
 
-        return rich_tables(
-            self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
-        )
+        chosen: Collection[Section] = get_args(Section) if details == "all" else details
+        further = self.further_tables if "answers" in chosen else vlm_vla_tables(self.vlm_vla)
+        rows, differences, notes = self.all_rows, self.differences, self.notes
+        return rich_tables(rows, differences, notes, self.wordings, further, self.unpaired, chosen)
 
     @property
     def further_tables(self) -> list[TextTable]:

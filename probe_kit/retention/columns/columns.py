@@ -11,6 +11,7 @@ from operator import attrgetter
 from typing import Any
 
 from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.text import (
     action_place,
@@ -80,11 +81,15 @@ class Column:
 
 @dataclass(frozen=True)
 class ColumnGroup:
-    """Columns that answer one question. detail: shown where there is room, in Markdown and the report."""
+    """Columns that answer one question.
+
+    section: by which `--details` shows them. detail: shown only where there is room, in Markdown and the report.
+    """
 
     title: str
     columns: tuple[Column, ...]
     detail: bool = False
+    section: Section = "success"
 
 
 def _lower(sentence: str) -> str:
@@ -549,33 +554,44 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
     "Success rate": (
         ColumnGroup(
             "Does it act on the answer?",
-            (SR, DIFFERENCE_P, MARGIN, PAPER_MARGIN, REGIME, LEFT, RIGHT, FOLLOWS, USED),
+            (SR, DIFFERENCE_P, MARGIN, PAPER_MARGIN, REGIME, LEFT, RIGHT),
         ),
         ColumnGroup("Where the cube ended", (WRONG, OUTSIDE, NEVER_MOVED, INVALID_ACTION)),
-        ColumnGroup("What the outcome rule makes of it", RULES),
+        ColumnGroup("With the two pictures swapped", (FOLLOWS, USED), section="interventions"),
+        ColumnGroup("What the outcome rule makes of it", RULES, section="rules"),
         ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
     ),
     "Accuracy of answers": (
         ColumnGroup("Does it know the answer?", (ACCURACY, DIFFERENCE_P, MARGIN, REGIME, LEFT, RIGHT)),
-        ColumnGroup("How it answered", ANSWERS),
+        ColumnGroup("How it answered", ANSWERS, section="answers"),
         ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
     ),
     "Retention": (
-        ColumnGroup("What is retained", (RETENTION, PUBLISHED, PROBE_MINUS_SR)),
-        ColumnGroup("In the backbone", (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS)),
-        ColumnGroup("Where the action is made", (ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION)),
+        ColumnGroup("What is retained", (RETENTION, PUBLISHED, PROBE_MINUS_SR), section="retention"),
         ColumnGroup(
-            "Best sites, not corrected for having been chosen", (BACKBONE_PEAK, ACTION_PEAK, GROUPS), True
+            "In the backbone", (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS), section="probes"
+        ),
+        ColumnGroup(
+            "Where the action is made",
+            (ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION),
+            section="probes",
+        ),
+        ColumnGroup(
+            "Best sites, not corrected for having been chosen",
+            (BACKBONE_PEAK, ACTION_PEAK, GROUPS),
+            True,
+            section="probes",
         ),
     ),
     "Controls": (
-        ColumnGroup("What gives the answer away without the model", BASELINES),
+        ColumnGroup("What gives the answer away without the model", BASELINES, section="controls"),
         ColumnGroup(
             "Selectivity",
             (
                 share("backbone.selectivity", "backbone selectivity %", f"{_SELECTIVITY} of the backbone."),
                 share("action.selectivity", "action selectivity %", f"{_SELECTIVITY} of the action."),
             ),
+            section="controls",
         ),
         ColumnGroup(
             "Against the untrained network",
@@ -593,6 +609,7 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
                     f"{_UNTRAINED}: where the action is made.",
                 ),
             ),
+            section="controls",
         ),
     ),
 }

@@ -1,8 +1,9 @@
 """The tables of runs, as every format shows them: groups of columns, rows and captions."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
 from probe_kit.retention.columns.conditions import rule_sentences
 from probe_kit.retention.columns.lines import (
@@ -54,6 +55,11 @@ class Table:
     def run_rows(self) -> list[RetentionRow]:
         """Rows of runs, without differences."""
         return [row for row in self.rows if isinstance(row, RetentionRow)]
+
+    def only(self, sections: Collection[Section]) -> "Table | None":
+        """The same with the parts of some sections; None without any."""
+        parts = tuple(part for part in self.parts if part.section in sections)
+        return replace(self, parts=parts) if parts else None
 
     def without_details(self) -> "Table":
         """The same without columns that need room."""

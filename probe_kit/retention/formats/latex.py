@@ -6,6 +6,7 @@ from itertools import pairwise
 from probe_kit.retention.columns.columns import Column
 from probe_kit.retention.columns.lines import TableRow
 from probe_kit.retention.columns.row_names import named_cells, row_headings, titled
+from probe_kit.retention.columns.summary import summarise_runs, summary_table
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of
 from probe_kit.retention.columns.text import ABOVE_CHANCE
 from probe_kit.retention.columns.text_table import TextTable
@@ -24,6 +25,7 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "<": "$<$",
     ">": "$>$",
     "·": r"$\cdot$",
+    "✓": r"$^{*}$",
 }
 
 
@@ -36,12 +38,15 @@ def latex(
 ) -> str:
     """Complete `table` environments: success rates with differences between runs, retention, then controls.
 
-    further: tables behind these. notes: sentences for the author, as comments. unpaired: why runs have no
-    differences, a part of the caption.
-    Needs the packages booktabs and xcolor with its option `table`.
+    The summary and `further` tables stand behind these. notes: sentences for the author, as comments. unpaired:
+    why runs have no differences, a part of the caption. Needs the packages booktabs and xcolor with its option
+    `table`.
     """
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
     parts = ["% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}", *colours]
+    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    whole = summary_table(found, differences)
+    further = [whole, *further]
     parts += [_table(table.without_details()) for table in tables_of(rows, differences, unpaired)]
     parts += [
         _environment(f"{own.title} ({own.note})", own.columns, [_line(map(_marked, cells)) for cells in own.cells])

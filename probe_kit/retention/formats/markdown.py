@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.row_names import named_cells, row_headings, titled
+from probe_kit.retention.columns.summary import summarise_runs, summary_table
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of
 from probe_kit.retention.columns.text import ABOVE_CHANCE
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 
 def markdown(
@@ -20,11 +21,15 @@ def markdown(
     further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
 ) -> str:
-    """Success rates and, where there are any, retention, controls, wordings, more and notes.
+    """The summary, success rates and, where there are any, retention, controls, wordings, more and notes.
 
     Differences stand below the runs of their category; unpaired: why others have none.
     """
-    parts = [_table(table) for table in tables_of(rows, differences, unpaired)]
+    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    whole = summary_table(found, differences)
+    parts = [_markdown_table(whole.title, whole.columns, whole.cells), f"{whole.note}.\n"]
+    parts += [f"* {sentence}" for run in found for sentence in run.sentences]
+    parts += ["", *(_table(table) for table in tables_of(rows, differences, unpaired))]
     plain = [*wording_tables(wordings), *further]
     parts += [f"{_markdown_table(own.title, own.columns, own.cells)}\n{own.note}\n" for own in plain]
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])

@@ -1,13 +1,16 @@
 """Retention tables on a console: one block per table, whole at any width."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.retention.behaviour.wordings import WordingPair
+from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.lines import TableRow
+from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of, views_of
 from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, is_vlm, model_name
 from probe_kit.retention.columns.text_table import TextTable
@@ -15,8 +18,11 @@ from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Console, ConsoleOptions, Group, RenderableType
+    from rich.text import Text
 
+WIDE = 100
+"""Columns from which on the summary has room for intervals."""
 _Letters = Mapping[tuple[str | None, str], str]
 """By group and run, what it is called in a table of several."""
 
@@ -28,11 +34,12 @@ def rich_tables(
     wordings: Sequence[WordingPair] = (),
     further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
+    details: Collection[Section] = (),
 ) -> "Group":
-    """Success rates of all runs in one table, retention and controls in one per view; wordings, more and notes.
+    """The tables of some sections, and at last the summary: one table, the notes, and a sentence per category.
 
-    Several runs go by letters, under each other, with their differences below them. VLM runs stand above a rule.
-    further: tables behind these. unpaired: why runs have no differences.
+    Several runs go by letters in details, under each other, with their differences below them. VLM runs stand
+    above a rule. further: tables of the section `answers`. unpaired: why runs have no differences.
     """
     from rich.console import Group
     from rich.rule import Rule
@@ -43,11 +50,35 @@ def rich_tables(
     for of_mode in ([row for row in rows if is_vlm(row)], [row for row in rows if not is_vlm(row)]):
         if blocks and of_mode:
             blocks.append(Rule("VLM runs above, policy runs below", style="dim"))
-        tables = [part for table in tables_of(of_mode, differences) for part in views_of(table)]
+        chosen = [own for table in tables_of(of_mode, differences) if (own := table.only(details)) is not None]
+        tables = [part for table in chosen for part in views_of(table)]
         blocks += [_block(table.without_details(), called) for table in tables]
-    blocks += [Text(sentence, style="yellow") for sentence in unpaired]
-    plain = map(_plain, [*wording_tables(wordings), *further])
-    return Group(*blocks, *plain, *(Text(note, style="yellow") for note in notes))
+    plain = [*(wording_tables(wordings) if "success" in details else []), *further]
+    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    why = unpaired if details or len(found) > 1 else ()
+    said = [Text(sentence, style="yellow") for sentence in (*why, *notes)]
+    return Group(*blocks, *map(_plain, plain), _Summary(found, differences), *said, *_sentences(found))
+
+
+@dataclass(frozen=True)
+class _Summary:
+    """The summary's table; below 100 columns intervals stand in the sentences only."""
+
+    found: Sequence[RunSummary]
+    differences: Sequence[Difference]
+
+    def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
+        yield _plain(summary_table(self.found, self.differences, options.max_width >= WIDE))
+
+
+def _sentences(found: Sequence[RunSummary]) -> "Iterator[Text]":
+    from rich.text import Text
+
+    for run in found:
+        if len(found) > 1:
+            yield Text(run.title, style="bold")
+        for sentence in run.sentences:
+            yield Text(sentence)
 
 
 def _block(table: Table, called: _Letters) -> ResponsiveTable:
@@ -83,7 +114,7 @@ def _block(table: Table, called: _Letters) -> ResponsiveTable:
 
 def _plain(table: TextTable) -> ResponsiveTable:
     """Its first columns name the rows."""
-    fixed = 1 if table.columns[0] == "category" else 2
+    fixed = 1 if table.columns[0] == "category" and table.columns[1:2] != ("run",) else 2
     return ResponsiveTable(
         title=table.title,
         caption=table.note,

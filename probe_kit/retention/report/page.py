@@ -12,13 +12,13 @@ from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.columns.known_used_table import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
+from probe_kit.retention.columns.summary import summary_table
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.heat import heat_key
 from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.report.category_summary import policy_summaries
 from probe_kit.retention.report.episodes import PICTURES, episode_grid
 from probe_kit.retention.report.pictures import data_uri
 from probe_kit.retention.report.provenance import citation, provenance
@@ -86,7 +86,8 @@ def report_html(
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         random_weights=any(run.random_weights for run in runs),
-        policy_summaries=policy_summaries(table.rows),
+        finding=table.summary,
+        summary=plain_tables([summary_table(table.summary, table.differences)]),
         summaries=_summaries(table),
         notes=table.notes,
         tables={subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")},
