@@ -1,212 +1,211 @@
-"""Coverage of bounded and area retention, for one category and for the mean of twelve, and of perfect categories.
+"""Coverage and width of intervals of retention and accuracies: a category, a mean of twelve, and differences.
 
-    python benchmarks/retention_coverage.py [--draws 240] [--shuffles 20] [--perfect-draws 1000] [--first-seed 0]
-        [--worlds …]
+    python benchmarks/retention_coverage.py [--draws 240] [--random 30] [--only NAME;NAME] [--seed 0] [--workers 1]
 
-Means of twelve are made of the same draws: all of them are shuffled into twelves again and again, so that
-`draws` / 12 means that share nothing stand behind each coverage, put together in many ways. Perfect: 12 groups of
-twins in both layouts, every layer of a plateau always right.
-
-Cells: correctness of two layouts of every item at 19 backbone and 10 × 18 expert sites, neighbours correlated,
-items 0.3, streams 0.25. The truth of `bounded` is the ratio of the best sites' true accuracies above chance,
-that of `area` the ratio of their means over all sites. The last ten worlds took no part in any choice made in
-the package.
+The truth of a world is the mean of the cross-fitted scores over its draws: what they estimate. An interval without
+limits counts as covered; the column `open` says how many there are. Means of twelve are made of the same draws:
+all of them are shuffled into twelves again and again, so that `draws` / 12 means share nothing. `--only` takes
+beginnings of worlds or of sections: `random`, `mixed` (means of twelve different random worlds), `unpaired` and
+`paired` (differences of two runs on other and on the same items).
 """
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from coverage_worlds import LIMITS, World, own_worlds, random_world, sample
 from numpy.typing import NDArray
-from probe_kit.retention.estimators.bootstrap_draws import Estimate, average, retention_draws
-from probe_kit.retention.estimators.combined import area_fit, bounded_fit
-from probe_kit.retention.estimators.cross_fit import Crossfit, GroupScores, crossfit
 from rich.console import Console
-from scipy.special import ndtri
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.retention.estimators.retention import retention_interval
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.estimates.crossfit import CrossFit, crossfit
+from probe_kit.statistics.estimates.retention import retention, retention_difference
+from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
+from probe_kit.statistics.fieller import Interval
 
-LAYERS, ITERATIONS = 19, 10
-PLACES = (
-    [Site("backbone", layer) for layer in range(LAYERS)],
-    [Site("expert", layer, iteration=step) for step in range(ITERATIONS) for layer in range(LAYERS - 1)],
-)
-DEPTH = np.linspace(0, 1, LAYERS)
-Matrix = NDArray[np.float64]
-Shape = Callable[[Matrix], Matrix]
-
-
-def bump(centre: float, width: float) -> Shape:
-    """A peak of height 1."""
-    return lambda depth: np.exp(-0.5 * ((depth - centre) / width) ** 2)
-
-
-def plateau(start: float) -> Shape:
-    """0 before `start`, then 1."""
-    return lambda depth: (depth >= start).astype(float)
+SHUFFLES = 20
+GATE = 0.92
+Covered = tuple[float, float]
+"""Share of intervals that hold the truth, and their median width."""
 
 
 @dataclass(frozen=True)
-class World:
-    """top: best backbone accuracy above chance; retention: the expert's share of it, grown over iterations."""
+class Study:
+    """The fits of one world, with the scores above chance that they estimate."""
 
-    name: str
-    top: float
-    retention: float
-    backbone: Shape
-    expert: Shape
-    growth: tuple[float, float] = (0.8, 1.0)
-    items: int = 150
-    neighbours: float = 0.9
-    of_group: int = 1
+    world: World
+    fits: list[CrossFit]
 
-    def above(self) -> tuple[Matrix, Matrix]:
-        """True accuracy above chance: (19,) of the backbone, (180,) of the expert."""
-        growth = np.linspace(*self.growth, ITERATIONS)[:, None]
-        expert = self.retention * self.top * growth * self.expert(DEPTH[1:])
-        return self.top * self.backbone(DEPTH), expert.ravel()
+    @property
+    def truth(self) -> NDArray[np.float64]:
+        """(2,) of (expert, backbone)."""
+        above = np.mean([fit.above for fit in self.fits], axis=0)
+        if self.world.retention == 0 and not self.world.same:
+            above[0] = 0.0
+        return above
 
-    def truth(self) -> tuple[float, float]:
-        """Ratio of maxima, and of means."""
-        backbone, expert = self.above()
-        return float(expert.max() / backbone.max()), float(expert.mean() / backbone.mean())
+    @property
+    def ratio(self) -> float:
+        """True retention."""
+        return float(self.truth[0] / self.truth[1])
 
 
-TUNING = tuple(
-    World(f"{strength}, {shape}, {retention:.2f}", top, retention, bump(2 / 3, width), bump(2 / 3, width))
-    for strength, top in (("strong", 0.25), ("weak", 0.12))
-    for shape, width in (("broad", 0.35), ("narrow", 0.15))
-    for retention in (0.25, 0.5, 0.8, 1.0)
-)[:15]
-OWN = (
-    World("plateaus", 0.3, 0.6, plateau(0.4), plateau(0.5)),
-    World("early backbone, late expert", 0.25, 0.5, bump(0.3, 0.2), bump(0.9, 0.2)),
-    World("expert falls over iterations", 0.3, 0.7, bump(0.6, 0.3), bump(0.4, 0.3), growth=(1.0, 0.2)),
-    World("expert rises from nothing", 0.3, 0.7, bump(0.6, 0.3), bump(0.8, 0.2), growth=(0.0, 1.0)),
-    World("60 items", 0.25, 0.6, bump(0.6, 0.3), bump(0.6, 0.3), items=60),
-    World("neighbours 0.3", 0.25, 0.6, bump(0.6, 0.3), bump(0.6, 0.3), neighbours=0.3),
-    World("two layers wide", 0.3, 0.5, bump(0.6, 0.07), bump(0.6, 0.07)),
-    World("very strong", 0.45, 0.9, bump(0.7, 0.3), bump(0.7, 0.3)),
-    World("expert twice as narrow", 0.3, 0.8, bump(0.6, 0.3), bump(0.6, 0.12)),
-    World("expert better than backbone", 0.2, 1.2, bump(0.6, 0.3), bump(0.6, 0.3)),
-)
+def study(world: World, draws: int, seed: int) -> Study:
+    """`draws` data sets of a world."""
+    seeds = [derive_seed("coverage", seed, world.name, number) for number in range(draws)]
+    with threadpool_limits(1):
+        fits = [crossfit(sample(world, np.random.default_rng(one)), derive_seed("halvings", one)) for one in seeds]
+    return Study(world, fits)
 
 
-PERFECT = tuple(
-    World(
-        f"top {0.5 + top:.2f}, kept {kept:.2f}", top, kept, plateau(0.4), plateau(0.4), (1.0, 1.0), 24, of_group=2
+def covered(intervals: Sequence[Interval], truths: Sequence[float]) -> Covered:
+    """Coverage and median width; widths of those that have limits."""
+    held = [one.low <= truth <= one.high for one, truth in zip(intervals, truths, strict=True)]
+    widths = [one.high - one.low for one in intervals if one.bounded]
+    return float(np.mean(held)), float(np.median(widths)) if widths else float("inf")
+
+
+def twelves(count: int, seed: int) -> list[NDArray[np.intp]]:
+    """Draws put together by twelve, in many ways."""
+    generator = np.random.default_rng(seed)
+    orders = [generator.permutation(count) for _ in range(SHUFFLES)]
+    return [order[start : start + 12] for order in orders for start in range(0, count - 11, 12)]
+
+
+def row_of(found: Study, seed: int) -> tuple[list[str], list[float]]:
+    """What the table says of a world, and the coverages of category and mean."""
+    scores = [Scores.of(fit) for fit in found.fits]
+    means = [Scores.mean([scores[at] for at in chosen]) for chosen in twelves(len(scores), seed)]
+    intervals = [retention(one).interval for one in scores]
+    of_one = covered(intervals, [found.ratio] * len(intervals))
+    of_mean = covered([retention(one).interval for one in means], [found.ratio] * len(means))
+    accuracies = []
+    for row in (1, 0):
+        true = 0.5 + found.truth[row]
+        each = covered([accuracy_interval(fit, row) for fit in found.fits], [true] * len(scores))
+        mean = covered([one.accuracy_interval(row) for one in means], [true] * len(means))
+        accuracies.append(f"{each[0]:.1%} {each[1]:.2f}, mean {mean[0]:.1%}")
+    open_ = np.mean([not interval.bounded for interval in intervals])
+    texts = [f"{found.ratio:.2f}", *(f"{share:.1%} {width:.2f}" for share, width in (of_one, of_mean))]
+    return [found.world.name, *texts, f"{open_:.0%}", *accuracies], [of_one[0], of_mean[0]]
+
+
+def table_of(title: str, studies: Sequence[Study], draws: int, seed: int) -> Table:
+    """A row per world, and the least coverages without the documented limits."""
+    table = Table("world", "truth", "category", "mean of 12", "open", "backbone", "action", title=title)
+    least = []
+    for found in studies:
+        texts, coverages = row_of(found, seed)
+        table.add_row(*texts)
+        if not found.world.name.startswith(LIMITS):
+            least.append(coverages)
+    if least:
+        lowest = np.min(least, axis=0)
+        bound = GATE - 2 * np.sqrt(0.95 * 0.05 / draws)
+        table.add_row("least", "", f"{lowest[0]:.1%}", f"{lowest[1]:.1%}", "", f"gate {bound:.1%}", "")
+    return table
+
+
+def mixed(studies: Sequence[Study], count: int, seed: int) -> str:
+    """Means of twelve different worlds: ratio of the means, true and estimated."""
+    generator, intervals, truths = np.random.default_rng(seed), [], []
+    for _ in range(count):
+        chosen = [studies[at] for at in generator.permutation(len(studies))[:12]]
+        truth = np.sum([one.truth for one in chosen], axis=0)
+        for _ in range(20):
+            scores = [Scores.of(one.fits[generator.integers(len(one.fits))]) for one in chosen]
+            intervals.append(retention(Scores.mean(scores)).interval)
+            truths.append(float(truth[0] / truth[1]))
+    share, width = covered(intervals, truths)
+    return f"mixed: means of twelve different random worlds: covered {share:.1%}, width {width:.2f}"
+
+
+def paired(first: World, second: World, draws: int, seed: int) -> str:
+    """Differences of two runs on the same items, for a category and for a mean of twelve."""
+    pairs = []
+    for number in range(draws):
+        one = derive_seed("paired", seed, first.name, second.name, number)
+        generator = np.random.default_rng(one)
+        common = generator.standard_normal(sum(first.sizes))
+        streams = [stream for world in (first, second) for stream in sample(world, generator, common)]
+        halves = derive_seed("halvings", one)
+        pairs.append((crossfit(streams[:2], halves), crossfit(streams[2:], halves)))
+    return f"paired: {first.name} minus {second.name}: " + _differences(pairs, True, seed)
+
+
+def unpaired(first: Study, second: Study, seed: int) -> str:
+    """Differences of two runs on other items."""
+    return f"unpaired: {first.world.name} minus {second.world.name}: " + _differences(
+        list(zip(first.fits, second.fits, strict=True)), False, seed
     )
-    for top in (0.5, 0.47)
-    for kept in (1.0, 0.5)
+
+
+def _differences(pairs: Sequence[tuple[CrossFit, CrossFit]], same: bool, seed: int) -> str:
+    above = np.mean([[a.above, b.above] for a, b in pairs], axis=0)
+    truth = float(above[0, 0] / above[0, 1] - above[1, 0] / above[1, 1])
+    one, mean = [], []
+    for a, b in pairs:
+        one.append(
+            retention_difference(Scores.of(a), Scores.of(b), a.covariance_with(b) if same else None).interval
+        )
+    for chosen in twelves(len(pairs), seed):
+        sides = [Scores.mean([Scores.of(pairs[at][side]) for at in chosen]) for side in (0, 1)]
+        between = np.sum([pairs[at][0].covariance_with(pairs[at][1]) for at in chosen], axis=0) / 144
+        mean.append(retention_difference(sides[0], sides[1], between if same else None).interval)
+    of_one, of_mean = covered(one, [truth] * len(one)), covered(mean, [truth] * len(mean))
+    texts = [f"{share:.1%} {width:.2f}" for share, width in (of_one, of_mean)]
+    return f"true {truth:+.2f}, category {texts[0]}, mean of 12 {texts[1]}"
+
+
+PAIRS = tuple(
+    (
+        replace(one, name=f"{one.name} {one.retention:g}"),
+        replace(one, name=f"{one.name} {other:g}", retention=other),
+    )
+    for one, other in (
+        (World("40 groups", 0.3, 0.8, sizes=(4,) * 40), 0.4),
+        (World("30 groups", 0.3, 0.5, sizes=(4,) * 30), 0.5),
+        (World("12 groups", 0.4, 0.9, sizes=(4,) * 12), 0.3),
+    )
 )
-
-
-def correlated(generator: np.random.Generator, cells: int, columns: int, neighbours: float) -> Matrix:
-    """(cells, columns) normal values, those of neighbouring cells correlated."""
-    values = generator.standard_normal((cells, columns))
-    for cell in range(1, cells):
-        values[cell] = neighbours * values[cell - 1] + np.sqrt(1 - neighbours**2) * values[cell]
-    return values
-
-
-def draw(world: World, generator: np.random.Generator) -> tuple[GroupScores, GroupScores]:
-    """Backbone and expert of one data set, its groups of `of_group` items each."""
-    shared = generator.standard_normal(2 * world.items)
-    found = []
-    for above in world.above():
-        of_item = np.repeat(correlated(generator, above.size, world.items, world.neighbours), 2, axis=1)
-        own = correlated(generator, above.size, 2 * world.items, world.neighbours)
-        values = 0.5 * shared + np.sqrt(0.75) * (np.sqrt(0.3) * of_item + np.sqrt(0.7) * own)
-        groups = np.arange(2 * world.items) // (2 * world.of_group)
-        found.append(GroupScores.of(values < ndtri(0.5 + above)[:, None], groups))
-    return found[0], found[1]
-
-
-def fits(world: World, seed: int) -> tuple[Crossfit, Crossfit]:
-    """Bounded and area fit of one data set."""
-    backbone, expert = draw(world, np.random.default_rng(seed))
-    return bounded_fit(backbone, expert, PLACES, 0.5, seed), area_fit(backbone, expert, 0.5)
-
-
-def study(world: World, draws: int, shuffles: int, first_seed: int) -> str:
-    """Median and coverage of both estimates over `draws` data sets, and of their means by twelve."""
-    found = [fits(world, first_seed + number) for number in range(draws)]
-    parts = [f"{world.name:30}"]
-    for name, truth, of_kind in zip(("bounded", "area"), world.truth(), zip(*found, strict=True), strict=True):
-        covered, median, width = coverage(of_kind, truth)
-        of_twelve, mean = mean_coverage(of_kind, truth, shuffles, first_seed)
-        parts.append(
-            f"{name} true {truth:.2f} median {median:.2f} covered {covered:5.1%} width {width:.2f}; twelve: mean "
-            f"{mean:.2f} covered {of_twelve:5.1%}"
-        )
-    return "  ".join(parts)
-
-
-def coverage(of_kind: Sequence[Crossfit], truth: float) -> tuple[float, float, float]:
-    """Share of intervals that hold the truth, median estimate, median width."""
-    intervals = [retention_interval(fit) for fit in of_kind]
-    covered = np.mean([interval.low <= truth <= interval.high for interval in intervals])
-    median = np.median([fit.expert / fit.backbone for fit in of_kind])
-    return float(covered), float(median), float(np.median([one.high - one.low for one in intervals]))
-
-
-def mean_coverage(of_kind: Sequence[Crossfit], truth: float, shuffles: int, seed: int) -> tuple[float, float]:
-    """Share of intervals of means by twelve that hold the truth, and the mean of all estimates."""
-    estimates = [
-        Estimate(fit.expert / fit.backbone, retention_draws(fit, 0.5, number), number, fit.sizes.size)
-        for number, fit in enumerate(of_kind)
-    ]
-    generator, covered = np.random.default_rng(seed), []
-    for _ in range(shuffles):
-        order = generator.permutation(len(estimates))
-        twelves = [order[start : start + 12] for start in range(0, len(order) - 11, 12)]
-        covered += [_covers(average([estimates[at] for at in twelve]), truth) for twelve in twelves]
-    return float(np.mean(covered)), float(np.mean([estimate.value for estimate in estimates]))
-
-
-def perfect(world: World, draws: int, first_seed: int) -> str:
-    """Coverage of debiased, bounded and area retention where all groups of the backbone agree, or nearly so."""
-    found: dict[str, list[Crossfit]] = {"debiased": [], "bounded": [], "area": []}
-    for seed in range(first_seed, first_seed + draws):
-        backbone, expert = draw(world, np.random.default_rng(seed))
-        found["debiased"].append(crossfit(backbone, expert, 0.5, seed))
-        found["bounded"].append(bounded_fit(backbone, expert, PLACES, 0.5, seed))
-        found["area"].append(area_fit(backbone, expert, 0.5))
-    truth = world.truth()
-    parts = [f"perfect, 12 groups: {world.name:22}"]
-    for name, of_kind in found.items():
-        covered, median, width = coverage(of_kind, truth[name == "area"])
-        parts.append(
-            f"{name} true {truth[name == 'area']:.2f} median {median:.2f} covered {covered:5.1%} width {width:.2f}"
-        )
-    return "  ".join(parts)
-
-
-def _covers(mean: Estimate, truth: float) -> bool:
-    low, high = mean.centred.ci
-    return low is None or high is None or low <= truth <= high
 
 
 def main() -> None:
-    """Run both studies and print each world as it ends."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=240, help="a multiple of 12")
-    parser.add_argument("--shuffles", type=int, default=20)
-    parser.add_argument("--perfect-draws", type=int, default=1000)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--worlds", default="", help="beginnings of names, separated by semicolons; default all")
+    """Run every section and print it as it ends."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=240, help="data sets per world, a multiple of 12")
+    parser.add_argument("--random", type=int, default=30, help="number of random worlds")
+    parser.add_argument("--only", default="", help="beginnings of worlds or sections, separated by semicolons")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
     asked = parser.parse_args()
-    console = Console(width=220)
+    names, console = tuple(asked.only.split(";")), Console(width=170)
+    own = [world for world in own_worlds() if world.name.startswith(names)]
+    drawn = [random_world(1000 * asked.seed + number) for number in range(asked.random)]
+    wanted = [section.startswith(names) for section in ("random", "mixed", "unpaired", "paired")]
+    with ProcessPoolExecutor(asked.workers) as pool:
+        one_study = partial(study, draws=asked.draws, seed=asked.seed)
+        if own:
+            console.print(table_of("own worlds", list(pool.map(one_study, own)), asked.draws, asked.seed))
+        if any(wanted[:3]):
+            found = list(pool.map(one_study, drawn))
+            console.print(table_of("random worlds", found, asked.draws, asked.seed))
+            if len(found) >= 12:
+                console.print(mixed(found, 20, asked.seed), highlight=False)
+            for first, second in zip(found[::3], found[1::3], strict=False):
+                console.print(unpaired(first, second, asked.seed), highlight=False)
+        for line in pool.map(partial(_paired, draws=asked.draws, seed=asked.seed), PAIRS if wanted[3] else ()):
+            console.print(line, highlight=False)
+
+
+def _paired(pair: tuple[World, World], draws: int, seed: int) -> str:
     with threadpool_limits(1):
-        for world in PERFECT if asked.perfect_draws else ():
-            console.print(perfect(world, asked.perfect_draws, asked.first_seed), highlight=False)
-        console.print(f"one category and means of twelve, {asked.draws} draws")
-        names = tuple(asked.worlds.split(";"))
-        for world in (world for world in (*OWN, *TUNING) if world.name.startswith(names)):
-            console.print(study(world, asked.draws, asked.shuffles, asked.first_seed), highlight=False)
+        return paired(*pair, draws, seed)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.statistics.estimates.balanced import GroupSums
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -31,8 +33,8 @@ class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
     chance: against relabellings. random_features, untrained: against a control that is right half of the time;
-    it takes more if the control is better than that. spread: standard error of the three, the largest, measured
-    over `SEEDS` seeds.
+    it takes more if the control is better than that. absent: share of experiments in which a stream without any
+    signal is called absent. spread: standard error of the four, the largest, measured over `SEEDS` seeds.
     """
 
     items: int
@@ -40,6 +42,7 @@ class Power:
     chance: float
     random_features: float
     untrained: float
+    absent: float
     spread: float
 
 
@@ -74,9 +77,9 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
     signal = np.zeros(sites)
     signal[_carriers(sites)] = above
     parts = np.array([_part(items, signal, -(-draws // SEEDS), SEEDS * seed + part) for part in range(SEEDS)])
-    chance, random_features, untrained = parts.mean(axis=0).tolist()
+    chance, random_features, untrained, absent = parts.mean(axis=0).tolist()
     spread = float((parts.std(axis=0, ddof=1) / sqrt(SEEDS)).max())
-    return Power(items, above, chance, random_features, untrained, spread)
+    return Power(items, above, chance, random_features, untrained, absent, spread)
 
 
 def items_needed(above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Needed:
@@ -148,8 +151,11 @@ def _carriers(sites: int) -> slice:
     return slice(first, first + count)
 
 
-def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tuple[float, float, float]:
-    """Shares of `draws` experiments in which each test sees the signal, with a limit of chance of their own."""
+def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tuple[float, float, float, float]:
+    """Shares of `draws` experiments with a limit of chance of their own.
+
+    In how many each test sees the signal, and in how many a untrained without signal is called absent.
+    """
     generator = np.random.default_rng([seed, items, signal.size])
     groups = np.repeat(np.arange(items // ITEMS_PER_GROUP), ITEMS_PER_GROUP * LAYOUTS)
     nothing = np.zeros(signal.size)
@@ -164,10 +170,18 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
                 here.mean(axis=1).max() > limit,
                 better_than_reference(here, reference, groups, draw).min() < SIGNIFICANCE,
                 better_than_best(here, untrained, groups, draw).min() < SIGNIFICANCE,
+                at_most(_group_sums(untrained)) < ABSENT_BELOW,
             )
         )
-    chance, random_features, beaten = np.mean(seen, axis=0).tolist()
-    return chance, random_features, beaten
+    chance, random_features, beaten, absent = np.mean(seen, axis=0).tolist()
+    return chance, random_features, beaten, absent
+
+
+def _group_sums(right: NDArray[np.bool_]) -> GroupSums:
+    """Of (S, E) correctness of whole groups."""
+    size = ITEMS_PER_GROUP * LAYOUTS
+    sums = right.reshape(len(right), -1, size).sum(axis=2).astype(np.float64)
+    return GroupSums(sums, np.full(sums.shape[1], float(size)))
 
 
 @lru_cache(maxsize=256)

@@ -105,6 +105,7 @@ def _answer(one: "Needed") -> str:
 
 def _print(found: "list[Power]") -> None:
     from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+    from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
     from probe_kit.statistics.significance import detectable
 
     headings = (
@@ -112,12 +113,16 @@ def _print(found: "list[Power]") -> None:
         "against chance %",
         "against random-features %",
         "against an untrained network %",
+        "absent if nothing %",
         "± (standard error)",
         "red control from %",
     )
     rows = [
         (
-            *(f"{100 * share:.0f}" for share in (one.above, one.chance, one.random_features, one.untrained)),
+            *(
+                f"{100 * share:.0f}"
+                for share in (one.above, one.chance, one.random_features, one.untrained, one.absent)
+            ),
             f"{100 * one.spread:.1f}",
             f"{100 * detectable(one.items):.0f}",
         )
@@ -126,8 +131,9 @@ def _print(found: "list[Power]") -> None:
     out.print(
         ResponsiveTable(
             title="Power: how often a signal is seen",
-            caption="random-features and the untrained network at chance; ±: of the three, the largest, "
-            "measured over seeds; a leaking control of that accuracy is red in 80 % of suites",
+            caption="random-features and the untrained network at chance; absent: how often a stream without signal is called absent, "
+            f"below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over seeds; a leaking control "
+            "of that accuracy is red in 80 % of suites",
             name="items",
             names=tuple(str(one.items) for one in found),
             styles=("",) * len(found),

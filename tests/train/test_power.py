@@ -26,6 +26,14 @@ def test_without_a_signal_power_is_the_false_alarm_rate() -> None:
     assert max(found.chance, found.random_features, found.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
 
 
+def test_nothing_is_called_absent_with_many_items_and_hardly_with_few() -> None:
+    """Whatever the signal of the stream that is tested."""
+    few, many = simulate(24, 0.25, draws=40), simulate(300, 0.25, draws=20)
+    assert few.absent < 0.15
+    assert many.absent > 0.9
+    assert simulate(60, 0.0, sites=1, draws=60).absent > simulate(60, 0.0, sites=19, draws=60).absent
+
+
 def test_what_a_control_could_have_seen_at_this_size() -> None:
     assert detectable(150) == pytest.approx(0.5 + (1.6449 + 0.8416) * (0.25 / 150) ** 0.5, abs=1e-4)
     assert detectable(24) > detectable(150) > 0.59
@@ -150,9 +158,12 @@ def test_sizes_and_signals_that_cannot_be_are_refused() -> None:
 def test_the_command_prints_every_number_of_items() -> None:
     found = CliRunner().invoke(app, ["power", "--items", "24,60", "--signal", "25", "--draws", "20", "--json"])
     assert found.exit_code == 0, found.output
-    assert [row["items"] for row in json.loads(found.stdout)] == [24, 60]
+    rows = json.loads(found.stdout)
+    assert [row["items"] for row in rows] == [24, 60]
+    assert all(0 <= row["absent"] <= 1 for row in rows)
     text = CliRunner().invoke(app, ["power", "--items", "24", "--signal", "25", "--draws", "20"]).stdout
     assert "against an untrained network" in text
+    assert "absent if nothing" in " ".join(text.split())
     assert CliRunner().invoke(app, ["power", "--width", "16"]).stdout.startswith("151 items")
     assert CliRunner().invoke(app, ["power", "--items", "many"]).exit_code == 2
 

@@ -28,8 +28,9 @@ CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, no
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
 LEGEND = (
-    "VLM right: share of its answers that are right. Backbone, action: accuracy of probes in the policy's backbone "
-    "and where its action is made, at sites that other questions chose. Success: the cube ends on the right picture. "
+    "VLM: share of its answers that are right. Backbone, action: accuracy of probes in the policy's backbone and "
+    "where its action is made, at sites that other questions chose. Success: the cube ends on the right "
+    "picture. "
     f"{MARK} above every control that was run. Retention: share of the backbone's signal left in the action"
 )
 
@@ -94,7 +95,7 @@ class CategorySummary:
         return _CONCLUSIONS[verdict(self.row)]
 
 
-HEADINGS = ("VLM right %", "backbone %", "action %", "success %", "retention", "verdict")
+HEADINGS = ("VLM %", "backbone %", "action %", "success %", "retention", "verdict")
 _CONCLUSIONS: dict[CategoryVerdict, str] = {
     "known": "The VLM knows the answer.",
     "unknown": "Not shown that the VLM knows the answer.",

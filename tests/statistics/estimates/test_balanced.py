@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from probe_kit.errors import UnbalancedEpisodesError, UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums, remove_fold_priors
+from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
 
 ITEMS = 20
 LABELS = np.tile([True, False], ITEMS)
@@ -94,3 +96,23 @@ def test_nan_a_single_fold_and_shapes_that_do_not_fit_are_refused() -> None:
         balanced_sums(np.zeros((1, 4)), labels, [0, 0, 0, 0], list("abcd"))
     with pytest.raises(UsageError, match="a label and a fold for each episode"):
         balanced_sums(np.zeros((1, 5)), labels, [0, 0, 1, 1], list("abcd"))
+
+
+def test_a_real_probe_trained_with_most_of_one_side_missing_leans_to_neither_side() -> None:
+    generator = np.random.default_rng(4)
+    labels, groups = np.tile([True, False], 300), np.repeat(np.arange(150), 4)
+    kept = ~labels | (generator.random(labels.size) >= 0.6)
+    features = generator.standard_normal((labels.size, 8)) + 0.15 * np.where(labels, 1, -1)[:, None]
+    labels, groups, features = labels[kept], groups[kept], features[kept]
+    folds = nested_folds(labels, groups, seed=0)
+    fold_of = np.zeros(labels.size, int)
+    for number, fold in enumerate(folds):
+        fold_of[fold.outer.test] = number
+    probe = probe_site(Samples.pooled(features), labels, np.empty((labels.size, 0), bool), folds)
+
+    def lean(decisions: np.ndarray) -> float:
+        right = (decisions > 0) == labels
+        return float(right[~labels].mean() - right[labels].mean())
+
+    assert lean(probe.decisions) > 0.4, "what is missing is learned"
+    assert abs(lean(remove_fold_priors(probe.decisions[None], labels, fold_of)[0])) < 0.15

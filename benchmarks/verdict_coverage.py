@@ -1,0 +1,238 @@
+"""Success-rate intervals, the verdict `absent`, comparisons of models, and probes with missing episodes.
+
+    python benchmarks/verdict_coverage.py [--draws 600] [--only rates;absent] [--seed 0] [--workers 1]
+
+rates: coverage of success rates in seven kinds of worlds with 6 to 150 groups, of their means over twelve
+categories, and of differences of two runs. absent: how often it is said where the best site has exactly the bound,
+and where nothing is there. models: exchange p and Welch's interval of groups of models that do not differ.
+missing: retention of real nested probes with up to 60 % of one side missing; it uses a sixtieth of the draws.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from coverage_worlds import World, draw_right
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.stats import binomtest
+from threadpoolctl import threadpool_limits
+
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
+from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
+from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.data.samples import Samples
+
+Sizes = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """A kind of world of success rates.
+
+    rate: true share. alike: correlation of the episodes of a group (beta-binomial). sizes: episodes of G groups.
+    """
+
+    name: str
+    rate: float
+    alike: float
+    sizes: Callable[[int], Sizes]
+
+    def draw(self, groups: int, generator: np.random.Generator) -> tuple[NDArray[np.bool_], Sizes]:
+        """(E,) outcomes and groups."""
+        group_of = np.repeat(np.arange(groups), self.sizes(groups))
+        if self.alike == 0:
+            return generator.random(group_of.size) < self.rate, group_of
+        scale = 1 / self.alike - 1
+        chance = generator.beta(self.rate * scale, (1 - self.rate) * scale, groups)
+        return generator.random(group_of.size) < chance[group_of], group_of
+
+
+def _equal(size: int) -> Callable[[int], Sizes]:
+    return lambda groups: np.full(groups, size)
+
+
+def _unequal(groups: int) -> Sizes:
+    return 2 * (1 + np.arange(groups) % 8)
+
+
+def _dominant(groups: int) -> Sizes:
+    """One group has 29 % of the episodes."""
+    sizes = np.full(groups, 4)
+    sizes[0] = round(0.29 / 0.71 * 4 * (groups - 1))
+    return sizes
+
+
+KINDS = (
+    Rates("groups of four, SR .8", 0.8, 0.3, _equal(4)),
+    Rates("groups of four, SR .5", 0.5, 0.3, _equal(4)),
+    Rates("groups of four, SR .99", 0.99, 0.3, _equal(4)),
+    Rates("independent episodes, SR .7", 0.7, 0.0, _equal(4)),
+    Rates("groups that agree, SR .6", 0.6, 0.9, _equal(4)),
+    Rates("groups of unequal size, SR .7", 0.7, 0.3, _unequal),
+    Rates("one group with 29 %, SR .7", 0.7, 0.3, _dominant),
+)
+GROUPS = (6, 12, 24, 75, 150)
+
+
+def rates(draws: int, seed: int) -> Table:
+    """Coverage and width of a category, of a mean of twelve and of a difference."""
+    table = Table("world", *(f"{count} groups" for count in GROUPS), title="SR: category, mean of 12, difference")
+    for kind in KINDS:
+        table.add_row(kind.name, *(_rates(kind, count, draws, seed) for count in GROUPS))
+    return table
+
+
+def _rates(kind: Rates, groups: int, draws: int, seed: int) -> str:
+    generator = np.random.default_rng(derive_seed("rates", seed, kind.name, groups))
+    shares = [Share.of(*kind.draw(groups, generator)) for _ in range(draws)]
+    limits = [share.interval() for share in shares]
+    held = np.mean([one.low <= kind.rate <= one.high for one in limits])
+    width = np.median([one.high - one.low for one in limits])
+    means, gaps = [], []
+    for _ in range(draws):
+        chosen = generator.permutation(draws)[:12]
+        mean = mean_interval([shares[at].value for at in chosen], [limits[at] for at in chosen])
+        means.append(mean.low <= kind.rate <= mean.high)
+        a, b = chosen[:2]
+        gap = difference_interval(shares[a].value, limits[a], shares[b].value, limits[b])
+        gaps.append(gap.low <= 0 <= gap.high)
+    return f"{held:.1%} {width:.2f}, {np.mean(means):.1%}, {np.mean(gaps):.1%}"
+
+
+SITES = (1, 4, 19, 180)
+
+
+def absent(draws: int, seed: int) -> Table:
+    """How often `absent` is said: wrongly at the bound, where one site or all have it, and rightly of nothing."""
+    title = f"absent below {ABSENT_BELOW}: share of experiments"
+    table = Table("sites", "groups", "one site at the bound", "all sites at the bound", "nothing", title=title)
+    for sites in SITES:
+        for groups in (24, 40, 75, 150):
+            found = []
+            for name in ("one", "all", "nothing"):
+                above = np.zeros(sites)
+                above[slice(None) if name == "all" else slice(sites // 2, sites // 2 + 1)] = ABSENT_BELOW - 0.5
+                generator = np.random.default_rng(derive_seed("absent", seed, sites, groups, name))
+                shares = 0.5 + (np.zeros(sites) if name == "nothing" else above)
+                said = [at_most(_sites(shares, groups, generator)) < ABSENT_BELOW for _ in range(draws)]
+                found.append(f"{np.mean(said):.1%}")
+            table.add_row(str(sites), str(groups), *found)
+    return table
+
+
+def _sites(shares: NDArray[np.float64], groups: int, generator: np.random.Generator) -> GroupSums:
+    """Groups of four episodes; neighbouring sites are correlated."""
+    group_of = np.repeat(np.arange(groups), 4)
+    common = generator.standard_normal(group_of.size)
+    right = draw_right(World("sites", 0.0, 0.0), shares - 0.5, common, group_of, generator)
+    return GroupSums(right.reshape(shares.size, groups, 4).sum(axis=2).astype(float), np.full(groups, 4.0))
+
+
+def models(draws: int, seed: int) -> Table:
+    """False alarms of the exact p and of Welch's interval where two groups of models do not differ."""
+    table = Table(
+        "models", "p ≤ .05", "smallest p", "Welch without 0", title="groups of models that do not differ"
+    )
+    for count in (3, 4, 5, 6):
+        generator = np.random.default_rng(derive_seed("models", seed, count))
+        # Between models 0.08, and what the items of each add.
+        values = 0.5 + generator.normal(0, np.hypot(0.08, 0.03), (draws, 2, count))
+        p = [exchange_p(*pair) for pair in values]
+        out = [not interval.low <= 0 <= interval.high for interval in (welch_interval(*pair) for pair in values)]
+        alarms = np.mean([one.p <= SIGNIFICANCE for one in p])
+        table.add_row(f"{count} + {count}", f"{alarms:.1%}", f"{p[0].smallest:.3f}", f"{np.mean(out):.1%}")
+    return table
+
+
+MISSING = (0.0, 0.1, 0.25, 0.4, 0.6)
+WIDTH, PAIRS = 16, 150
+
+
+def missing(draws: int, seed: int) -> Table:
+    """Retention by real nested probes of one network, with more and more episodes of the left side missing."""
+    table = Table(
+        "left missing", "backbone", "action", "ratio of the means", "±", title="missing episodes of one side"
+    )
+    above = np.array([_probed(derive_seed("missing", seed, number)) for number in range(draws)])
+    for place, share in enumerate(MISSING):
+        here = above[:, place]
+        expert, backbone = here.mean(axis=0)
+        each = (here[:, 0] - expert / backbone * here[:, 1]) / backbone
+        error = each.std(ddof=1) / np.sqrt(draws) if draws > 1 else np.nan
+        numbers = (backbone, expert, expert / backbone, error)
+        table.add_row(f"{share:.0%}", *(f"{number:.3f}" for number in numbers))
+    return table
+
+
+def _probed(seed: int) -> NDArray[np.float64]:
+    """(len(MISSING), 2) scores above chance of (expert, backbone) on the same items."""
+    generator = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(PAIRS), 4)
+    labels = np.tile([True, False], 2 * PAIRS)
+    drawn = generator.random(labels.size)
+    features = [_features(labels, strength, generator) for strength in (0.20, 0.32, 0.26, 0.50, 0.75, 0.6)]
+    found = []
+    for share in MISSING:
+        kept = ~labels | (drawn >= share)
+        folds = nested_folds(labels[kept], groups[kept], seed=0)
+        fold_of = np.zeros(int(kept.sum()), np.int64)
+        for number, fold in enumerate(folds):
+            fold_of[fold.outer.test] = number
+        nothing = np.empty((fold_of.size, 0), np.bool_)
+        decisions = np.array([
+            probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds).decisions for one in features
+        ])  # fmt: skip
+        sums = balanced_sums(decisions, labels[kept], fold_of, groups[kept])
+        streams = [Stream.of(sums.only(rows), [0, 1, 2]) for rows in ([0, 1, 2], [3, 4, 5])]
+        found.append(crossfit(streams, seed).above)
+    return np.array(found)
+
+
+def _features(labels: NDArray[np.bool_], strength: float, generator: np.random.Generator) -> NDArray[np.float64]:
+    values = generator.standard_normal((labels.size, WIDTH))
+    values[:, 0] += strength * np.where(labels, 1, -1)
+    return values
+
+
+SECTIONS: dict[str, Callable[[int, int], Table]] = {
+    "rates": rates,
+    "absent": absent,
+    "models": models,
+    "missing": missing,
+}
+
+
+def _run(name: str, draws: int, seed: int) -> Table:
+    with threadpool_limits(1):
+        return SECTIONS[name](max(2, draws // 60) if name == "missing" else draws, seed)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the sections and print each as it ends."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=600)
+    parser.add_argument("--only", default=";".join(SECTIONS), help="sections, separated by semicolons")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    asked = parser.parse_args(arguments)
+    console = Console(width=170)
+    error = binomtest(round(0.95 * asked.draws), asked.draws).proportion_ci()
+    console.print(f"{asked.draws} draws: 95 % is known to {error.low:.1%} … {error.high:.1%}", highlight=False)
+    with ProcessPoolExecutor(asked.workers) as pool:
+        for table in pool.map(partial(_run, draws=asked.draws, seed=asked.seed), asked.only.split(";")):
+            console.print(table)
+
+
+if __name__ == "__main__":
+    main()
