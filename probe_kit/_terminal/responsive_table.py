@@ -71,6 +71,11 @@ class ResponsiveTable:
     styles: tuple[str, ...]
     parts: tuple[Part, ...]
 
+    @property
+    def width(self) -> int:
+        """Columns of a console on which it is one table."""
+        return max(Cell(name).width for name in (self.name, *self.names)) + sum(part.width for part in self.parts)
+
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
         from rich.text import Text
 

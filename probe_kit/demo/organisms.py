@@ -193,6 +193,7 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
     """
     said = verdict(row)
+    said = "absent" if said == "not shown" else said  # so few items cannot show that it is absent
     bounded = (
         row.image_swap.net_follow_rate_ci is not None
         and (row.image_swap.net_follow_rate_ci[1] or 0.0) < SMALLEST_EFFECT_OF_INTEREST

@@ -131,9 +131,9 @@ def _print(found: "list[Power]") -> None:
     out.print(
         ResponsiveTable(
             title="Power: how often a signal is seen",
-            caption="random-features and the untrained network at chance; absent: how often a stream without signal is called absent, "
-            f"below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over seeds; a leaking control "
-            "of that accuracy is red in 80 % of suites",
+            caption="random-features and the untrained network at chance; absent: how often a stream without "
+            f"signal is called absent, below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over "
+            "seeds; a leaking control of that accuracy is red in 80 % of suites",
             name="items",
             names=tuple(str(one.items) for one in found),
             styles=("",) * len(found),

@@ -23,7 +23,7 @@ from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 
-CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, not acted on"]
+CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, not acted on", "not shown"]
 """A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
@@ -41,15 +41,17 @@ def verdict(row: RetentionRow) -> CategoryVerdict:
     In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored image
     swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says *acted
     on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed what the
-    policy acts on. A VLM knows a category in which it answers in the regime of knowledge.
+    policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy, else *not shown*.
+    A VLM knows a category in which it answers in the regime of knowledge.
     """
     if is_vlm(row):
         return "known" if _knows(row) else "unknown"
+    nothing: CategoryVerdict = "absent" if row.backbone.verdict == "absent" else "not shown"
     if row.image_swap.used is not None:
-        return cast("Verdict", row.image_swap.used)
+        return nothing if row.image_swap.used == "absent" else cast("Verdict", row.image_swap.used)
     if _knows(row):
         return "acted on" if row.backbone.has_signal else "acted on, not found"
-    return "encoded, not acted on" if row.backbone.has_signal else "absent"
+    return "encoded, not acted on" if row.backbone.has_signal else nothing
 
 
 def _knows(row: RetentionRow) -> bool:
@@ -102,7 +104,8 @@ _CONCLUSIONS: dict[CategoryVerdict, str] = {
     "used": "The answer is used.",
     "encoded, unused": "Shown in the backbone, not used.",
     "encoded, acted against": "Shown in the backbone; the policy acts against it.",
-    "absent": "Not shown in the backbone, and the policy does not act on it.",
+    "absent": "Absent from the backbone, and the policy does not act on it.",
+    "not shown": "Not shown in the backbone, and not acted on: more items would tell.",
     "acted on, not found": "The policy acts on it, and the probes did not find it.",
     "acted against, not found": "The policy acts against it, and the probes did not find it.",
     "follows": "The action follows the pictures; there are no probes.",

@@ -62,13 +62,14 @@ def rich_tables(
 
 @dataclass(frozen=True)
 class _Summary:
-    """The summary's table; below 100 columns intervals stand in the sentences only."""
+    """The summary's table; where it would not fit, intervals stand in the sentences only."""
 
     found: Sequence[RunSummary]
     differences: Sequence[Difference]
 
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
-        yield _plain(summary_table(self.found, self.differences, options.max_width >= WIDE))
+        whole, short = (_plain(summary_table(self.found, self.differences, wide)) for wide in (True, False))
+        yield whole if options.max_width >= max(WIDE, whole.width) else short
 
 
 def _sentences(found: Sequence[RunSummary]) -> "Iterator[Text]":

@@ -1,0 +1,153 @@
+"""The summary: one table, and a sentence per category, from one definition for every format."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from probe_kit.retention import RetentionRow, RetentionTable
+from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
+from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table, verdict
+from probe_kit.retention.rows.parts import (
+    ActionPart,
+    AnswerStats,
+    BackbonePart,
+    RetentionPart,
+    RunInfo,
+    SwapEffect,
+)
+from probe_kit.retention.rows.row import MEAN
+
+
+def row(mode: str, category: str, sr: float | None = 0.5, **run: Any) -> RetentionRow:
+    """Of a run that answers or acts. run: fields of its `RunInfo`."""
+    plain: dict[str, Any] = {
+        "location": mode, "model": "pi0-tiny" if mode == "acts" else "vlm-tiny", "random_weights": False,
+        "weights_sha256": None, "suite": "suite@1", "settings": "r", "probes": None, "action_stream": "expert",
+    }  # fmt: skip
+    regime = None if sr is None else Regime.KNOWLEDGE if sr > 0.7 else Regime.NO_RELIABLE_KNOWLEDGE
+    ci = None if sr is None else (sr - 0.1, min(1.0, sr + 0.1))
+    return RetentionRow(
+        category=category,
+        view=None,
+        run=RunInfo(mode=mode, **{**plain, **run}),  # type: ignore[arg-type]
+        success=SuccessRate(n_episodes=48, n_items=24, sr=sr, ci=ci, regime=regime, chance_margin=0.2),
+    )
+
+
+def answers(category: str, sr: float = 1.0, picture: str | None = None, **run: Any) -> RetentionRow:
+    return replace(row("answers", category, sr, **run), answers=AnswerStats(picture=picture))
+
+
+def acts(
+    category: str, backbone: float | None, used: str | None, sr: float | None = 0.5, **run: Any
+) -> RetentionRow:
+    shown = backbone is not None and backbone > 0.7
+    part: dict[str, Any] = {"score": backbone, "ci": (0.4, 1.0), "at_most": 0.78, "exceeds": {"chance": shown}}
+    part["verdict"] = None if backbone is None else "shown" if shown else "not shown"
+    return replace(
+        row("acts", category, sr, **run),
+        view="mean",
+        backbone=BackbonePart(**part),
+        action=ActionPart(**part),
+        retention=RetentionPart(value=1.0, ci=(0.8, 1.2), defined=shown),
+        image_swap=SwapEffect(used=used, follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12))
+        if used
+        else SwapEffect(),
+    )
+
+
+ASKED = [answers("color"), answers("state"), answers("counting", 0.5), answers(MEAN, 0.83)]
+ACTED = [
+    acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "encoded, unused", 0.66), acts("counting", 0.52, "absent"),
+    acts(MEAN, 0.83, None),
+]  # fmt: skip
+
+
+def split(*rows: RetentionRow) -> tuple[list[RetentionRow], list[RetentionRow]]:
+    return [one for one in rows if one.category != MEAN], [one for one in rows if one.category == MEAN]
+
+
+def test_a_sentence_says_what_was_found_with_numbers_uncertainty_items_and_what_follows() -> None:
+    (found,) = summarise_runs(*split(*ASKED, *ACTED))
+    color, state, counting = found.sentences
+    assert color == (
+        "Color (24 items): the VLM answers right in 100 %, 90 to 100; the backbone holds the answer (100 %, 40 to "
+        "100); so does the action expert (100 %, 40 to 100); the action follows it (in 4 % of swapped pictures), and "
+        "the cube ends right in 94 %, 84 to 100. The answer is used."
+    )
+    assert "the action does not follow it (in 4 % of swapped pictures, at most 12 %)" in state
+    assert state.endswith("Shown in the backbone, not used.")
+    assert "the backbone is not shown to hold it (52 %, could be up to 78 %)" in counting
+    assert "Absent" not in counting, "a large p is no absence"
+
+
+def test_a_regime_that_says_nothing_beside_an_interval_above_one_half_names_its_margin() -> None:
+    (found,) = summarise_runs(*split(*ACTED))
+    assert "56 to 76, less than the 20 points above one half that guessing can reach" in found.sentences[1]
+    assert "guessing can reach" not in found.sentences[0]
+
+
+ELSEWHERE = [answers(name, suite="another@1") for name in ("color", MEAN)]
+BLIND = [answers(name, picture="none") for name in ("color", MEAN)]
+
+
+@pytest.mark.parametrize("rows", [ACTED, [*ACTED, *ELSEWHERE], [*ACTED, *BLIND]])
+def test_a_policy_stands_alone_where_no_vlm_was_asked_the_same(rows: list[RetentionRow]) -> None:
+    found = next(one for one in summarise_runs(*split(*rows)) if one.run == "pi0-tiny")
+    assert found.beside == ""
+    assert all("VLM" not in sentence for sentence in found.sentences)
+
+
+def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
+    (found,) = summarise_runs(*split(*ASKED))
+    assert found.sentences[0] == (
+        "Color (24 items): the VLM answers right in 100 %, 90 to 100. The VLM knows the answer."
+    )
+    assert summary_table([found]).columns == ("category", "VLM %", "verdict")
+
+
+def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control() -> None:
+    (found,) = summarise_runs(*split(*ASKED, *ACTED))
+    table = summary_table([found])
+    assert table.columns == ("category", *HEADINGS)
+    color, _, counting, mean = table.cells
+    assert color == (
+        "Color", f"100 [90, 100] {MARK}", f"100 [40, 100] {MARK}", f"100 [40, 100] {MARK}", f"94 [84, 100] {MARK}",
+        "1.00 [0.80, 1.20]", "used",
+    )  # fmt: skip
+    assert counting[-2:] == ("n/a", "not shown")
+    assert mean[0] == "Mean"
+    assert mean[-1] == ""
+
+
+def test_several_runs_stand_in_one_table_by_category() -> None:
+    again = [replace(one, run=replace(one.run, location="b", label="early")) for one in ACTED]
+    found = summarise_runs(*split(*ACTED, *again))
+    table = summary_table(found)
+    assert [cells[:2] for cells in table.cells[:2]] == [("Color", "pi0-tiny"), ("Color", "early")]
+
+
+@pytest.mark.parametrize("width", [80, 100, 120, 200])
+def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(width: int) -> None:
+    rows, means = split(*ASKED, *ACTED)
+    console = Console(width=width, record=True)
+    with console.capture() as printed:
+        console.print(RetentionTable(rows, means).to_rich())
+    text = printed.get()
+    assert text.count("category") == 1, "one header: one table, and it is not split"
+    assert ("[40, 100]" in text.split("Color (24")[0]) == (width >= 120)
+    assert " ".join(text.split()).endswith("Not shown in the backbone, and not acted on: more items would tell.")
+
+
+def test_used_is_said_only_where_an_intervention_was_stored() -> None:
+    assert verdict(acts("color", 1.0, None, 0.95)) == "acted on"
+    assert verdict(acts("color", 1.0, None, 0.5)) == "encoded, not acted on"
+    assert verdict(acts("color", 0.5, None, 0.95)) == "acted on, not found"
+    assert verdict(acts("color", 0.5, None, 0.5)) == "not shown"
+    assert verdict(acts("color", 0.5, "used", 0.5)) == "used"
+    absent = acts("color", 0.5, "absent", 0.5)
+    assert verdict(replace(absent, backbone=replace(absent.backbone, verdict="absent"))) == "absent"
+    (found,) = summarise_runs(*split(acts("color", 1.0, None, 0.95), acts(MEAN, 1.0, None)))
+    assert "was not tested: run `probe-kit intervene`" in found.sentences[0]
