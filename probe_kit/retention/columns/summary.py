@@ -38,11 +38,11 @@ LEGEND = (
 def verdict(row: RetentionRow) -> CategoryVerdict:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
-    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored image
-    swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says *acted
-    on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed what the
-    policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy, else *not shown*.
-    A VLM knows a category in which it answers in the regime of knowledge.
+    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored
+    image swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says
+    *acted on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed
+    what the policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy,
+    else *not shown*. A VLM knows a category in which it answers in the regime of knowledge.
     """
     if is_vlm(row):
         return "known" if _knows(row) else "unknown"

@@ -1,24 +1,29 @@
-"""The retention table as a notebook shows it: success rates, probes and retention on heat colours."""
+"""The retention table as a notebook shows it: the summary, and success rates, probes and retention below it."""
 
 from collections.abc import Sequence
 from html import escape
 
 from probe_kit._terminal.local_paths import without_places
+from probe_kit.retention.columns.summary import summarise_runs, summary_table
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables, plain_tables
+from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 _CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
 _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of text
 
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
-    """The report's first tables, without its page: headings explain themselves when pointed at."""
-    found = [
+    """The summary, and folded below it the report's first tables: headings explain themselves when pointed at."""
+    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    summary = plain_tables([summary_table(found, differences)])
+    said = "".join(f"<li>{_safe(sentence)}</li>" for run in found for sentence in run.sentences)
+    tables = [
         table for table in html_tables(rows, differences) if table.subject != "controls" and not table.details
     ]
-    return _heading(rows) + "".join(map(_table, found))
+    details = f"<details><summary>All tables</summary>{''.join(map(_table, tables))}</details>"
+    return f"{_heading(rows)}{''.join(map(_table, summary))}<ul>{said}</ul>{details}"
 
 
 def _safe(text: str) -> str:

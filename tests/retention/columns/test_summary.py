@@ -60,8 +60,8 @@ def acts(
 
 ASKED = [answers("color"), answers("state"), answers("counting", 0.5), answers(MEAN, 0.83)]
 ACTED = [
-    acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "encoded, unused", 0.66), acts("counting", 0.52, "absent"),
-    acts(MEAN, 0.83, None),
+    acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "encoded, unused", 0.66),
+    acts("counting", 0.52, "absent"), acts(MEAN, 0.83, None),
 ]  # fmt: skip
 
 
