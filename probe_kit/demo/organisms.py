@@ -220,7 +220,7 @@ def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
             ),
             Part(
                 "What they rest on",
-                ("SR %", "± Δ", "follows / against", "backbone", "p", "exceeds", "action", "retention [95 %]"),
+                ("SR %", "± Δ", "follow / reversal %", "backbone", "p", "exceeds", "action", "retention [95 %]"),
                 tuple(map(_number_cells, findings)),
             ),
         ),

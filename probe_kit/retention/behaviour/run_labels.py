@@ -15,7 +15,7 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
 
 
 def full_name(label: str, random_weights: bool, heard: bool = False, group: str | None = None) -> str:
-    """A label, marked if nobody trained the model or it only captured, with its group if there is one."""
+    """A label, marked if the weights are random or the model only captured, with its group if there is one."""
     name = label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
     return name if group is None else f"{group}: {name}"
 
@@ -23,8 +23,7 @@ def full_name(label: str, random_weights: bool, heard: bool = False, group: str 
 def distinct_labels(runs: Sequence[RunReader]) -> dict[str, str]:
     """By location, the label of each run, so that no two full names are equal.
 
-    Runs of one name are told apart by the hash of their settings; where that is the same too, by their folders;
-    and where these have one name as well, by their number.
+    Runs of one name get the hash of their settings, where that is the same their folders, and else a number.
     """
     labels = {str(run.location): run.label for run in runs}
     for mark in _MARKS:

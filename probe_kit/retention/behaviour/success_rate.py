@@ -117,7 +117,7 @@ def capture_only(episodes: "pd.DataFrame") -> bool:
 def _check_acted(episodes: "pd.DataFrame") -> None:
     if capture_only(episodes):
         raise UsageError(
-            "this run's model was captured (extract --no-act): there is no success rate. Its probes are as ever"
+            "this run's model was captured (extract --no-act): there is no success rate. Its probes are not affected"
         )
 
 

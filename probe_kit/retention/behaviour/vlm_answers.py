@@ -31,8 +31,8 @@ def ask_of(run: RunReader) -> Mapping[str, Any] | None:
 class ScoredAnswers:
     """A VLM run, read by one of its scores; everything else is the run's own.
 
-    with_side_words: keep items in whose name a side stands, such as "no left turn sign": their answers cannot be
-    told from their names.
+    with_side_words: keep items in whose name a side stands, such as "no left turn sign": answers and
+    names of these are not distinguishable.
     """
 
     def __init__(self, run: RunReader, score: str = "text", with_side_words: bool = False) -> None:

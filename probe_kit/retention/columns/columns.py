@@ -154,7 +154,7 @@ DIFFERENCE_P = Column(
     key="difference.p",
     heading="p (Holm)",
     help="Of a difference between two runs: probability that two equally good ones differ so much on these "
-    "questions, whole groups turned together; in brackets corrected by Holm for all categories and pairs.",
+    "questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and pairs.",
     text=lambda _: "",
     sort=lambda _: None,
     difference=difference_test,
@@ -203,9 +203,9 @@ RIGHT = share(
 )
 FOLLOWS = Column(
     key="image_swap.follow_rate",
-    heading="follows / against %",
-    help="With the two pictures exchanged, and nothing else: share of episodes whose action then turns from the "
-    "correct picture's side to the other one, and share in which it does the reverse.",
+    heading="follow / reversal %",
+    help="With the two pictures swapped, and nothing else: share of episodes whose action turns to the other side. "
+    "After the slash: share in which it does the reverse.",
     text=lambda row: (
         "–"
         if row.image_swap.follow_rate is None

@@ -20,7 +20,7 @@ TERMS = {
         "Difference of two runs on the same questions: of both the same groups of questions are drawn, over "
         "and over, and the interval holds 95 % of what that gives. Zero inside it: they may be equal."
     ),
-    "random weights": ("Nobody trained this model. It shows what knowing nothing looks like."),
+    "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),
 }
 """Terms that are no column."""
 

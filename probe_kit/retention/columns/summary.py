@@ -60,7 +60,7 @@ def _knows(row: RetentionRow) -> bool:
 
 @dataclass(frozen=True)
 class CategorySummary:
-    """One category of a policy, or of a VLM alone. asked: the VLM's row that stands beside the policy's."""
+    """One category of a policy, or of a VLM alone. asked: the VLM's row of the same category."""
 
     row: RetentionRow
     asked: RetentionRow | None = None
@@ -199,7 +199,7 @@ def _acted(row: RetentionRow) -> str:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A row and a sentence per category of a run. beside: the VLM whose answers stand beside it, or empty."""
+    """A row and a sentence per category of a run. beside: the VLM that was asked the same questions, or empty."""
 
     run: str
     beside: str
@@ -265,7 +265,7 @@ def _name(category: str) -> str:
 
 
 def summarise_runs(rows: Sequence[RetentionRow], means: Sequence[RetentionRow]) -> list[RunSummary]:
-    """One per run and group, by the first view of each; VLM runs of the same suite stand beside policies.
+    """One per run and group, by the first view of each; policies have the answers of a VLM of their suite.
 
     A VLM has a summary of its own only where no policy of its suite is in the table.
     """

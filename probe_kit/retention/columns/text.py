@@ -22,7 +22,7 @@ _REGIMES = {
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A share as a percentage, with one decimal unless told otherwise; a dash for None."""
+    """A share as a percentage, by default with one decimal; a dash for None."""
     return "–" if value is None else f"{100 * value:.{digits}f}"
 
 
@@ -142,7 +142,7 @@ def difference_name(row: Difference) -> str:
 
 
 def difference_interval(value: float | None, limits: Limits | None, scale: float = 100.0, digits: int = 1) -> str:
-    """A signed value with its interval; in points unless told otherwise."""
+    """A signed value with its interval; by default in points."""
     if value is None:
         return "–"
     if limits is None:

@@ -1,9 +1,8 @@
 """Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
 
 known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance,
-random-features and untrained. used: the action follows. The unit is the item, right in both layouts: whoever
-always takes one side is right in exactly one, so that a habit never counts; a coin is right in both in one item
-of four.
+random-features and untrained. used: the action follows. The unit is the item, right in both layouts. A fixed
+side is right in exactly one layout, so a bias never counts. Guessing is right in both for 25 % of items.
 """
 
 from collections.abc import Mapping, Sequence

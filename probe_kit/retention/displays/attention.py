@@ -39,7 +39,7 @@ class AttentionDisplay(Panelled):
 
     blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
     iterations, heads and inferences. iterations: (R, B, I) over heads and inferences. heads: (R, B, H) over
-    iterations and inferences. It describes: what is weighed need not be used, and enters no verdict.
+    iterations and inferences. Descriptive: attended tokens need not be used, and no verdict reads this.
     """
 
     measure: ClassVar[str] = "% of attention (describes, no cause)"

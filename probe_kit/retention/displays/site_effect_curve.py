@@ -44,7 +44,7 @@ class SiteEffectDisplay(Panelled):
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
     the swapped images, minus those that turn from it. read: the same for the keys and values that the acting
-    part reads of each block; None where nobody looked. Filled: significant, family-wise.
+    part reads of each block; None where it was not tested. Filled: significant, family-wise.
     """
 
     measure: ClassVar[str] = "% of episodes"

@@ -160,7 +160,7 @@ class PooledScores:
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
         """(K, L) covariance of the scores; 0 on other groups.
 
-        Of a stream with itself it leaves room for groups that nobody has seen, in which one run holds nothing.
+        Of a stream with itself it leaves room for unseen groups, in which one run holds nothing.
         """
         if self.fit is None or other.fit is None or self.fit.seed != other.fit.seed:
             return np.zeros((len(self.names), len(other.names)))

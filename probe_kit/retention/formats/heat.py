@@ -9,7 +9,7 @@ HEAT = (
 )
 """Upper bound of retention, colour name, RGB: from lost (pale yellow) to kept (blue).
 
-Lightness alone orders them, so that they are told apart in grey and by every kind of colour vision."""
+Lightness alone orders them, so that they differ in grey and for every kind of colour vision."""
 
 
 def heat_colour(value: float) -> str:

@@ -32,7 +32,7 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
     facts = {
         "run": run.label,
         "model": run.model,
-        "weights": "random: nobody trained them" if run.random_weights else "",
+        "weights": "random: untrained" if run.random_weights else "",
         "weights sha256": run.weights_sha256 or "none (scripted)",
         "suite": run.suite,
         "episodes": str(len(run.episodes)),

@@ -150,7 +150,7 @@ def _why_not(rows: Sequence[RetentionRow]) -> str:
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     found = []
     if mean.run.random_weights:
-        found.append("The weights are random: nobody trained this model. Read every number as “knows nothing”.")
+        found.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
     found += _unread(mean) if is_vlm(mean) else _unmoved(mean)
     biased = [
         row
@@ -182,7 +182,7 @@ def _unmoved(mean: RetentionRow) -> list[str]:
     if (mean.success.share_never_moved or 0) > _MOSTLY:
         found.append(
             f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
-            "the policy does not grasp, so its success rate says nothing about what it knows."
+            "the policy does not grasp, so its success rate is no measure of what it knows."
         )
     elif (mean.success.share_outside or 0) > _MOSTLY:
         found.append(f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes.")

@@ -74,8 +74,8 @@ def test_a_sentence_says_what_was_found_with_numbers_uncertainty_items_and_what_
     color, state, counting = found.sentences
     assert color == (
         "Color (24 items): the VLM answers right in 100 %, 90 to 100; the backbone holds the answer (100 %, 40 to "
-        "100); so does the action expert (100 %, 40 to 100); the action follows it (in 4 % of swapped pictures), and "
-        "the cube ends right in 94 %, 84 to 100. The answer is used."
+        "100); so does the action expert (100 %, 40 to 100); the action follows it (in 4 % of swapped pictures), "
+        "and the cube ends right in 94 %, 84 to 100. The answer is used."
     )
     assert "the action does not follow it (in 4 % of swapped pictures, at most 12 %)" in state
     assert state.endswith("Shown in the backbone, not used.")

@@ -18,7 +18,7 @@ class ShownFigure(Figure):
     caption: str = ""
 
     def savefig(self, fname: Any, **options: Any) -> None:
-        """Save, pixels at 300 per inch unless told otherwise."""
+        """Save, by default 300 pixels per inch."""
         super().savefig(fname, **{"dpi": PRINT_DPI, **options})
 
     def _repr_png_(self) -> Picture:
