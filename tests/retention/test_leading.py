@@ -1,4 +1,4 @@
-"""What every form of table has in common: bounded retention first, the call, the first iteration, ties, Δ."""
+"""What every form of table has in common: one retention first, the published ratio, the call, ties, and Δ."""
 
 import io
 import re
@@ -15,7 +15,8 @@ from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
 TIED = ([0.5, 0.9, 0.9], [[0.6, 0.8], [0.8, 0.8]])
-FURTHER = ("area", "debiased", "published")
+FORMER = ("bounded [", "debiased", "area [", "unbounded")
+"""Words of the three estimates that there were once."""
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def headings(table: HtmlTable) -> str:
 
 def console(table: RetentionTable) -> str:
     screen = Console(width=240, file=io.StringIO())
-    screen.print(table.to_rich())
+    screen.print(table.to_rich("all"))
     return screen.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
@@ -40,17 +41,25 @@ def every_form(table: RetentionTable) -> dict[str, str]:
     cells = " | ".join(cell.text for cell in html.body[0])
     return {
         "console": console(table).split("Retention, view")[1],
-        "markdown": table.to_markdown().split("**Retention")[1],
+        "markdown": table.to_markdown().split("**Retention,")[1],
         "latex": table.to_latex().split(r"\caption{Retention")[1],
         "page": f"{headings(html)}\n{cells}",
     }
 
 
-def test_every_table_leads_with_bounded_retention(table: RetentionTable) -> None:
+def test_every_table_leads_with_the_one_retention_and_the_published_ratio_beside_it(table: RetentionTable) -> None:
+    row = table.rows[0].retention
+    assert row.value is not None
+    assert row.published is not None
+    numbers = [f"{row.value:.2f}", f"{row.published:.2f}"]
+    assert len(set(numbers)) == 2, "the two can be told apart"
     for form, text in every_form(table).items():
-        places = [text.lower().find(name) for name in ("bounded", *FURTHER)]
+        shown = text.lower()
+        places = [shown.find(name) for name in ("retention [95", "published ratio", "backbone")]
         assert -1 not in places, (form, places)
-        assert places == sorted(places), (form, places)
+        assert places[0] < places[1], form
+        assert -1 < text.find(numbers[0]) < text.find(numbers[1]), form
+        assert not [name for name in FORMER if name in shown], form
 
 
 def test_every_table_names_the_call_the_first_iteration_and_ties(table: RetentionTable) -> None:
@@ -87,21 +96,22 @@ def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable)
         assert -1 < text.find(deciding) < text.find(papers), form
 
 
-def test_the_summary_quotes_bounded_retention(table: RetentionTable) -> None:
+def test_the_summary_quotes_the_retention_of_the_mean(table: RetentionTable) -> None:
     rows = [row for row in table.all_rows if row.group == "first"]
-    bounded = rows[-1].retention.bounded
-    assert bounded is not None
-    assert bounded != rows[-1].retention.debiased
+    found = rows[-1].retention
+    assert found.value is not None
+    assert f"{found.value:.2f}" != f"{found.published:.2f}"
     headline = summarise(rows).headlines[-1]
-    assert (headline.name, headline.value) == ("retention, bounded", f"{bounded:.2f}")
+    assert (headline.name, headline.value) == ("retention", f"{found.value:.2f}")
 
 
-def test_differences_hold_all_three_estimates_and_the_call(table: RetentionTable) -> None:
-    (row, _) = table.differences
+def test_differences_hold_one_retention_and_the_call(table: RetentionTable) -> None:
+    (row, mean) = table.differences
     assert isinstance(row, Difference)
-    first, second = (one for one in table.rows if one.category == "color")
-    for name in ("bounded", "area"):
-        one, other = (getattr(side.retention, name) for side in (first, second))
-        assert getattr(row, f"retention_{name}") == pytest.approx(one - other)
-        assert getattr(row, f"retention_{name}_ci") is not None
-    assert row.call == 0
+    first, second = (one.retention.value for one in table.rows if one.category == "color")
+    assert row.retention == pytest.approx(first - second)  # type: ignore[operator]
+    assert row.retention_ci is not None
+    assert (row.call, mean.call) == (0, 0)
+    assert [name for name in vars(row) if "retention" in name] == [
+        "retention", "retention_ci", "retention_models",
+    ]  # fmt: skip

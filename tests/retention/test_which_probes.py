@@ -91,5 +91,5 @@ def as_text(table: RetentionTable) -> str:
     from rich.console import Console
 
     console = Console(width=80, file=io.StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]

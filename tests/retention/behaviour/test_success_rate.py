@@ -139,9 +139,6 @@ def test_a_table_without_distances_has_no_sensitivity(outcome_table: Outcomes) -
     assert sensitivity(outcome_table(1, 0, 0)) == {}
 
 
-@pytest.mark.parametrize(
-    ("outcome", "expected"), [("correct", (0.025 ** (1 / 10), 1)), ("oob", (0, 1 - 0.025 ** (1 / 10)))]
-)
 def test_twelve_groups_of_four_that_are_all_right_are_known_like_twelve_tosses() -> None:
     found = success_rate(doubles(12, lambda *_: True)).ci
     exact = binomtest(12, 12).proportion_ci(0.95, "exact")
@@ -159,6 +156,9 @@ def test_the_interval_is_korn_and_graubards() -> None:
     assert (found.sr, found.ci) == (0.5, pytest.approx(wanted))
 
 
+@pytest.mark.parametrize(
+    ("outcome", "expected"), [("correct", (0.025 ** (1 / 10), 1)), ("oob", (0, 1 - 0.025 ** (1 / 10)))]
+)
 def test_an_interval_has_a_width_even_where_all_episodes_agree(
     outcome: str, expected: tuple[float, float]
 ) -> None:

@@ -27,7 +27,7 @@ def table(probed_run: ProbedRun) -> RetentionTable:
 
 def every_form(table: RetentionTable) -> dict[str, str]:
     console = Console(width=400, file=io.StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     page = "\n".join(
         f"{column.name} {column.explanation} {' '.join(row[at].text for row in (*one.body, *one.foot))}"
         for one in html_tables(table.all_rows, table.differences)

@@ -42,7 +42,7 @@ def text_of(page: str) -> str:
 def formats(runs: list[SaidRun]) -> Mapping[str, str]:
     table = retention_table(runs)
     console = Console(width=220, record=True, file=StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     exhibits = collect_figures(runs, table)
     return {
         "terminal": console.export_text(),

@@ -31,7 +31,7 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
 
 def test_a_baseline_above_chance_is_red_in_every_format(table: RetentionTable) -> None:
     console = Console(width=120, file=io.StringIO(), force_terminal=True, color_system="standard")
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "\x1b[1;31m75.0 above chance" in printed
     assert "31m51.0" not in printed

@@ -141,6 +141,6 @@ def test_every_format_says_whether_the_reader_is_the_source(tmp_path: Path, card
     runs = [reader(tmp_path / "r", card), policy(tmp_path / "p", xiaomi())]
     table = retention_table(runs, vlm_vla=True)
     console = Console(width=300, record=True, file=StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     pages = (table.to_markdown(), table.to_latex(), report_html(runs, table), console.export_text())
     assert [words in " ".join(page.split()) for page in pages] == [True] * 4

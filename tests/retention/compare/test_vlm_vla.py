@@ -160,7 +160,7 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     other = asked(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")
     table = retention_table([*runs, larger, other], vlm_vla=True)
     console = Console(width=200, record=True, file=StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     shown = console.export_text()
     for words in (
         "Accuracy of answers",

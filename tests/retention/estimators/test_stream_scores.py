@@ -27,8 +27,9 @@ SUITE = "suite@1"
 def scored(curve_of: CurveOf, outcome_table: Outcomes) -> Callable[..., StreamScores]:
     """Scores of a run on 60 items. others: whether on items of other names. seed: of who is right where."""
 
-    def make(backbone: list[float], expert: list[list[float]], seed: int = 0, others: bool = False) ->
-    StreamScores:
+    def make(
+        backbone: list[float], expert: list[list[float]], seed: int = 0, others: bool = False
+    ) -> StreamScores:
         curve = curve_of(outcome_table(120, 0, 0, "shape" if others else "color"), backbone, expert)
         mixed = np.random.default_rng(seed).permutation(60)
         pairs = curve.decisions.reshape(len(curve.sites), 60, 2) * np.where(curve.labels, 1, -1).reshape(60, 2)

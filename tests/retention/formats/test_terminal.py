@@ -22,7 +22,7 @@ WIDTHS = (24, 40, 60, 80, 100, 120, 160, 240)
 
 def printed(table: RetentionTable, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO())
-    console.print(table.to_rich())
+    console.print(table.to_rich("all"))
     return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
