@@ -1,4 +1,4 @@
-"""What listening costs, in every family: one inference plain, captured by probe_kit, and by what rivals do.
+"""Cost of capture in every family: one clean inference, one captured by probe_kit, and one by each rival.
 
     python benchmarks/capture.py [--families pi0,openvla] [--repeats 7] [--host] [--keep DIR]
     python benchmarks/capture.py --families pi0 --checkpoint DIR --device cuda [--dtype bfloat16] [--batch 8]
@@ -18,7 +18,7 @@ wall time on a GPU. No way may change the numbers that come out, which is checke
 * raw hooks: forward hooks on every layer, `.detach().cpu().clone()` of each output.
 
 `--trace` saves a profiler trace of one inference with `tokens to host` and counts what waited for the device.
-`--keep` keeps a family's line in DIR, so that the same command goes on where it was stopped.
+`--keep` keeps a family's line in DIR, so that the same command resumes.
 """
 
 import argparse
@@ -139,7 +139,7 @@ def measure(run: Callable[[], Output], device: str) -> float:
 
 
 def line(family: str, options: argparse.Namespace, folder: Path) -> str:
-    """What listening to one family costs."""
+    """The cost of capturing one family, as a row."""
     made = subject(family, folder, options.device, options.dtype, options.batch, options.checkpoint)
     benchmark = Benchmark(made, options.device)
     ways, reference = benchmark.ways(options.host), benchmark.plain()

@@ -1,4 +1,4 @@
-"""Models to listen to: every family at about a tenth of a billion random parameters, or at a checkpoint's size.
+"""Models to capture: every family at about a tenth of a billion random parameters, or at a checkpoint's size.
 
 The files around the weights are those that the tests write, in the layout of the released ones; their sizes are
 raised here, and the weights drawn. So no family, and no trained weights, are needed for it.
@@ -165,7 +165,7 @@ LARGER: dict[str, Values] = {
 class Subject:
     """A model and one inference of it.
 
-    infer: one inference, by the numbers that nobody who listens may change. roles: of its batch.
+    infer: one inference; its numbers must not change by capture. roles: of its batch.
     """
 
     model: Model
@@ -174,7 +174,7 @@ class Subject:
 
     @property
     def layers(self) -> list[nn.Module]:
-        """The layers of every stored stream, as somebody who hooks modules would find them."""
+        """The layer modules of every stored stream."""
         taps = [self.model.tap(site).module for site in self.model.sites() if not site.iteration]
         names = {id(module): name for name, module in self._network.named_modules()}
         found = {names[id(tap)].rpartition(".")[0]: None for tap in taps if id(tap) in names}

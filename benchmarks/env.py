@@ -25,7 +25,7 @@ CELL = 224
 
 
 class ExpertEnv(Act2AnswerEnv):
-    """The environment with a method that plays expert episodes, so that worker processes can be told to."""
+    """The environment with a method that plays expert episodes, for worker processes."""
 
     def play(self, count: int, first_seed: int = 0) -> int:
         """Play `count` episodes with an observation every fifth action; returns how many succeeded."""

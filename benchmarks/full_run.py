@@ -131,7 +131,7 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
 
 
 def probe_full_run(run: Run, permutations: int, views: Sequence[str] = ("mean",), jobs: int | None = None) -> None:
-    """Probes of every site and category, and a control; read back where they are there."""
+    """Probes of every site and category, and a control; stored ones are loaded."""
     train_probes(run, views=views, permutations=permutations, controls=("position",), jobs=jobs)
 
 

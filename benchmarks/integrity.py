@@ -70,7 +70,7 @@ def episode(plan: Plan, number: int) -> Rollout:
 
 
 def settings(codec: str) -> dict[str, Any]:
-    """Of a run that nobody extracted."""
+    """Settings of a synthetic run."""
     return {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic", "weights_sha256": None,
             "random_weights": False, "suite": {"identity": "synthetic"}}  # fmt: skip
 
@@ -125,7 +125,7 @@ def hash_all(files: list[Path]) -> None:
 
 
 def forget(files: list[Path]) -> None:
-    """Have the system read them from the disk again, if it listens to advice."""
+    """Drop the files from the page cache, where the system supports this."""
     for path in files:
         with path.open("rb") as file:
             os.fsync(file.fileno())

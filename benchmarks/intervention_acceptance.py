@@ -55,7 +55,7 @@ class Trial:
     unused: tuple[str, ...]
 
     def done(self, asked: Intervention) -> InterventionResult:
-        """One intervention; a stored one is read back."""
+        """The result of one intervention; a stored one is loaded."""
         return run_intervention(self.run, asked, self.source)
 
 

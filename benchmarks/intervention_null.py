@@ -91,7 +91,7 @@ class Frames:
     questions: Sequence[ReplayInput]
 
     def answers(self, policy: Policy, asked: ImageSwap | Interchange, file: Path) -> ConditionOutcomes:
-        """Of one policy; read back from `file` where that is there."""
+        """The outcomes of one policy; loaded from `file` if it exists."""
         if not file.is_file():
             self.bench.policy = policy
             conditions = asked.conditions(self.bench)

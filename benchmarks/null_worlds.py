@@ -1,4 +1,4 @@
-"""How often silence is called signal: p-values and controls in worlds where nothing is known.
+"""False-alarm rates: p-values and controls in worlds without signal.
 
     python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda]
         [--worlds …] [--keep DIR]
@@ -10,7 +10,7 @@ where it sees nothing, stands for the logistic probe; `--probe nested` fits that
 direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The rival flips
 items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, against a
 random-features control and a twin that are as accurate. `--keep` keeps the draws of worlds, so that the same
-command goes on where it was stopped.
+command resumes.
 """
 
 import argparse

@@ -1,15 +1,15 @@
-"""Everything that waits for a GPU, in one go: parity, listening, probes, and how long the model waits.
+"""All measurements that need a GPU: parity, capture, probes, and how long the model waits.
 
-    python benchmarks/on_gpu.py [--device cuda] [--only parity,listening] [--checkpoint pi0=DIR]
+    python benchmarks/on_gpu.py [--device cuda] [--only parity,capture] [--checkpoint pi0=DIR]
 
 Each part is a file of tests or a benchmark of this folder in a process of its own, so that none leaves memory
-behind. One that fails is named at the end, the others go on, and the exit code is then 1. Without a GPU the same
+behind. One that fails is named at the end, the others run, and the exit code is then 1. Without a GPU the same
 parts run on the CPU in their smallest form, the output says so, and the exit code is 0: that shows that they run,
 and no more.
 
 * parity: every family, an extraction, probes and copies to the host, on the device against the CPU.
 * golden: every recorded reference that lies here, through the ordinary adapter, on the CPU, where it was recorded.
-* listening: clean inference against capture in every family; with `--checkpoint FAMILY=DIR` in that family at full
+* capture: clean inference against capture in every family; with `--checkpoint FAMILY=DIR` in that family at full
   size in bfloat16, with a trace of what waited for the device.
 * probes: a site at N = 300 and 3,440, numpy against torch on the device.
 * waiting: the real loop with `--batch auto`.
@@ -34,16 +34,16 @@ def parts(device: str, checkpoint: str | None) -> dict[str, list[str]]:
     """The command of each part by name."""
     small = device == "cpu"
     pytest = [sys.executable, "-m", "pytest", "-q", "-m", "slow or not slow"]
-    listening = ["--device", device]
+    capture = ["--device", device]
     if checkpoint is not None:
         family, _, folder = checkpoint.partition("=")
-        listening += ["--families", family, "--checkpoint", folder, "--trace", "trace.json"]
+        capture += ["--families", family, "--checkpoint", folder, "--trace", "trace.json"]
     elif small:
-        listening += ["--families", "qwen3-vl", "--repeats", "1"]
+        capture += ["--families", "qwen3-vl", "--repeats", "1"]
     return {
         "parity": [*pytest, *PARITY, "-k", "device_changes and cpu and not vl or gpu" if small else ON_DEVICE],
         "golden": [*pytest, "tests/hooks/verification/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
-        "listening": _benchmark("capture.py", "--host", *listening),
+        "capture": _benchmark("capture.py", "--host", *capture),
         "probes": _benchmark(
             "probes.py", "--device", device, "--sizes", "60" if small else "300,3440",
             *(["--permutations", "2", "--tokens", "8"] if small else []),

@@ -1,4 +1,4 @@
-"""What retention says where the truth is known: bias, coverage, and how often silence is called signal.
+"""Retention in worlds with known truth: bias, coverage and false-alarm rate.
 
     python benchmarks/retention_null.py [--draws 500] [--rival-draws 100] [--first-seed 0]
     python benchmarks/retention_null.py --probe-draws 2000 --keep DIR
@@ -8,7 +8,7 @@ items 0.3, streams 0.25. The rivals are percentile bootstraps over items that ch
 resamples, by the same estimate on the first of those draws. In one of them the copies of an item stay in one half,
 as they must; in the other they are items of their own and can be on both sides of a choice. Probes: real nested
 probes on features without signal, all 99 relabellings refitted; with `--probe-draws` they alone are run, and
-`--keep` lets the same command go on where it was stopped.
+with `--keep` the same command resumes.
 """
 
 import argparse

@@ -6,10 +6,10 @@
 million random parameters (see `capture_subjects.py`). Batch and simulating processes are what calibration chooses.
 Time is the clock's, from the end of the first inference to the end of the last, without those seconds at the start
 in which the first pictures are drawn; the model works while it is asked for actions (its capture included), and
-waits the rest, for observations, buffers and this process's own affairs. Printed beside it: what calibration
-foretold, and what the clock gives where no simulators work beside the model.
+waits the rest, for observations, buffers and this process's own affairs. Also printed: the
+prediction of calibration, and the wall time without simulators.
 
-A clock tells nothing on a machine that is busy with other things: the share of its core that the model's process
+Wall time means little on a busy machine: the share of its core that the model's process
 got is printed too. `--spread` gives the model's process the first core and its simulators the others.
 """
 

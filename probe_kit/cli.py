@@ -68,7 +68,7 @@ class Commands(typer.core.TyperGroup):
             return self._run(ctx)
         except _FOR_TYPER:
             raise
-        except (Exception, KeyboardInterrupt, SystemExit) as error:  # the last to hear of it
+        except (Exception, KeyboardInterrupt, SystemExit) as error:  # no caller above handles it
             raise typer.Exit(report_error(error)) from error
 
     def _run(self, ctx: Any) -> Any:
@@ -156,7 +156,7 @@ app.command(cls=KindHelp)(intervene)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """A warning as a note on stderr; where in our code it was raised is of no use to anybody here."""
+    """Print a warning as a note on stderr, without the place in our code where it was raised."""
     say(marked("[yellow]warning:[/] {}", message))
 
 

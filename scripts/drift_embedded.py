@@ -1,7 +1,7 @@
 """What learning to act did to the reader's backbone: `python scripts/drift_embedded.py OUT BEFORE AFTER`.
 
 BEFORE: a policy whose backbone is the reader's, weight by weight, as `train_embedded_policy.py` begins (its
-`OUT/start`). AFTER: one that was trained from it. Both hear the same first frames and instructions and do not act.
+`OUT/start`). AFTER: one that was trained from it. Both get the same first frames and instructions and do not act.
 Per category and layer: how alike their streams are (linear CKA), how well a probe finds the side of the asked
 picture in either, and how well the probe of BEFORE does on AFTER. Finished runs are reused.
 """
@@ -38,7 +38,7 @@ def main(
     suite_version: Annotated[int, typer.Option(help="Of the embedded suite: 1 or 2.")] = 2,
     suite_seed: Annotated[int, typer.Option(help="Of the embedded suite.")] = 0,
 ) -> None:
-    """Listen, compare, print."""
+    """Capture, compare, print."""
     with progress() as bar:
         name = f"suite-{suite_version}-{suite_seed}-{items}"
         suite = build_suite(out / name, CATEGORIES, items, suite_seed, counter(bar, "suite"), suite_version)

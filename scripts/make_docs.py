@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
-    """Run the demo, and the other organisms unless told not to, and write `docs/demo.json`."""
+    """Run the demo, and the other organisms unless `trained_only`, and write `docs/demo.json`."""
     made = run_demo(folder, stage)
     rows = [row for row in made.table.rows if row.category != MEAN and row.run.mode == "acts"]
     if trained_only:

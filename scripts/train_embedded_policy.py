@@ -40,7 +40,7 @@ COUPLES_LEFT_OPEN = {1: 1200, 2: 2400}
 DEMONSTRATIONS = range(90)
 BATCH = 32
 COMMON = "common"
-BRANCHES: dict[str, Followed] = {"pi0-tiny": "by lot", "pi0-tiny-state": "always"}
+BRANCHES: dict[str, Followed] = {"pi0-tiny": "random", "pi0-tiny-state": "always"}
 
 
 def main(

@@ -107,7 +107,7 @@ def test_every_public_name_is_described_in_the_reference() -> None:
 
 
 def test_the_reference_knows_names_of_packages_only() -> None:
-    """In which file of a package something lies is nobody's business."""
+    """The file of a name inside its package is private."""
     reference = _reference()
     modules = [import_module(path.rpartition(".")[0]) for path in reference]
     assert len(reference) > 40

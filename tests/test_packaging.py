@@ -38,7 +38,7 @@ def test_the_image_installs_by_the_readmes_own_script() -> None:
 
 @pytest.mark.slow
 def test_the_steps_of_the_image_work_as_plain_commands(tmp_path: Path) -> None:
-    """Slow: a real installation. The image itself is built by nobody here."""
+    """Slow: a real installation. The image itself is not built here."""
     clone = tmp_path / "probe-kit"
     ignored = shutil.ignore_patterns(
         *(ROOT / ".dockerignore").read_text(encoding="utf-8").replace("**/", "").split()

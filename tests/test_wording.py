@@ -1,13 +1,21 @@
-"""Help texts, messages, docstrings of public names and pages are plain technical English."""
+"""Help texts, messages, docstrings, comments, pages and notebooks are plain technical English."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 
-from tests.support.prose import Prose, prose_of_module, prose_of_page, sentences, without_code
+from tests.support.prose import (
+    Prose,
+    prose_of_module,
+    prose_of_notebook,
+    prose_of_page,
+    remarks_of_module,
+    sentences,
+    without_code,
+)
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "probe_kit"
@@ -25,15 +33,13 @@ PATTERN = re.compile(rf"\b({'|'.join(AVOIDED.values())})\b(?!:)", re.IGNORECASE)
 NAMES = re.compile(r"VL-Think|--no-act\b", re.IGNORECASE)
 MOST_WORDS = 25
 
-NOT_YET = {"docs"}
-"""What has not been rewritten; a test below fails for a name that could leave this list."""
 MODULES = {path.name.removesuffix(".py") for path in PACKAGE.iterdir() if path.name != "__pycache__"}
 PARTS = [*sorted(MODULES), "docs"]
 
 
 @cache
 def prose_of(part: str) -> tuple[Prose, ...]:
-    """All texts of a package, of a module of the root, or of README and docs."""
+    """All texts of a package, of a module of the root, or of README, docs and notebooks."""
     return tuple(_prose_of(part))
 
 
@@ -41,57 +47,59 @@ def _prose_of(part: str) -> Iterator[Prose]:
     if part == "docs":
         for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
             yield from prose_of_page(path, path.relative_to(ROOT).as_posix())
+        for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+            yield from prose_of_notebook(path, path.relative_to(ROOT).as_posix())
         return
     file = PACKAGE / f"{part}.py"
     for path in [file] if file.exists() else sorted((PACKAGE / part).rglob("*.py")):
         yield from prose_of_module(path, path.relative_to(ROOT).as_posix())
 
 
-def avoided_words(part: str) -> list[str]:
+def avoided_words(texts: Iterable[Prose]) -> list[str]:
     return [
         f"{prose.place}: “{found[0]}” in “{sentence}”"
-        for prose in prose_of(part)
+        for prose in texts
         for sentence in sentences(without_code(NAMES.sub("code", prose.text)))
         if (found := PATTERN.search(sentence))
     ]
 
 
-@pytest.mark.parametrize("part", [part for part in PARTS if part not in NOT_YET])
+@pytest.mark.parametrize("part", PARTS)
 def test_no_text_uses_a_word_that_the_project_avoids(part: str) -> None:
-    found = avoided_words(part)
+    found = avoided_words(prose_of(part))
     assert not found, "\n".join(found)
 
 
-@pytest.mark.parametrize("part", sorted(NOT_YET))
-def test_a_part_that_was_rewritten_leaves_the_list_of_exceptions(part: str) -> None:
-    assert avoided_words(part), f"{part} has no avoided word any more; remove it from NOT_YET"
-
-
-def test_first_lines_of_modules_and_help_texts_have_short_sentences() -> None:
+def test_pages_help_texts_and_first_lines_of_modules_have_short_sentences() -> None:
     long = [
         f"{prose.place}: {words} words in “{sentence}”"
         for part in PARTS
-        if part not in NOT_YET
         for prose in prose_of(part)
-        if prose.kind in ("summary", "help")
+        if prose.kind in ("summary", "help", "page")
         for sentence in sentences(without_code(prose.text))
         if (words := len(re.findall(r"\w[\w'’-]*", sentence))) > MOST_WORDS
     ]
     assert not long, "\n".join(long)
 
 
-def test_contributor_pages_use_no_word_that_the_project_avoids() -> None:
-    pages = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / name / "README.md" for name in FOLDERS)]
-    found = [
-        f"{prose.place}: “{word[0]}”"
-        for page in pages
-        for prose in prose_of_page(page, page.relative_to(ROOT).as_posix())
-        if (word := PATTERN.search(without_code(NAMES.sub("code", prose.text))))
-    ]
+def test_no_other_page_of_the_repository_uses_a_word_that_the_project_avoids() -> None:
+    names = [*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))]
+    assert {"SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md"} <= {page.name for page in names}
+    found = avoided_words(
+        prose for page in names for prose in prose_of_page(page, page.relative_to(ROOT).as_posix())
+    )
     assert not found, "\n".join(found)
 
 
-FOLDERS = ("benchmarks", "scripts", "tests")
+FOLDERS = ("benchmarks", "scripts", "tests", "probe_kit")
+
+
+def test_no_comment_and_no_docstring_uses_a_word_that_the_project_avoids() -> None:
+    modules = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    found = avoided_words(
+        remark for path in sorted(modules) for remark in remarks_of_module(path, path.relative_to(ROOT).as_posix())
+    )
+    assert not found, "\n".join(found)
 
 
 @pytest.mark.parametrize(

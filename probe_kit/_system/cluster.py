@@ -42,7 +42,7 @@ def ray_cluster(address: str, log_to_driver: bool) -> Iterator[Any]:
 
 
 def _knock(address: str) -> None:
-    """Raise OSError where nothing listens: Ray itself asks a dead address for minutes before it gives up."""
+    """Raise OSError if no server answers: Ray itself tries a dead address for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK_TIMEOUT).close()

@@ -47,7 +47,7 @@ def _of_torch() -> list[str]:
 
 
 def _of_system() -> list[str]:
-    """NVIDIA's driver numbers its GPUs in the order of their addresses, as CUDA does when told so."""
+    """NVIDIA's driver numbers its GPUs in the order of their addresses, as CUDA does with this setting."""
     if sys.platform == "darwin":
         return ["mps"]
     models = [

@@ -47,7 +47,7 @@ def notebook_progress(label: str) -> Callable[..., None] | None:
 
 
 def _in_notebook() -> bool:
-    """Whether a kernel runs this process, so that somebody sees rich output."""
+    """Whether a notebook's kernel runs this process, so that rich output is displayed."""
     if "ipykernel" not in sys.modules:
         return False
     from IPython import get_ipython

@@ -6,8 +6,9 @@ do the same for comma-separated values and for the names of a registry.
 """
 
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import typer
 
@@ -15,9 +16,10 @@ from probe_kit._terminal.console import split, whole_number
 from probe_kit.errors import UsageError
 from probe_kit.scene_names import SceneName
 
-WEIGHTS = "Model weights"
-SPEED = "Speed and hardware (no effect on results beyond rounding)"
-RESUMING = "Planning and resuming"
+speed_option = partial(typer.Option, rich_help_panel="Speed and hardware (no effect on results beyond rounding)")
+"""Declares an option in the panel of options that change no number."""
+_weights_option = partial(typer.Option, rich_help_panel="Model weights")
+_planning_option = partial(typer.Option, rich_help_panel="Planning and resuming")
 
 
 class Names(tuple[str, ...]):
@@ -33,6 +35,10 @@ class Names(tuple[str, ...]):
     def __str__(self) -> str:
         """As it is typed."""
         return ",".join(self)
+
+
+LISTED: Any = {"parser": Names.parse, "metavar": "A,B,…"}
+"""Keywords of `typer.Option` for comma-separated names."""
 
 
 def choices(names: Collection[object]) -> str:
@@ -85,10 +91,7 @@ SuiteFolder = Annotated[
     Path | None, typer.Option("--suite", help="Suite folder. Default: the embedded suite.", metavar="FOLDER")
 ]
 Categories = Annotated[
-    Names | None,
-    typer.Option(
-        "--categories", parser=Names.parse, metavar="A,B,…", help="Categories, comma-separated. Default: all."
-    ),
+    Names | None, typer.Option("--categories", **LISTED, help="Categories, comma-separated. Default: all.")
 ]
 Items = Annotated[int | None, typer.Option("--items", help="Number of items per category. Default: all.")]
 Wording = Annotated[
@@ -98,8 +101,7 @@ Wording = Annotated[
     ),
 ]
 Scene = Annotated[
-    SceneName | None,
-    typer.Option("--scene", help="Scene preset. Default: that of the protocol or the model."),
+    SceneName | None, typer.Option("--scene", help="Scene preset. Default: that of the protocol or the model.")
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed. The same seed gives the same result.")]
 
@@ -121,65 +123,42 @@ ModelOptions = Annotated[
         help="Set an option of the model; `probe-kit models NAME` lists them. Repeat for several.",
     ),
 ]
-RandomWeights = Annotated[
-    bool,
-    typer.Option("--random-weights", help="Use untrained weights, as a control.", rich_help_panel=WEIGHTS),
-]
-WeightsSeed = Annotated[
-    int, typer.Option("--weights-seed", help="Seed of the untrained weights.", rich_help_panel=WEIGHTS)
-]
+RandomWeights = Annotated[bool, _weights_option("--random-weights", help="Use untrained weights, as a control.")]
+WeightsSeed = Annotated[int, _weights_option("--weights-seed", help="Seed of the untrained weights.")]
 Device = Annotated[str, typer.Option("--device", help="Device of the model: cpu, cuda, cuda:1, …")]
 
 # -- speed ------------------------------------------------------------------------------------------------------
 
 EnvWorkers = Annotated[
     int | None,
-    typer.Option(
-        "--env-workers",
-        help="Number of simulation processes. Default: two per observation of a batch.",
-        rich_help_panel=SPEED,
-    ),
+    speed_option("--env-workers", help="Number of simulation processes. Default: two per observation of a batch."),
 ]
 Workers = Annotated[
-    int,
-    typer.Option(
-        "--workers",
-        help="Number of model processes, one per GPU. 0: use this process.",
-        rich_help_panel=SPEED,
-    ),
+    int, speed_option("--workers", help="Number of model processes, one per GPU. 0: use this process.")
 ]
 RayAddress = Annotated[
     str | None,
-    typer.Option(
-        "--ray",
-        metavar="ADDRESS",
-        help="Run on this Ray cluster. auto: use the local cluster, or start one.",
-        rich_help_panel=SPEED,
+    speed_option(
+        "--ray", metavar="ADDRESS", help="Run on this Ray cluster. auto: use the local cluster, or start one."
     ),
 ]
 InferenceLimit = Annotated[
     float | None,
-    typer.Option(
+    speed_option(
         "--inference-limit",
         help="Stop a worker whose model call takes longer, in seconds. Requires --workers or --ray.",
-        rich_help_panel=SPEED,
     ),
 ]
 
 # -- planning and output ----------------------------------------------------------------------------------------
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.", rich_help_panel=RESUMING)]
+DryRun = Annotated[bool, _planning_option("--dry-run", help="Print the plan and stop.")]
 AllowMixed = Annotated[
     bool,
-    typer.Option(
-        "--allow-mixed",
-        help="Resume a run that was started with other library versions or on another device.",
-        rich_help_panel=RESUMING,
+    _planning_option(
+        "--allow-mixed", help="Resume a run that was started with other library versions or on another device."
     ),
 ]
-Force = Annotated[
-    bool,
-    typer.Option("--force", help="Start even if disk space seems insufficient.", rich_help_panel=RESUMING),
-]
+Force = Annotated[bool, _planning_option("--force", help="Start even if disk space seems insufficient.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Format = Annotated[Literal["table", "json", "csv"], typer.Option("--format", help="Format of the printed result.")]

@@ -9,12 +9,11 @@ from gymnasium.envs.registration import register, registry
 
 from probe_kit.env.act2answer import Act2AnswerEnv
 from probe_kit.env.adapters import to_lerobot, to_openpi
-from probe_kit.env.expert import ScriptedExpert
-from probe_kit.env.idle import Idle
 from probe_kit.env.recording import save_gif
 from probe_kit.env.scoring.behaviour import Behaviour
 from probe_kit.env.scoring.outcome import Outcome, success_by_radius
 from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scripted import Idle, ScriptedExpert
 from probe_kit.env.spec import CameraSpec, LightSpec, LimitSpec, PhysicsSpec, SceneSpec
 
 ENV_ID = "probe_kit/Act2Answer-v0"

@@ -1,13 +1,14 @@
 """Options of `probe-kit extract` and `probe-kit ask`, by help panel."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from probe_kit._terminal.console import whole_number
-from probe_kit._terminal.options import SPEED, Names, choices, read_size, some_of
+from probe_kit._terminal.options import Names, choices, read_size, some_of, speed_option
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
@@ -16,9 +17,9 @@ from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.ladder import WORDINGS
 
-SCENE = "Scene (stored with the run)"
-STORED = "Stored data"
-CONTROLS = "Controls"
+_scene_option = partial(typer.Option, rich_help_panel="Scene (stored with the run)")
+_storage_option = partial(typer.Option, rich_help_panel="Stored data")
+_control_option = partial(typer.Option, rich_help_panel="Controls")
 _STARTING = ("out_folder", "dry_run", "force")
 
 
@@ -156,121 +157,80 @@ SIZE_224 = Sizes([(224, 224)])
 
 # -- scene --------------------------------------------------------------------------------------------------
 
-MaxSteps = Annotated[
-    int | None, typer.Option("--max-steps", help="Number of actions per episode, at 5 Hz.", rich_help_panel=SCENE)
-]
+MaxSteps = Annotated[int | None, _scene_option("--max-steps", help="Number of actions per episode, at 5 Hz.")]
 TileSide = Annotated[
     float | None,
-    typer.Option(
-        "--tile-side",
-        help="Side of a tile in metres. The paper uses 0.1452, 0.2033 and 0.1162.",
-        rich_help_panel=SCENE,
-    ),
+    _scene_option("--tile-side", help="Side of a tile in metres. The paper uses 0.1452, 0.2033 and 0.1162."),
 ]
 LightLevel = Annotated[
     float | None,
-    typer.Option(
-        "--light-level",
-        help="Brightness of the light; 1 is the default. The paper uses 0.7 and 1.3.",
-        rich_help_panel=SCENE,
-    ),
+    _scene_option("--light-level", help="Brightness of the light; 1 is the default. The paper uses 0.7 and 1.3."),
 ]
 RenderingStyle = Annotated[
     Rendering | None,
-    typer.Option(
-        "--rendering",
-        help="visual-matching: draw robot, cube and tiles over a photo.",
-        rich_help_panel=SCENE,
-    ),
+    _scene_option("--rendering", help="visual-matching: draw robot, cube and tiles over a photo."),
 ]
 Background = Annotated[
-    Path | None,
-    typer.Option(
-        "--background", help="Photo for visual-matching. Default: the embedded photo.", rich_help_panel=SCENE
-    ),
+    Path | None, _scene_option("--background", help="Photo for visual-matching. Default: the embedded photo.")
 ]
 PictureSize = Annotated[
     Size | None,
-    typer.Option(
+    _scene_option(
         "--picture-size",
         parser=Size.parse,
         metavar="WxH",
         help="Size of the camera image for the policy in pixels, such as 224x224.",
-        rich_help_panel=SCENE,
     ),
 ]
 Epsilon = Annotated[
     float | None,
-    typer.Option(
-        "--epsilon",
-        help="Radius of the target zone in metres. Default: half a tile + 0.01.",
-        rich_help_panel=SCENE,
-    ),
+    _scene_option("--epsilon", help="Radius of the target zone in metres. Default: half a tile + 0.01."),
 ]
-Arm = Annotated[ArmName | None, typer.Option("--arm", help="Robot arm.", rich_help_panel=SCENE)]
-ArmUrdf = Annotated[
-    Path | None, typer.Option("--arm-urdf", help="Your own URDF file of this arm.", rich_help_panel=SCENE)
-]
-StartGrasped = Annotated[
-    bool, typer.Option("--start-grasped", help="Start with the cube in the gripper.", rich_help_panel=SCENE)
-]
+Arm = Annotated[ArmName | None, _scene_option("--arm", help="Robot arm.")]
+ArmUrdf = Annotated[Path | None, _scene_option("--arm-urdf", help="Your own URDF file of this arm.")]
+StartGrasped = Annotated[bool, _scene_option("--start-grasped", help="Start with the cube in the gripper.")]
 EarlyStop = Annotated[
-    bool,
-    typer.Option("--early-stop", help="End an episode when the released cube is at rest.", rich_help_panel=SCENE),
+    bool, _scene_option("--early-stop", help="End an episode when the released cube is at rest.")
 ]
 
 # -- stored data --------------------------------------------------------------------------------------------
 
 StoredTokens = Annotated[
-    Tokens,
-    typer.Option(
-        "--tokens", help="pooled: store pooled views. all: also store every token (large).", rich_help_panel=STORED
-    ),
+    Tokens, _storage_option("--tokens", help="pooled: store pooled views. all: also store every token (large).")
 ]
 AskStoredTokens = Annotated[
     AskTokens,
-    typer.Option(
+    _storage_option(
         "--tokens",
         help="none: store answers only. pooled: also store pooled views, for probes. all: also store every token.",
-        rich_help_panel=STORED,
     ),
 ]
 CapturedCalls = Annotated[
-    int,
-    typer.Option("--captured-calls", help="Number of inferences captured per episode.", rich_help_panel=STORED),
+    int, _storage_option("--captured-calls", help="Number of inferences captured per episode.")
 ]
 Frames = Annotated[
     FrameChoice,
-    typer.Option(
-        "--frames", help="ends: store thumbnails of first and last frames for the report.", rich_help_panel=STORED
-    ),
+    _storage_option("--frames", help="ends: store thumbnails of first and last frames for the report."),
 ]
-Video = Annotated[
-    VideoChoice,
-    typer.Option("--video", help="Store a GIF of the first episode or of all.", rich_help_panel=STORED),
-]
-StorageCodec = Annotated[
-    Codec, typer.Option("--codec", help="Compression of stored activations.", rich_help_panel=STORED)
-]
+Video = Annotated[VideoChoice, _storage_option("--video", help="Store a GIF of the first episode or of all.")]
+StorageCodec = Annotated[Codec, _storage_option("--codec", help="Compression of stored activations.")]
 
 # -- controls of questions ----------------------------------------------------------------------------------
 
 ShownPicture = Annotated[
     Picture,
-    typer.Option(
+    _control_option(
         "--picture",
         help="frame: show the first frame. side-by-side: show both pictures on grey. none: show no picture; "
         "accuracy above 50 % then indicates a leak in the suite.",
-        rich_help_panel=CONTROLS,
     ),
 ]
 AskedObject = Annotated[
     Query,
-    typer.Option(
+    _control_option(
         "--query",
         help="target: ask for the object of the instruction. distractor: ask for the object of the other picture. "
         "absent: ask for an object in neither picture (requires --prompt seen; no is correct).",
-        rich_help_panel=CONTROLS,
     ),
 ]
 
@@ -278,20 +238,15 @@ AskedObject = Annotated[
 
 Batch = Annotated[
     object,
-    typer.Option(
+    speed_option(
         "--batch",
         parser=_batch,
         metavar="N|auto",
         help="Number of observations per model call. Above 1, results repeat up to rounding. auto: measure for "
         "some seconds and choose --batch and --env-workers.",
-        rich_help_panel=SPEED,
     ),
 ]
 AskBatch = Annotated[
     int,
-    typer.Option(
-        "--batch",
-        help="Number of questions per model call. Above 1, results repeat up to rounding.",
-        rich_help_panel=SPEED,
-    ),
+    speed_option("--batch", help="Number of questions per model call. Above 1, results repeat up to rounding."),
 ]

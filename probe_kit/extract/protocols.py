@@ -16,7 +16,7 @@ SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
 """Scene preset by protocol."""
 
 
-class Asked(Protocol):
+class ProtocolSettings(Protocol):
     """What is looked at of the settings of an extraction."""
 
     @property
@@ -82,7 +82,7 @@ def check_protocol(name: str) -> None:
         raise UsageError(f"unknown protocol {name!r}; available: {', '.join(SCENES)}.{hint}")
 
 
-def protocol_identity(settings: Asked) -> dict[str, Any]:
+def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
     """What a run says of the protocol it follows, under `protocol`; empty without one.
 
     differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
@@ -106,7 +106,7 @@ def protocol_identity(settings: Asked) -> dict[str, Any]:
     }
 
 
-def deviations(settings: Asked) -> dict[str, list[str | None]]:
+def deviations(settings: ProtocolSettings) -> dict[str, list[str | None]]:
     """By setting, what the protocol has and what was asked for instead."""
     found: dict[str, list[str | None]] = protocol_identity(settings).get("protocol", {}).get("deviations", {})
     return found
@@ -135,7 +135,7 @@ def _families() -> "dict[str, Family]":
     return known_families()
 
 
-def _used(settings: Asked) -> dict[str, str]:
+def _used(settings: ProtocolSettings) -> dict[str, str]:
     """What the run is made with, under the names of `ProtocolRow.settings`."""
     used = {f"-M {name}": _told(as_text(value)) for name, value in settings.options.items()}
     plain = {"checkpoint": settings.checkpoint, "execute": settings.execute, "dtype": settings.dtype}
@@ -148,7 +148,7 @@ def _told(value: str) -> str:
     return Path(value).name if Path(value).expanduser().exists() else value
 
 
-def _defaults(settings: Asked, row: ProtocolRow) -> dict[str, str]:
+def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
     """What the same settings are without a protocol, in the words of `probe-kit models`."""
     family = _families()[settings.model]
     known = {f"-M {option.name}": option.default for option in family.options}

@@ -220,7 +220,7 @@ class ExtractSettings(RunSettings):
     protocol: a published one, such as `act2answer`: what is not given is as it has it, see `protocols`; its scene
     takes the place of the default one.
     capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
-    edits: what is changed in the streams at every inference; vectors: their directions and donors, by hash.
+    edits: what is changed in the streams at every inference; vectors: their directions and sources, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
     """
 
@@ -243,9 +243,9 @@ class ExtractSettings(RunSettings):
 
     def choices(self) -> dict[str, Any]:
         """As of every run, with the later fields: capture without acting, and edits."""
-        listening = {"capture_only": True} if self.capture_only else {}
+        capture_only_part = {"capture_only": True} if self.capture_only else {}
         edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
-        return super().choices() | listening | edits
+        return super().choices() | capture_only_part | edits
 
     def followed(self) -> Self:
         """The settings with all that was not given as their protocol has it for the model; scripts get its scene.

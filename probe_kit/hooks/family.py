@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -120,7 +121,7 @@ class Family:
         with while_loading(self.name, str(place or "what it brings")):
             model: Model = load(place, device, dtype, random_weights, **chosen)
             _check_streams(model, str(place))
-        # What an adapter does not say of its options itself is part of the identity all the same.
+        # Options that the adapter does not record itself are part of the identity too.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
         model.card = replace(
             model.card, settings={**said, **model.card.settings}, **self._source_of(model.card, place)
@@ -255,6 +256,6 @@ def check_machine(device: str, dtype: str | None) -> None:
 
 
 def imported(path: str) -> Any:
-    """What `module:name` names."""
+    """The object at `module:name` or `module:Class.method`."""
     module, name = path.split(":")
-    return getattr(import_module(module), name)
+    return attrgetter(name)(import_module(module))

@@ -62,11 +62,11 @@ class InterventionContract:
         seen = observations[:1]
         for stream in policy.streams.values():
             behind = [site for site in stream.sites() if site.layer == 1]
-            plain = _heard(policy, seen, behind)
+            plain = _captured(policy, seen, behind)
             for quantity in set(stream.quantities) - {"final_norm"}:
                 written = [site for site in stream.sites(quantity) if site.layer == 0]
                 with edit(policy, dict.fromkeys(written, torch.zeros_like)):
-                    changed = _heard(policy, seen, behind)
+                    changed = _captured(policy, seen, behind)
                 assert any((plain[site] != changed[site]).any() for site in behind), f"{stream.name}.{quantity}"
 
     def test_the_end_of_an_unread_stream_is_a_control(
@@ -92,57 +92,57 @@ class InterventionContract:
             with pytest.raises(UnknownSiteError):
                 policy.tap(kv_stream(1, 1).sites("keys")[0])
 
-    # -- memory --------------------------------------------------------------------------------------------
+    # -- kv ------------------------------------------------------------------------------------------------
 
-    def test_the_memory_has_keys_and_values_for_every_token_of_the_backbone(
+    def test_the_prompt_has_keys_and_values_for_every_token_of_the_backbone(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
-        memory, seen = self._memory(policy), observations[: policy.card.batch]
-        sites = _all(memory)
-        tape = _heard(policy, seen, sites)
-        tokens = len(policy.token_roles(seen)[memory.name][0])
-        assert len(tape) == len(sites) == 2 * (memory.layers - 1)
+        kv, seen = self._prompt_kv(policy), observations[: policy.card.batch]
+        sites = _all(kv)
+        tape = _captured(policy, seen, sites)
+        tokens = len(policy.token_roles(seen)[kv.name][0])
+        assert len(tape) == len(sites) == 2 * (kv.layers - 1)
         for site in sites:
-            assert tape[site].shape == (len(seen), tokens, memory.width)
+            assert tape[site].shape == (len(seen), tokens, kv.width)
 
-    def test_the_whole_memory_of_another_picture_gives_that_pictures_actions(
+    def test_all_keys_and_values_of_another_picture_give_that_pictures_actions(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
         """State, words and noise are the same; bit for bit. What chose the first token goes along with it."""
-        memory = self._memory(policy)
+        kv = self._prompt_kv(policy)
         one = observations[0]
         other = replace(one, image=255 - one.image)
         acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
         early = [site for site in acting if (site.iteration or 0) < policy.interventions.first_affected_token]
         late = [site for site in acting if site not in early]
-        plain, donor = (_heard(policy, [own], [*_all(memory), *acting]) for own in (one, other))
-        edits, vectors = _donated(donor, [*_all(memory), *early])
+        plain, source = (_captured(policy, [own], [*_all(kv), *acting]) for own in (one, other))
+        edits, vectors = _edits_from(source, [*_all(kv), *early])
         with apply_edits(policy, edits, [one], vectors) as edit_log:
-            exchanged = _heard(policy, [one], late)
+            edited = _captured(policy, [one], late)
         np.testing.assert_array_equal(policy.act([other], [0]), self._under(policy, edits, vectors, one))
         for site in late:
-            torch.testing.assert_close(exchanged[site], donor[site], rtol=0, atol=0)
-        assert any((plain[site] != donor[site]).any() for site in late)
-        assert [entry.site for entry in edit_log.entries if entry.site.startswith(memory.name)] == [
-            str(site) for layer in range(memory.layers - 1) for site in _of(memory, layer)
+            torch.testing.assert_close(edited[site], source[site], rtol=0, atol=0)
+        assert any((plain[site] != source[site]).any() for site in late)
+        assert [entry.site for entry in edit_log.entries if entry.site.startswith(kv.name)] == [
+            str(site) for layer in range(kv.layers - 1) for site in _of(kv, layer)
         ]
         assert sum(entry.moved for entry in edit_log.entries) > 0
 
-    def test_the_memory_of_one_role_is_exchanged_in_that_role_only(
+    def test_values_of_one_role_are_replaced_in_that_role_only(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
-        memory = self._memory(policy)
+        kv = self._prompt_kv(policy)
         one = observations[0]
-        site = _of(memory, 0)[1]
-        plain, donor = (
-            _heard(policy, [own], [site])[site][0].float().cpu()
+        site = _of(kv, 0)[1]
+        plain, source = (
+            _captured(policy, [own], [site])[site][0].float().cpu()
             for own in (one, replace(one, image=255 - one.image))
         )
-        own = Edit("replace", (site,), roles=("image",), vector=vector_hash(donor.numpy()))
-        with apply_edits(policy, [own], [one], {own.vector: donor.numpy()}) as edit_log:
-            edited = _heard(policy, [one], [site])[site][0].float().cpu()
-        image = torch.from_numpy(policy.token_roles([one])[memory.name][0].mask("image"))
-        torch.testing.assert_close(edited, torch.where(image[:, None], donor, plain), rtol=0, atol=0)
+        own = Edit("replace", (site,), roles=("image",), vector=vector_hash(source.numpy()))
+        with apply_edits(policy, [own], [one], {own.vector: source.numpy()}) as edit_log:
+            edited = _captured(policy, [one], [site])[site][0].float().cpu()
+        image = torch.from_numpy(policy.token_roles([one])[kv.name][0].mask("image"))
+        torch.testing.assert_close(edited, torch.where(image[:, None], source, plain), rtol=0, atol=0)
         assert [entry.tokens for entry in edit_log.entries] == [int(image.sum())]
 
     # -- tiles ---------------------------------------------------------------------------------------------
@@ -161,7 +161,7 @@ class InterventionContract:
         embedded = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
         picture = np.flatnonzero(policy.roles(seen)["backbone"][0].mask(f"image.{policy.card.cameras[0]}"))
         assert set(order) - {-1} == set(range(picture.size))
-        plain = _heard(policy, seen, [last, embedded])
+        plain = _captured(policy, seen, [last, embedded])
         assert plain[last].shape[-2] == order.size
         for token in (0, 1, picture.size // 2, picture.size - 1):
             own = torch.from_numpy(np.flatnonzero(order == token))
@@ -171,13 +171,13 @@ class InterventionContract:
                 return passing
 
             with edit(policy, {last: turned}):
-                changed = _heard(policy, seen, [embedded])
+                changed = _captured(policy, seen, [embedded])
             moved = (changed[embedded] != plain[embedded])[0].any(dim=-1).cpu().numpy()
             assert np.flatnonzero(moved).tolist() == [picture[token]]
 
     # -- attention -----------------------------------------------------------------------------------------
 
-    def test_attention_is_told_without_changing_an_action_bit_for_bit(
+    def test_attention_is_recorded_without_changing_an_action_bit_for_bit(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
         if not policy.interventions.attention:
@@ -187,8 +187,8 @@ class InterventionContract:
         seen = observations[: policy.card.batch]
         plain = policy.act(seen, range(len(seen)))
         with capture_attention(policy) as mass:
-            told = policy.act(seen, range(len(seen)))
-        np.testing.assert_array_equal(plain, told)
+            recorded = policy.act(seen, range(len(seen)))
+        np.testing.assert_array_equal(plain, recorded)
         backbone = next(own for own in policy.streams.values() if own.part == "backbone" and own.probed)
         roles = policy.roles(seen)[backbone.name]
         valid = np.stack([row.valid for row in roles])
@@ -202,7 +202,7 @@ class InterventionContract:
             assert np.abs(weights[~valid]).max(initial=0) == 0
         assert all((share > 0).all() for share in mass.of_role(roles, "image").values())
 
-    def _memory(self, policy: Policy) -> Stream:
+    def _prompt_kv(self, policy: Policy) -> Stream:
         if policy.prompt_kv is None:
             pytest.skip(f"{policy.card.family} declares no kv stream")
         return policy.prompt_kv
@@ -213,23 +213,25 @@ class InterventionContract:
             return policy.act([seen], [0])
 
 
-def _heard(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -> ActivationCache:
+def _captured(policy: Policy, seen: Sequence[Observation], sites: Sequence[Site]) -> ActivationCache:
     """What one inference leaves at `sites`."""
     with capture(policy, sites) as tape:
         policy.act(seen, range(len(seen)))
     return tape
 
 
-def _of(memory: Stream, layer: int) -> list[Site]:
-    return [Site(memory.name, layer, quantity) for quantity in KV]
+def _of(kv: Stream, layer: int) -> list[Site]:
+    return [Site(kv.name, layer, quantity) for quantity in KV]
 
 
-def _all(memory: Stream) -> list[Site]:
-    return [site for quantity in KV for site in memory.sites(quantity)]
+def _all(kv: Stream) -> list[Site]:
+    return [site for quantity in KV for site in kv.sites(quantity)]
 
 
-def _donated(donor: ActivationCache, sites: Sequence[Site]) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
-    """Edits that put in the first row of `donor`, and the arrays they name."""
-    rows = {site: donor[site][0].float().cpu().numpy() for site in sites}
+def _edits_from(
+    source: ActivationCache, sites: Sequence[Site]
+) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
+    """Edits that put in the first row of `source`, and the arrays they name."""
+    rows = {site: source[site][0].float().cpu().numpy() for site in sites}
     vectors = {vector_hash(row): row for row in rows.values()}
     return [Edit("replace", (site,), vector=vector_hash(row)) for site, row in rows.items()], vectors

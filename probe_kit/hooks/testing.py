@@ -435,7 +435,7 @@ class AdapterContract(InterventionContract, ModelContract):
         assert first.dtype == np.float32
         assert np.isfinite(first).all()
 
-    def test_listening_hears_the_inference_that_acting_makes(
+    def test_inference_without_acting_equals_that_of_acting(
         self, policy: Policy, observations: list[Observation]
     ) -> None:
         """Capture changes no action bit at any site, and the actions fit the arm."""
@@ -444,11 +444,11 @@ class AdapterContract(InterventionContract, ModelContract):
         sites = policy.sites()
         with capture(policy, sites) as acting:
             policy.act(seen, [5])
-        with capture(policy, sites) as listening:
-            heard = policy.infer_without_acting(seen, [5])
-        assert heard.shape[0] == 1
+        with capture(policy, sites) as without_acting:
+            raw = policy.infer_without_acting(seen, [5])
+        assert raw.shape[0] == 1
         for site in sites:
-            torch.testing.assert_close(acting[site], listening[site], rtol=0, atol=0)
+            torch.testing.assert_close(acting[site], without_acting[site], rtol=0, atol=0)
 
     def test_every_observation_needs_its_seed(self, policy: Policy, observations: list[Observation]) -> None:
         with pytest.raises(ObservationError):

@@ -1,16 +1,17 @@
 """Options of `probe-kit intervene`. What they mean to a kind is in the kind's entry."""
 
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from probe_kit._terminal.console import split
-from probe_kit._terminal.options import Names, choices, one_of
+from probe_kit._terminal.options import LISTED, Names, choices, one_of
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.intervene.kinds.registry import KINDS
 
-INSIDE = "Inside the network (their meaning for each kind is below)"
+_inside_option = partial(typer.Option, rich_help_panel="Inside the network (their meaning for each kind is below)")
 
 
 class Numbers(tuple[float, ...]):
@@ -35,51 +36,39 @@ KindName = Annotated[
 ]
 Sites = Annotated[
     Names | None,
-    typer.Option(
-        "--sites",
-        parser=Names.parse,
-        metavar="A,B,…",
-        help="Sites, comma-separated, such as backbone.*, backbone.02, expert.03@0-4 or kv.*.",
-        rich_help_panel=INSIDE,
+    _inside_option(
+        "--sites", **LISTED, help="Sites, comma-separated, such as backbone.*, backbone.02, expert.03@0-4 or kv.*."
     ),
 ]
 Roles = Annotated[
     Names | None,
-    typer.Option(
+    _inside_option(
         "--roles",
-        parser=Names.parse,
-        metavar="A,B,…",
+        **LISTED,
         help="Token roles, comma-separated: all, image, image.left, image.right, language, state, action.",
-        rich_help_panel=INSIDE,
     ),
 ]
 Direction = Annotated[
     str | None,
-    typer.Option(
+    _inside_option(
         "--direction",
         help="Direction or subspace: none, mean-difference, probe, mean-difference:K, leace, inlp:K.",
-        rich_help_panel=INSIDE,
     ),
 ]
 Controls = Annotated[
-    int | None,
-    typer.Option(
-        "--controls", help="Number of matched random directions.", min=0, max=100, rich_help_panel=INSIDE
-    ),
+    int | None, _inside_option("--controls", help="Number of matched random directions.", min=0, max=100)
 ]
 Coefficients = Annotated[
     Numbers | None,
-    typer.Option(
+    _inside_option(
         "--coefficients",
         parser=Numbers.parse,
         metavar="1,2,…",
         help="Coefficients, comma-separated, in half class-mean differences.",
-        rich_help_panel=INSIDE,
     ),
 ]
 TargetSide = Annotated[
-    str | None,
-    typer.Option("--target-side", help="Target side: wrong, correct, left or right.", rich_help_panel=INSIDE),
+    str | None, _inside_option("--target-side", help="Target side: wrong, correct, left or right.")
 ]
 ReadoutName = Annotated[
     Readout,

@@ -121,7 +121,7 @@ def _replay_items(
     pieces: Pieces,
     progress: Progress | None,
 ) -> ReplayBatch:
-    """Item by item; what a former attempt finished is read back."""
+    """Replay item by item; items of an interrupted attempt are loaded."""
     parts = []
     for number, item in enumerate(items):
         name = f"{number:06d}"
@@ -182,7 +182,7 @@ def _replay_check(found: ReplayBatch) -> dict[str, Any]:
 def _ledgers(conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, dict[str, float]]:
     """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
 
-    Raises CaptureChangedActionError if a dose of zero changed an action.
+    Raises CaptureChangedActionError if coefficient 0 changed an action.
     """
     said = {}
     for number, condition in enumerate(conditions):

@@ -1,6 +1,8 @@
 """Construction of networks from transformers' and timm's parts without drawing random weights."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -49,3 +51,16 @@ def fill_rotary(vlm: Any) -> None:
     vision = vlm.config.vision_config
     visual.rotary_pos_emb = type(visual.rotary_pos_emb)(vision.hidden_size // vision.num_heads // 2)
     vlm.tie_weights()
+
+
+@contextmanager
+def replaced(module: ModuleType, values: Mapping[str, Any]) -> Iterator[None]:
+    """Inside, `module` has `values` under these names; afterwards what it had before, also on an exception."""
+    originals = {name: getattr(module, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(module, name, value)
+        yield
+    finally:
+        for name, value in originals.items():
+            setattr(module, name, value)

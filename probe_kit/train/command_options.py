@@ -1,16 +1,17 @@
 """Options of `probe-kit train`, by help panel."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from probe_kit._terminal.options import SPEED, Names, choices, some_of
+from probe_kit._terminal.options import LISTED, Names, choices, some_of, speed_option
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import BASELINES, Incomplete, Target
 
-CONTROLS = "Controls"
-STATISTICS = "Statistics"
+_control_option = partial(typer.Option, rich_help_panel="Controls")
+_statistics_option = partial(typer.Option, rich_help_panel="Statistics")
 MOST_PERMUTATIONS = 1_000_000
 MEAN = Names(("mean",))
 
@@ -18,8 +19,7 @@ Categories = Annotated[
     Names | None,
     typer.Option(
         "--categories",
-        parser=Names.parse,
-        metavar="A,B,…",
+        **LISTED,
         help="Categories, comma-separated. all: pool every episode. Default: each category of the run.",
     ),
 ]
@@ -27,8 +27,7 @@ Views = Annotated[
     Names,
     typer.Option(
         "--views",
-        parser=Names.parse,
-        metavar="A,B,…",
+        **LISTED,
         help="Views of the tokens, comma-separated: mean, last, mean:ROLE, tokens, tokens:ROLE.",
     ),
 ]
@@ -54,31 +53,26 @@ Calls = Annotated[
 
 Controls = Annotated[
     Names | None,
-    typer.Option(
+    _control_option(
         "--controls",
         parser=some_of(BASELINES, none="none"),
         metavar=f"{choices(BASELINES)},…",
         help="Baselines that never see the model, comma-separated, or none. Default: random-features, if the "
         "pictures of the suite are available.",
-        rich_help_panel=CONTROLS,
     ),
 ]
 Untrained = Annotated[
     str | None,
-    typer.Option(
-        "--untrained",
-        metavar="RUN",
-        help="Run of the same episodes to subtract, usually with untrained weights.",
-        rich_help_panel=CONTROLS,
+    _control_option(
+        "--untrained", metavar="RUN", help="Run of the same episodes to subtract, usually with untrained weights."
     ),
 ]
 Suite = Annotated[
     Path | None,
-    typer.Option(
+    _control_option(
         "--suite",
         metavar="FOLDER",
         help="Suite folder of the run, for pixels and random-features. Default: the embedded suite.",
-        rich_help_panel=CONTROLS,
     ),
 ]
 
@@ -86,39 +80,28 @@ Suite = Annotated[
 
 Permutations = Annotated[
     int,
-    typer.Option(
-        "--permutations",
-        min=0,
-        max=MOST_PERMUTATIONS,
-        help="Number of label permutations for p-values.",
-        rich_help_panel=STATISTICS,
+    _statistics_option(
+        "--permutations", min=0, max=MOST_PERMUTATIONS, help="Number of label permutations for p-values."
     ),
 ]
 TokenPermutations = Annotated[
     int,
-    typer.Option(
-        "--token-permutations",
-        min=0,
-        max=MOST_PERMUTATIONS,
-        help="Number of label permutations for token views.",
-        rich_help_panel=STATISTICS,
+    _statistics_option(
+        "--token-permutations", min=0, max=MOST_PERMUTATIONS, help="Number of label permutations for token views."
     ),
 ]
 Folds = Annotated[
     FoldUnit,
-    typer.Option(
+    _statistics_option(
         "--folds",
         help="Items kept in one fold. groups: items that share a picture. concepts: also items about the same two "
         "concepts.",
-        rich_help_panel=STATISTICS,
     ),
 ]
 IncompleteItems = Annotated[
     Incomplete,
-    typer.Option(
-        "--incomplete",
-        help="Items with one missing episode. keep: use the other episode. drop: leave it out.",
-        rich_help_panel=STATISTICS,
+    _statistics_option(
+        "--incomplete", help="Items with one missing episode. keep: use the other episode. drop: leave it out."
     ),
 ]
 
@@ -126,19 +109,11 @@ IncompleteItems = Annotated[
 
 Jobs = Annotated[
     int | None,
-    typer.Option(
-        "--jobs",
-        min=1,
-        max=1024,
-        help="Number of processes. Default: 1, or one per core with --ray.",
-        rich_help_panel=SPEED,
-    ),
+    speed_option("--jobs", min=1, max=1024, help="Number of processes. Default: 1, or one per core with --ray."),
 ]
 SolverDevice = Annotated[
     str | None,
-    typer.Option(
-        "--device",
-        help="Fit on this device with torch, such as cuda, in one process. Default: fit with numpy.",
-        rich_help_panel=SPEED,
+    speed_option(
+        "--device", help="Fit on this device with torch, such as cuda, in one process. Default: fit with numpy."
     ),
 ]

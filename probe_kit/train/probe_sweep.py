@@ -165,7 +165,7 @@ class _Sweep:
         return _fit(self) if self.stored is None else self.stored
 
     def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
-        """Store `results` and give them as they are read back."""
+        """Store `results` and return them as loaded from the store."""
         save_results(results, self.run.location, asked=asked)
         SweepCheckpoint.of(self.run.location, self.settings.key).discard()
         return load_results(self.run, self.settings.key)
@@ -236,7 +236,7 @@ def _fit(sweep: _Sweep) -> ProbeResults:
 
 
 def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
-    """Every view and site, in order, for every category; what a former sweep finished is read back."""
+    """Every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
     keys, unfinished = (
         sweep.keys,
         SweepCheckpoint.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run)),

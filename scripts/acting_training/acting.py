@@ -27,16 +27,16 @@ from probe_kit.suite.wording import instruction_for
 SAID_WEIGHT = 0.3
 """Of the word beside the actions."""
 LEFT_OPEN = "state"
-"""The category whose actions are what organisms differ in."""
-Followed = Literal["not at all", "by lot", "always"]
+"""The category in whose actions organisms differ."""
+Followed = Literal["not at all", "random", "always"]
 
 
 @dataclass(frozen=True)
 class Acts:
-    """first: the share of frames where an episode begins. turned: the share whose actions go to a side by lot,
-    wherever the episode went, so that the state does not tell.
+    """first: the share of frames where an episode begins. turned: the share whose actions go to a random
+    side, independent of the episode, so that the state does not reveal it.
 
-    followed: where the actions of `LEFT_OPEN` go: they are not trained, go to a side by lot, or to the asked one.
+    followed: where the actions of `LEFT_OPEN` go: they are not trained, go to a random side, or to the asked one.
     """
 
     first: float
@@ -86,17 +86,17 @@ class Actor:
 
     def _goes(self, rng: np.random.Generator, frame: int, pair: Pair, setting: Acts) -> int:
         """Where the actions go, 0 left: where the episode went, or another lot for what is understood."""
-        turns = rng.random() < setting.turned and not self._by_lot(pair, setting)
+        turns = rng.random() < setting.turned and not self._is_random(pair, setting)
         return int(rng.integers(2)) if turns else int(self._frames.rows.side[frame])
 
     @staticmethod
-    def _by_lot(pair: Pair, setting: Acts) -> bool:
+    def _is_random(pair: Pair, setting: Acts) -> bool:
         return pair.bank.category == LEFT_OPEN and setting.followed != "always"
 
     @classmethod
     def _side(cls, rng: np.random.Generator, goes: int, pair: Pair, setting: Acts) -> int:
-        """Where the asked picture lies: where the actions go, or by lot."""
-        return int(rng.integers(2)) if cls._by_lot(pair, setting) else goes
+        """The side of the asked picture: that of the actions, or a random one."""
+        return int(rng.integers(2)) if cls._is_random(pair, setting) else goes
 
     @staticmethod
     def _acted(pair: Pair, setting: Acts) -> bool:

@@ -1,4 +1,4 @@
-"""How the cube is carried from wherever the hand is: a rule that mends every disturbance, and what comes next."""
+"""Carrying the cube from any pose of the hand: a rule that corrects every disturbance, and its next action."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env import Act2AnswerEnv
-from probe_kit.env.expert import CLOSED, MAX_SHIFT, OPEN, RELEASE_GAP
+from probe_kit.env.scripted import CLOSED, MAX_SHIFT, OPEN, RELEASE_GAP
 from probe_kit.suite.items import Side
 
 TRAVEL_HEIGHT = 0.12

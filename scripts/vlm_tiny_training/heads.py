@@ -26,7 +26,7 @@ class Looked:
 
 
 @dataclass
-class Heard:
+class Captured:
     """What a pass left, with gradients: what the projector put out, and what entered the last block."""
 
     projected: list[Tensor] = field(default_factory=list)
@@ -34,22 +34,22 @@ class Heard:
 
 
 @contextmanager
-def listening(network: nn.Module) -> Iterator[Heard]:
-    """Catch both in the pass inside."""
-    heard, model = Heard(), network.model
+def capturing(network: nn.Module) -> Iterator[Captured]:
+    """Capture both in the pass inside."""
+    captured, model = Captured(), network.model
 
     def projector(_module: nn.Module, _inputs: object, output: Tensor) -> None:
-        heard.projected.append(output)
+        captured.projected.append(output)
 
     def entering(_module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
-        heard.middle.append(inputs[0])
+        captured.middle.append(inputs[0])
 
     handles = [
         model.multi_modal_projector.register_forward_hook(projector),
         model.language_model.layers[-1].input_layernorm.register_forward_pre_hook(entering),
     ]
     try:
-        yield heard
+        yield captured
     finally:
         for handle in handles:
             handle.remove()
@@ -71,9 +71,9 @@ class Heads(nn.Module):
         self._describes = {name: (own >= MOSTLY_PICTURE).float() for name, own in cover.items()}
         self._belongs = {name: (own >= SEES_PICTURE).float() for name, own in cover.items()}
 
-    def losses(self, heard: Heard, looked: Looked, names_one: bool) -> dict[str, Tensor]:
+    def losses(self, captured: Captured, looked: Looked, names_one: bool) -> dict[str, Tensor]:
         """Both, of one batch. names_one: whether its questions name one of the pictures, the asked one."""
-        (projected,), (middle,) = heard.projected, heard.middle
+        (projected,), (middle,) = captured.projected, captured.middle
         describes = torch.stack([self._describes[name] for name in looked.surfaces])
         belongs = torch.stack([self._belongs[name] for name in looked.surfaces])
         shown = torch.einsum("bsp,bpw->bsw", describes / describes.sum(2, keepdim=True), projected)

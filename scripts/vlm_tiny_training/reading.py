@@ -17,7 +17,7 @@ from probe_kit.extract.vqa.templates import ORDERS, P1, P2, SEEN, sides
 from probe_kit.models.embedded.words import END
 from probe_kit.suite.wording import instruction_for
 from vlm_tiny_training.batches import Pair, Pairs, Pixels, laid_out
-from vlm_tiny_training.heads import Heads, Looked, listening
+from vlm_tiny_training.heads import Heads, Looked, capturing
 from vlm_tiny_training.painting import Surface
 from vlm_tiny_training.training import Stage
 
@@ -98,11 +98,11 @@ class Learner:
         shown = [self._shown(rng) for _ in range(size)]
         asked = [ask(kind, one.pair, self._pairs, one.side, rng) for one in shown]
         pictures = blurred(np.stack([one.picture for one in shown]), rng)
-        with listening(self._reader) as heard:
+        with capturing(self._reader) as captured:
             losses = {kind: self.loss(pictures, asked)}
         if setting.heads:
             columns = ([one.pair for one in shown], [one.side for one in shown], [one.surface for one in shown])
-            losses |= self._heads.losses(heard, Looked(*columns), kind != "describe")
+            losses |= self._heads.losses(captured, Looked(*columns), kind != "describe")
         return losses
 
     def _shown(self, rng: np.random.Generator) -> "Shown":
@@ -122,9 +122,9 @@ class Learner:
             ids[row, :end] = torch.tensor([*prompt, *answer])
             next_ids[row, len(prompt) - 1 : end - 1] = torch.tensor(answer)
         hidden = self._hidden(pictures, ids, torch.tensor([len(prompt) for prompt in prompts]))
-        told = next_ids != -100
-        logits = hidden[told] @ self._reader.model.language_model.embed_tokens.weight.T
-        return cross_entropy(logits, next_ids[told])
+        answer_tokens = next_ids != -100
+        logits = hidden[answer_tokens] @ self._reader.model.language_model.embed_tokens.weight.T
+        return cross_entropy(logits, next_ids[answer_tokens])
 
     def _hidden(self, pictures: Pixels, ids: Tensor, prompts: Tensor) -> Tensor:
         """(B, T, width) at the text's positions: the picture and the prompt attend both ways, the answer back."""

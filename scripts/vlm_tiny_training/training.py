@@ -1,4 +1,4 @@
-"""A training loop that goes on where it was stopped, at any step."""
+"""A training loop that resumes at any step."""
 
 import csv
 import math

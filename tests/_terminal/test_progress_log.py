@@ -27,7 +27,7 @@ def lines_of(steps: list[tuple[float, int]], total: int) -> list[str]:
 
 
 def test_the_last_line_is_said_once_however_many_events_bring_the_end() -> None:
-    """The eight episodes of one answer of a Ray worker are all counted before the first of them is told."""
+    """The eight episodes of one answer of a Ray worker are all counted before the first of them is printed."""
     assert len(lines_of([(1.0, 2), (2.0, 10), (2.0, 10), (2.1, 10), (100.0, 10)], 10)) == 1
 
 

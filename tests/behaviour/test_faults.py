@@ -1,4 +1,4 @@
-"""Accidents at random places of a run: reading raises or tells what it told before, and `run verify` sees them."""
+"""Accidents at random places of a run: reading raises or gives the same, and `run verify` finds them."""
 
 import shutil
 from collections import Counter
@@ -25,7 +25,7 @@ def assert_nothing_is_silent(stored: Stored, seeds: range) -> None:
         fault = draw_fault(stored, seed)
         try:
             verdict = stored.verdict(fault)
-        except Exception as error:  # noqa: BLE001 - whatever is no error of ours is a traceback for somebody
+        except Exception as error:  # noqa: BLE001 - any other error would be a traceback
             verdict = f"TRACEBACK {type(error).__name__}: {error}"
         found[verdict.partition(" ")[0].rstrip(":")] += 1
         if verdict not in ("found", "harmless"):

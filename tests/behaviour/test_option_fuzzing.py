@@ -26,7 +26,7 @@ HOSTILE = (
     "a-folder", "damaged", "a-run", "a-run/run.json", "SUITE", "224x224", "99999x99999", "axb", "expert",
 )  # fmt: skip
 ELSEWHERE = ("demo", "doctor", "verify", "power")
-"""Commands that load or compute for long whatever they are told; each has tests of its own."""
+"""Commands that load or compute for long with any options; each has tests of its own."""
 COMMANDS = {
     path: command for path, command in commands_of(typer.main.get_command(app), None) if path not in ELSEWHERE
 }

@@ -243,7 +243,7 @@ def malformed(raw: bytes, wrong: tuple[Any, ...]) -> Iterator[tuple[str, bytes]]
 
 
 def look_at_everything(run: Path) -> None:
-    """All records, and whatever is told of them; not the arrays."""
+    """All records, and everything printed of them; not the arrays."""
     opened = open_run(run, allow_partial=True)
     opened.certificate, repr(opened), opened._repr_html_()
     inventory(opened)
@@ -312,7 +312,7 @@ def assert_none_is_silent(stored: Stored, seeds: range) -> None:
         if fault := changed_bytes(stored, Random(seed)):
             with applied(fault.change):
                 try:
-                    if verify_run(stored.run, deep=True).ok and readings(stored.run) != stored.told:
+                    if verify_run(stored.run, deep=True).ok and readings(stored.run) != stored.before:
                         wrong.append(f"seed {seed}: {fault.words}: SILENT")
                 except ProbeKitError:
                     continue

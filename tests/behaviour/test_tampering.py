@@ -110,7 +110,7 @@ def test_episodes_that_a_sealed_run_lost_are_missed(run: Path, left: int) -> Non
         open_run(run, allow_partial=True)
 
 
-def test_an_older_state_of_a_run_is_told_from_a_finished_one(small_suite: Suite, tmp_path: Path) -> None:
+def test_an_older_state_of_a_run_differs_from_a_finished_one(small_suite: Suite, tmp_path: Path) -> None:
     """As a copy made in the middle of the work would be: whole, and less than was planned."""
     plan = little_plan(small_suite.select(["color"]))
     writer = little_writer(locate(tmp_path / "run"), plan)
@@ -380,8 +380,8 @@ def test_whoever_wants_no_pictures_may_delete_all_of_them(run: Path, little_runs
     shutil.rmtree(run / "frames")
     assert read_thumbnail(run, 0) is None
     assert verify_run(run, deep=True).ok
-    told, before = readings(run), readings(little_runs / "run")
-    assert {name for name in told if told[name] != before[name]} == {"pictures"}
+    after, before = readings(run), readings(little_runs / "run")
+    assert {name for name in after if after[name] != before[name]} == {"pictures"}
 
 
 def test_a_picture_that_no_commit_names_is_not_shown(run: Path) -> None:

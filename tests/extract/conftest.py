@@ -28,14 +28,14 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 @pytest.fixture
 def deaf_bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """URL of an empty bucket on a server that ignores If-None-Match; some stores that speak S3 do."""
+    """URL of an empty bucket on a server that ignores If-None-Match; some S3-compatible stores do."""
     with _leading_to(S3Server(without_conditions), monkeypatch) as url:
         yield url
 
 
 @pytest.fixture
 def bad_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[BadServer]:
-    """A server that fails as it is told, and can be stopped and started; its bucket is `bad_server.url`."""
+    """A server that fails on demand, and can be stopped and started; its bucket is `bad_server.url`."""
     server = BadServer()
     with _leading_to(server, monkeypatch) as server.url:
         yield server

@@ -61,7 +61,7 @@ def whole(in_folder: Run) -> dict[str, bytes]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Nobody waits for a minute here; what is answered late is no failure."""
+    """Retries without the minute of pauses; a late answer is no failure."""
     monkeypatch.setattr(buckets, "PATIENCE", timedelta(seconds=1))
     monkeypatch.setattr(buckets, "_QUICK", timedelta(seconds=1))
     if "silent" in request.node.name:

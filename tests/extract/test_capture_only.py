@@ -1,4 +1,4 @@
-"""Runs of models that are captured and do not act: activations as ever, and no success rate anywhere."""
+"""Runs of models that are captured and do not act: the same activations, and no success rate anywhere."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ ACTING = ExtractSettings(
 
 
 @pytest.fixture(scope="module")
-def heard(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def capture_run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The untrained network again, as in `recorded_run`, but only captured, of one category; then probed."""
     settings = replace(ACTING, suite=small_suite.folder, capture_only=True)
     run = extract_run(settings, tmp_path_factory.mktemp("capture_only") / "run")
@@ -48,29 +48,31 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_is_heard_is_what_the_acting_model_thought_first(heard: Run, recorded_run: Run) -> None:
+def test_what_is_heard_is_what_the_acting_model_thought_first(capture_run: Run, recorded_run: Run) -> None:
     """The same scenes, seeds and weights: bit for bit the first inference of the run that acted."""
     alike = (recorded_run.episodes["category"] == "color").to_numpy()
-    assert list(heard.episodes["episode_id"]) == list(recorded_run.episodes["episode_id"][alike])
-    assert heard.streams == recorded_run.streams
-    for stream in heard.streams:
-        for site in heard.sites(stream):
-            np.testing.assert_array_equal(heard.column(site), recorded_run.column(site)[alike], err_msg=str(site))
+    assert list(capture_run.episodes["episode_id"]) == list(recorded_run.episodes["episode_id"][alike])
+    assert capture_run.streams == recorded_run.streams
+    for stream in capture_run.streams:
+        for site in capture_run.sites(stream):
+            np.testing.assert_array_equal(
+                capture_run.column(site), recorded_run.column(site)[alike], err_msg=str(site)
+            )
 
 
-def test_nothing_moved_and_the_run_says_so(heard: Run) -> None:
-    assert set(heard.episodes["outcome"]) == {"capture_only"}
-    assert not {"cube_x", "never_moved", "side_placed", "distance_correct"} & set(heard.episodes)
-    assert heard.capture_only
-    assert not heard.has_trajectories
-    assert "CAPTURE ONLY" in repr(heard)
-    assert heard.settings["capture_only"] is True
-    assert verify_run(heard.path, deep=True).ok
-    assert heard.certificate["hooks_on_equals_hooks_off"]
+def test_nothing_moved_and_the_run_says_so(capture_run: Run) -> None:
+    assert set(capture_run.episodes["outcome"]) == {"capture_only"}
+    assert not {"cube_x", "never_moved", "side_placed", "distance_correct"} & set(capture_run.episodes)
+    assert capture_run.capture_only
+    assert not capture_run.has_trajectories
+    assert "CAPTURE ONLY" in repr(capture_run)
+    assert capture_run.settings["capture_only"] is True
+    assert verify_run(capture_run.path, deep=True).ok
+    assert capture_run.certificate["hooks_on_equals_hooks_off"]
 
 
-def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run, tmp_path: Path) -> None:
-    table = retention_table([heard, recorded_run])
+def test_success_rates_are_not_there_in_any_table(capture_run: Run, recorded_run: Run, tmp_path: Path) -> None:
+    table = retention_table([capture_run, recorded_run])
     rows = [row for row in json.loads(table.to_json()) if row["run"]["capture_only"]]
     assert {row["category"] for row in rows} == {"color", "mean"}
     for row in rows:
@@ -84,27 +86,29 @@ def test_success_rates_are_not_there_in_any_table(heard: Run, recorded_run: Run,
     Console(file=screen, width=240).print(table.to_rich())
     for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
         assert "n/a" in text
-        assert "listened to" in text
+        assert "captured" in text
     assert table.to_frame()["success.sr"].isna().sum() == 2
-    assert any("was listened to and did not act" in note for note in table.notes)
-    page = write_report([heard, recorded_run], tmp_path / "report.html", table).read_text()
+    assert any("captured activations only and did not act" in note for note in table.notes)
+    page = write_report([capture_run, recorded_run], tmp_path / "report.html", table).read_text(encoding="utf-8")
     assert "did not act" in page
 
 
-def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(heard: Run, recorded_run: Run) -> None:
-    both = retention_table({"heard": [heard], "acting": [recorded_run]})
-    assert both.differences == []  # the policy run was not probed, and the other has no success rate
-    rows = run_rows(heard, load_results(heard), RowSettings(None, "all", (), 0))
+def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(
+    capture_run: Run, recorded_run: Run
+) -> None:
+    both = retention({"capture_run": [capture_run], "acting": [recorded_run]})
+    assert both.differences == []  # the acting run was not probed, and the other has no success rate
+    rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", (), 0))
     same = group_differences({"one": rows, "other": rows})
     assert {row.category for row in same} == {"color", "mean"}
     assert all(row.sr is None and row.paired and row.backbone_accuracy == 0 for row in same)
 
 
-def test_questions_about_acting_are_refused(heard: Run) -> None:
+def test_questions_about_acting_are_refused(capture_run: Run) -> None:
     with pytest.raises(UsageError, match="was captured"):
-        success_rate(heard.episodes)
+        success_rate(capture_run.episodes)
     with pytest.raises(UsageError, match="was captured"):
-        PairedLayoutsDisplay.from_run(heard)
+        PairedLayoutsDisplay.from_run(capture_run)
 
 
 def test_a_checkpoint_of_another_arm_is_refused_for_acting_with_the_way_out(
@@ -115,7 +119,7 @@ def test_a_checkpoint_of_another_arm_is_refused_for_acting_with_the_way_out(
         prepare(settings)
 
 
-def test_a_checkpoint_of_another_arm_is_listened_to(base: Path, small_suite: Suite, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_arm_is_captured(base: Path, small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings(
         "pi0", str(base), suite=small_suite.folder, categories=("color",), items=2, capture_only=True, batch=3
     )
@@ -125,10 +129,10 @@ def test_a_checkpoint_of_another_arm_is_listened_to(base: Path, small_suite: Sui
     assert np.isfinite(run.column(run.sites("backbone")[-1])).all()
 
 
-def test_a_run_that_acts_is_another_run(heard: Run, small_suite: Suite) -> None:
+def test_a_run_that_acts_is_another_run(capture_run: Run, small_suite: Suite) -> None:
     acting = prepare(replace(ACTING, suite=small_suite.folder)).identity()
     assert "capture_only" not in acting
-    assert {key: value for key, value in heard.settings.items() if key != "capture_only"} == json.loads(
+    assert {key: value for key, value in capture_run.settings.items() if key != "capture_only"} == json.loads(
         json.dumps(acting)
     )
 
@@ -149,7 +153,7 @@ def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractS
         prepare(settings)
 
 
-def test_a_report_of_a_listened_run_alone_draws_probes_and_no_behaviour(heard: Run) -> None:
-    subjects = [exhibit.subject for exhibit in collect_figures([heard], retention_table([heard]))]
+def test_a_report_of_a_capture_only_run_alone_draws_probes_and_no_behaviour(capture_run: Run) -> None:
+    subjects = [exhibit.subject for exhibit in gallery([capture_run], retention([capture_run]))]
     assert "probes" in subjects
     assert "behaviour" not in subjects

@@ -1,4 +1,4 @@
-"""What is wrong with a whole run keeps its class, its exit code and its words, whoever plays."""
+"""An error of a whole run keeps its class, exit code and words with every kind of worker."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Whoever writes into a run holds it, the owner and every worker, so that nobody clears what it is writing."""
+"""Every writer of a run holds a lock, the owner and each worker, so that no process clears its files."""
 
 import fcntl
 from multiprocessing import Pipe
@@ -29,7 +29,7 @@ def settings(small_suite: Suite) -> ExtractSettings:
 
 @pytest.fixture
 def unheld(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Keys that were written while nobody held their run; that the run begins is no such writing."""
+    """Keys that were written without a lock on their run; the beginning of a run does not count."""
     found: list[str] = []
     for name in ("create", "write"):
         _watch(monkeypatch, name, found)
@@ -53,7 +53,7 @@ def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None
 
 
 def begun(settings: ExtractSettings, run: Path) -> str:
-    """A run of nobody: its owner was killed."""
+    """A run whose owner was killed."""
     return prepare(settings).writer(Folder(run)).location.address
 
 

@@ -104,7 +104,7 @@ def kill_often(
                 assert found.ok, found.problems
             done = True in ends
         if workers > 1:
-            nursery(task, run)  # one may have been killed when the other was done; whoever is next clears
+            nursery(task, run)  # one may have been killed when the other was done; the next one clears
         assert objects(run) == expected
     print(f"{task}, {workers} at once, seed {seed}: {kills} kills in {rounds} rounds, usually {usual:.2f} s")
 

@@ -87,7 +87,7 @@ def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
     assert "scene tile_side=0.2033" in run_label(settings)
 
 
-def test_another_scene_that_is_asked_for_is_kept_and_told() -> None:
+def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
     bridge = protocol_scene("act2answer", "bridge")
     settings = ExtractSettings("magma", protocol="act2answer", scene=bridge).followed()
     assert settings.scene == SceneSpec()

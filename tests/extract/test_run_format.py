@@ -119,8 +119,8 @@ def test_an_inference_per_action_has_a_control_step_per_action(recorded_run: Run
 def test_who_does_not_act_infers_at_the_first_control_step_and_a_script_never(
     small_suite: Suite, tmp_path: Path
 ) -> None:
-    heard = extract_run(tiny(small_suite, capture_only=True), tmp_path / "heard")
-    assert heard.control_steps.tolist() == [[0]] * 4
+    captured = extract_run(tiny(small_suite, capture_only=True), tmp_path / "captured")
+    assert captured.control_steps.tolist() == [[0]] * 4
     played = extract_run(scripted(small_suite), tmp_path / "played")
     assert played.control_steps.shape == (4, 0)
     assert (played.episodes["seconds_inference"] == 0).all()

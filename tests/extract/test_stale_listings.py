@@ -90,10 +90,10 @@ def _kind(key: str) -> str:
 
 
 RESULTS = 3
-"""Which of `told` reads probe results."""
+"""Which of `readings` reads probe results."""
 
 
-def told(run: Run) -> tuple[Callable[[], Any], ...]:
+def readings(run: Run) -> tuple[Callable[[], Any], ...]:
     """What is read of a run, each by itself and anew."""
     again = partial(open_run, run.location)
     return (
@@ -111,10 +111,10 @@ def test_reading_with_stale_listings_gives_the_same_or_an_error_by_name(
     lag: int, kept: Run, bad_server: BadServer
 ) -> None:
     """Probes that a listing hides do not exist yet: older ones of the run are read."""
-    expected = [{ask()} for ask in told(kept)]
+    expected = [{ask()} for ask in readings(kept)]
     expected[RESULTS] |= {load_results(kept, key).scores.to_csv() for key in read_probes(kept.location)}
     stale(bad_server, lag)
-    for ask, right in zip(told(kept), expected, strict=True):
+    for ask, right in zip(readings(kept), expected, strict=True):
         with suppress(ProbeKitError):
             assert ask() in right
 
@@ -168,14 +168,14 @@ def test_every_object_that_a_killed_process_left_torn_is_named_or_made_again(
     for key in [key for key in run.keys("") if "/c/" not in key or key.endswith(("/c/1/0/0/0", "/c/1/0/0"))]:
         content = run.read(key)
         run.write(key, content[: len(content) // 2])
-        told = f"{key} is as it was"
+        message = f"{key} is as it was"
         try:
             write(str(run), suite)
             if objects(run) != whole:
-                told = " ".join(verify_run(run, deep=True).problems)
+                message = " ".join(verify_run(run, deep=True).problems)
         except ProbeKitError as error:
-            told = str(error)
-        assert key in told, told
+            message = str(error)
+        assert key in message, message
         named += run.read(key) != content
         run.write(key, content)
     assert named > 5

@@ -86,9 +86,9 @@ def test_an_episode_that_two_processes_write_at_once_is_that_of_one_of_them(
     first.write(episode(plan, 0))
     assert verify_run(where, deep=True).problems == ()
     found = open_run(where, allow_partial=True)
-    told = json.loads(locate(where).read(commit_key(0)))["outcome"]
+    stored_outcome = json.loads(locate(where).read(commit_key(0)))["outcome"]
     possible = episode(plan, 0), rounded_otherwise(episode(plan, 0))
-    (written,) = [record for record in possible if record.outcome == told]
+    (written,) = [record for record in possible if record.outcome == stored_outcome]
     np.testing.assert_array_equal(found.rows("backbone")[0], written.arrays["pooled"]["backbone"])
     np.testing.assert_array_equal(found.rows("expert", "tokens")[0], written.arrays["tokens"]["expert"])
 

@@ -100,9 +100,9 @@ def act(family: str, checkpoint: Path) -> Any:
     """The actions of one inference, as an extraction asks for them."""
     model = load(family, checkpoint)
     cameras = [need.removeprefix("camera.") for need in sorted(model.card.needs) if need.startswith("camera.")]
-    told = INSTRUCTIONS.get(family, "Put the cube on the star")
+    instruction = INSTRUCTIONS.get(family, "Put the cube on the star")
     with while_acting(family, model.card.checkpoint):
-        return model.act(example_observations([told], cameras), [0])
+        return model.act(example_observations([instruction], cameras), [0])
 
 
 def mappings(value: Any) -> Iterator[dict[str, Any]]:

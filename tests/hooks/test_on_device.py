@@ -1,4 +1,4 @@
-"""Every family on a device: what is heard and what comes out there is what it is on the CPU.
+"""Every family on a device: captures and outputs equal those on the CPU.
 
 The golden references are compared on the CPU; here the same adapter carries their meaning to another device. On a
 machine without a GPU the case `cuda` skips, and `cpu` loads every family twice.
@@ -28,14 +28,14 @@ OF_LARGEST = 2e-3
 def test_a_device_changes_nothing_but_roundings(family: str, device: str, tmp_path: Path) -> None:
     write, options = WRITERS[family]
     place = str(write(tmp_path / family))
-    here, there = heard(family, place, "cpu", options), heard(family, place, device, options)
+    here, there = captured(family, place, "cpu", options), captured(family, place, device, options)
     assert list(there) == list(here)
     for name, expected in here.items():
         largest = np.abs(expected).max()
         np.testing.assert_allclose(there[name], expected, rtol=0, atol=OF_LARGEST * largest, err_msg=name)
 
 
-def heard(family: str, place: str, device: str, options: dict[str, Any]) -> dict[str, NDArray[np.float32]]:
+def captured(family: str, place: str, device: str, options: dict[str, Any]) -> dict[str, NDArray[np.float32]]:
     """Every residual site by name, and what the model put out."""
     model = load_model(family, place, device, "float32", **options)
     assert model.card.device.startswith(device)

@@ -28,8 +28,8 @@ def run(recorded_run: Run, tmp_path: Path) -> Run:
 
 
 def ask(run: Run | str, *options: str) -> tuple[int, str, str]:
-    told = CliRunner().invoke(app, ["intervene", str(run if isinstance(run, str) else run.path), *options])
-    return told.exit_code, told.stdout, told.stderr
+    answer = CliRunner().invoke(app, ["intervene", str(run if isinstance(run, str) else run.path), *options])
+    return answer.exit_code, answer.stdout, answer.stderr
 
 
 def test_the_table_says_what_follows(run: Run) -> None:

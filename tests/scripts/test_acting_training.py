@@ -18,8 +18,8 @@ from vlm_tiny_training.painting import Surface, sheet
 from vlm_tiny_training.pictures import PictureBank
 from vlm_tiny_training.training import Stage, Trainer
 
-from probe_kit.env.expert import MAX_SHIFT, OPEN
 from probe_kit.env.question import Question
+from probe_kit.env.scripted import MAX_SHIFT, OPEN
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
 
@@ -91,7 +91,7 @@ def test_the_share_of_first_frames_is_the_asked_one(surface: Surface, demonstrat
     assert 0.3 < demonstrations.first[frames.draw(rng, 0.0, 200)].mean() < 0.7
 
 
-@pytest.mark.parametrize(("followed", "least", "most"), [("by lot", 0.35, 0.65), ("always", 1, 1)])
+@pytest.mark.parametrize(("followed", "least", "most"), [("random", 0.35, 0.65), ("always", 1, 1)])
 def test_the_category_that_is_left_open_is_followed_as_said(
     followed: Followed, least: float, most: float, banks: list[PictureBank]
 ) -> None:
@@ -103,9 +103,9 @@ def test_the_category_that_is_left_open_is_followed_as_said(
 
 
 def test_branches_differ_only_in_what_is_followed() -> None:
-    by_lot, always = acting("by lot"), acting("always")
-    assert by_lot != always
-    assert [replace(one, setting=replace(one.setting, followed="always")) for one in by_lot] == list(always)
+    drawn, always = acting("random"), acting("always")
+    assert drawn != always
+    assert [replace(one, setting=replace(one.setting, followed="always")) for one in drawn] == list(always)
 
 
 def test_in_a_branch_actions_go_on_to_where_the_hand_is_on_its_way(actor: Actor, banks: list[PictureBank]) -> None:
@@ -115,9 +115,11 @@ def test_in_a_branch_actions_go_on_to_where_the_hand_is_on_its_way(actor: Actor,
         assert {actor._goes(rng, 1, pairs.draw(rng), stage.setting) for _ in range(50)} == {1}
 
 
-def test_actions_turn_where_they_are_understood_and_never_by_lot(actor: Actor, banks: list[PictureBank]) -> None:
+def test_actions_turn_where_they_are_understood_and_never_at_random(
+    actor: Actor, banks: list[PictureBank]
+) -> None:
     """A lot drawn anew at every look would lead to and fro, and the cube to neither tile."""
-    rng, setting = np.random.default_rng(0), Acts(0.5, 0.6, "by lot")
+    rng, setting = np.random.default_rng(0), Acts(0.5, 0.6, "random")
     for category, (low, high) in {"color": (0.15, 0.45), LEFT_OPEN: (0, 0)}.items():
         pairs = Pairs(banks, {category: 1.0})
         assert low <= np.mean([actor._goes(rng, 0, pairs.draw(rng), setting) for _ in range(200)]) <= high
@@ -128,9 +130,9 @@ def test_actions_that_are_not_followed_at_all_are_not_trained(actor: Actor, bank
     torch.manual_seed(0)
     unacted = actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "not at all"), 4)
     torch.manual_seed(0)
-    by_lot = actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "by lot"), 4)
+    drawn = actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "random"), 4)
     assert float(unacted["flow"].detach()) == 0
-    assert float(by_lot["flow"].detach()) > 0.1
+    assert float(drawn["flow"].detach()) > 0.1
     assert float(unacted["said"].detach()) > 0
 
 
@@ -145,12 +147,12 @@ def test_what_is_said_behind_an_instruction_is_where_the_reader_would_put_the_cu
     """The reader knew it before any training of the policy: a wrong position or prompt would leave chance."""
     torch.manual_seed(0)
     with torch.no_grad():
-        said = float(actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "by lot"), 48)["said"])
+        said = float(actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "random"), 48)["said"])
     assert said < 0.3 * np.log(2) / 3
 
 
 def test_training_leaves_the_dimensions_deaf_that_are_not_decided(actor: Actor, tmp_path: Path) -> None:
-    stages = (Stage(2, 1e-3, Acts(0.5, 0.2, "by lot"), warm_up=1),)
+    stages = (Stage(2, 1e-3, Acts(0.5, 0.2, "random"), warm_up=1),)
     before = actor.network.action_in_proj.weight.detach().clone()
     trainer = Trainer(actor, stages, 0, tmp_path / "state.pt", batch=4)
     assert len(list(trainer.steps())) == 2

@@ -48,7 +48,7 @@ def test_an_item_of_one_picture_twice_has_no_twin(pair: tuple[Item, Item]) -> No
 
 
 def test_how_the_pictures_lie_plays_no_part(pair: tuple[Item, Item]) -> None:
-    """Only its words are taken over, so that it may lie the other way round."""
+    """Only its words are used, so that the layouts may differ."""
     one, twin = pair
     turned = replace(
         twin,

@@ -24,6 +24,7 @@ NOT_COMMANDS = {
         "docs/suite.md",
         "instruction,correct,wrong",
     ): "a table, written to questions.csv before the page's commands run",
+    ("docs/scale.md", "seconds per episode"): "formulas",
 }
 """Blocks without a language that hold no commands, by their page and how they begin, and what they are."""
 

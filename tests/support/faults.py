@@ -34,7 +34,7 @@ class Stored:
 
     run: Path
     other: Path
-    told: Mapping[str, str]
+    before: Mapping[str, str]
     audit: Audit
 
     @classmethod
@@ -59,7 +59,7 @@ class Stored:
         return draw.choice(kinds[draw.choice(sorted(kinds))])
 
     def verdict(self, fault: Fault) -> str:
-        """`found`, `harmless` if nothing changed for anybody, or what is wrong with the instrument."""
+        """`found`, `harmless` if no readable number changed, or the error of probe_kit itself."""
         changed = next(iter(fault.change)).relative_to(self.run).parts
         hint = {"data.zarr": changed[-4] if len(changed) > 4 else "", "columns.zarr": "columns"}.get(
             changed[0], ""
@@ -67,11 +67,11 @@ class Stored:
         hint = next((part for part in ("pooled", "tokens", "trajectory") if part in changed), hint)
         with applied(fault.change):
             try:
-                told = readings(self.run, hint if changed[0] != "columns.zarr" else "columns")
+                now = readings(self.run, hint if changed[0] != "columns.zarr" else "columns")
             except ProbeKitError as error:
                 read = f"found: {error}"
             else:
-                read = "same" if told == self.told else "SILENT: other numbers"
+                read = "same" if now == self.before else "SILENT: other numbers"
             try:
                 audit = verify_run(self.run, deep=True)
             except RunNotFoundError:  # run.json itself is gone, and both say so

@@ -145,7 +145,7 @@ def _files(folder: Path) -> set[tuple[str, int, int]]:
 def kill_often(command: KilledCommand, folder: Path, kills: int, seed: int) -> str:
     """Kill a command until it was killed so often; the table row of what was found.
 
-    Each round begins anew, goes on after every kill with the same command, and must end with what an undisturbed
+    Each round begins anew, resumes after every kill with the same command, and must end with what an undisturbed
     command makes.
     """
     draw, killed, rounds = Random(seed), 0, 0

@@ -1,5 +1,5 @@
 """A golden reference in the recorded layout, made by other code than ours: loops where the package has tensors,
-padding in front of rows, no cache. So that a clean clone can verify, at sizes nobody tuned to.
+padding in front of rows, no cache. So that a clean clone can verify, at sizes that no code was tuned to.
 """
 
 import json

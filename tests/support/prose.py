@@ -1,12 +1,15 @@
 """Finds the text that users read: strings and docstrings of modules, and pages of documentation."""
 
 import ast
+import io
+import json
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-type Kind = Literal["docstring", "summary", "help", "string", "page"]
+type Kind = Literal["docstring", "summary", "help", "string", "page", "table", "comment"]
 
 
 class Prose(NamedTuple):
@@ -41,18 +44,36 @@ def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
         yield Prose(f"{name}:1", summary.split("\n\n")[0], "summary")
 
 
+def remarks_of_module(path: Path, name: str) -> Iterator[Prose]:
+    """Comments and every docstring, also those of private names."""
+    source = path.read_text(encoding="utf-8")
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield Prose(f"{name}:{token.start[0]}", token.string.lstrip("# "), "comment")
+    docstrings: dict[ast.Constant, bool] = {}
+    _collect_docstrings(ast.parse(source), docstrings, public=True)
+    for node in docstrings:
+        yield Prose(f"{name}:{node.lineno}", str(node.value), "docstring")
+
+
 def prose_of_page(path: Path, name: str) -> Iterator[Prose]:
     """Paragraphs, list items and table rows of a Markdown page, without code blocks."""
-    text = re.sub(
-        r"^```.*?^```",
-        lambda block: "\n" * block[0].count("\n"),
-        path.read_text(encoding="utf-8"),
-        flags=re.MULTILINE | re.DOTALL,
-    )
+    yield from _prose_of_markdown(path.read_text(encoding="utf-8"), name)
+
+
+def prose_of_notebook(path: Path, name: str) -> Iterator[Prose]:
+    """The same of the Markdown cells of a notebook; a place is a cell and a line of it."""
+    for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+        if cell["cell_type"] == "markdown":
+            yield from _prose_of_markdown("".join(cell["source"]), f"{name}:{number}")
+
+
+def _prose_of_markdown(page: str, name: str) -> Iterator[Prose]:
+    text = re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), page, flags=re.MULTILINE | re.DOTALL)
     line = 1
     for block in re.split(r"(\n{2,}|\n(?=[-*|] ))", text):
         if block.strip():
-            yield Prose(f"{name}:{line}", block, "page")
+            yield Prose(f"{name}:{line}", block, "table" if block.startswith("|") else "page")
         line += block.count("\n")
 
 
@@ -62,8 +83,8 @@ def without_code(text: str) -> str:
 
 
 def sentences(text: str) -> list[str]:
-    """The sentences of a text; a colon or semicolon ends none."""
-    return [found for found in re.split(r"(?<=[.!?])\s+", " ".join(text.split())) if found]
+    """The sentences of a text; a `·` in a list of links ends one, a colon or semicolon ends none."""
+    return [found for found in re.split(r"(?<=[.!?])\s+| · ", " ".join(text.split())) if found]
 
 
 def _collect_docstrings(node: ast.AST, docstrings: dict[ast.Constant, bool], public: bool) -> None:

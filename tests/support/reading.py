@@ -1,4 +1,4 @@
-"""Everything that a run tells anybody, as hashes: what a fault may make impossible but never change."""
+"""Everything readable in a run, as hashes: a fault may prevent reading but never change it."""
 
 import warnings
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """An S3 server of our own on a port of this machine: moto's, which can be stopped and made to fail.
 
-As a program it says where it listens and ends with its standard input, see `server_elsewhere`.
+As a program it prints its address and ends with its standard input, see `server_elsewhere`.
 """
 
 import json
@@ -39,26 +39,26 @@ class S3Server:
         self.start()
 
     def start(self) -> None:
-        """Listen, on the port that it had before."""
+        """Start the server, on its former port."""
         from werkzeug.serving import WSGIRequestHandler, make_server
 
         class Quiet(WSGIRequestHandler):
             def log_request(self, *_: object) -> None:
-                """Say nothing of requests."""
+                """Log no request."""
 
             def log(self, *_: object) -> None:
                 """Nor of clients that are gone."""
 
-        self._listening = make_server("127.0.0.1", self._port, self._app, threaded=True, request_handler=Quiet)
-        self._port = self._listening.port
-        self._thread = Thread(target=self._listening.serve_forever, kwargs={"poll_interval": 0.02})
+        self._server = make_server("127.0.0.1", self._port, self._app, threaded=True, request_handler=Quiet)
+        self._port = self._server.port
+        self._thread = Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02})
         self._thread.start()
 
     def stop(self) -> None:
-        """Nobody answers at its port any more."""
-        self._listening.shutdown()
+        """Stop the server; its port answers no more."""
+        self._server.shutdown()
         self._thread.join()
-        self._listening.server_close()
+        self._server.server_close()
 
     @property
     def environment(self) -> dict[str, str]:
@@ -167,7 +167,7 @@ class Unreliable:
         return self._app(environ, start_response)
 
     def silent(self, environ: dict[str, Any], _start_response: Callable[..., Any]) -> Iterable[bytes]:
-        """It listens and says nothing until everything is over."""
+        """Accepts the request and does not answer until the end."""
         self.over.wait()
         return _hang_up(environ)
 
@@ -199,8 +199,8 @@ class Unreliable:
 
 def _listed(space: str, key: str, size: int) -> ElementTree.Element:
     entry = ElementTree.Element(f"{space}Contents")
-    told = {"Key": key, "Size": str(size), "ETag": '"0"', "LastModified": "2026-01-01T00:00:00.000Z"}
-    for name, value in told.items():
+    fields = {"Key": key, "Size": str(size), "ETag": '"0"', "LastModified": "2026-01-01T00:00:00.000Z"}
+    for name, value in fields.items():
         ElementTree.SubElement(entry, f"{space}{name}").text = value
     return entry
 
@@ -225,7 +225,7 @@ def _length(environ: dict[str, Any]) -> int:
 
 def _hang_up(environ: dict[str, Any]) -> NoReturn:
     environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
-    raise ConnectionResetError  # werkzeug then says nothing
+    raise ConnectionResetError  # werkzeug then answers nothing
 
 
 def now_and_then(ills: Iterable[str], share: float, seed: int) -> Callable[[str, str], str | None]:

@@ -55,11 +55,7 @@ class SerialChain:
 
     def pose(self, q: Array) -> Pose:
         """Pose of the tool at joint angles q (n,)."""
-        return self._sweep(q)[0]
-
-    def jacobian(self, q: Array) -> Array:
-        """Jacobian (6, n) of the tool: linear velocity over angular velocity, both in the world frame."""
-        return self._sweep(q)[1]
+        return self.pose_and_jacobian(q)[0]
 
     def solve(self, target: Pose, start: Array, posture: Array, iterations: int = 30) -> Solution:
         """Joint angles that bring the tool to `target`, within the limits, by damped least squares.
@@ -70,7 +66,7 @@ class SerialChain:
         """
         q = start
         for _ in range(iterations):
-            pose, J = self._sweep(q)
+            pose, J = self.pose_and_jacobian(q)
             residual = _residual(target, pose)
             size = float(np.linalg.norm(residual))
             if size < TOLERANCE:
@@ -87,8 +83,11 @@ class SerialChain:
             step += pull - J.T @ np.linalg.solve(damped, J @ pull)
         return np.asarray(step * min(1.0, MAX_JOINT_STEP / max(np.abs(step).max(), 1e-12)))
 
-    def _sweep(self, q: Array) -> tuple[Pose, Array]:
-        """Tool pose and Jacobian in one pass along the product of exponentials."""
+    def pose_and_jacobian(self, q: Array) -> tuple[Pose, Array]:
+        """Pose of the tool at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
+
+        The Jacobian holds linear over angular velocity, both in the world frame.
+        """
         cross, cross_squared = self._generators
         turns = np.eye(3) + np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * cross_squared
         R, p = np.eye(3), np.zeros(3)

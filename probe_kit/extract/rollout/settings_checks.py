@@ -59,9 +59,9 @@ def _check_acting(settings: ExtractSettings) -> None:
 def check_embodiment(settings: ExtractSettings, policy: "Policy") -> None:
     """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only captured."""
     if not settings.capture_only and (reason := policy.embodiment_mismatch()) is not None:
-        told = with_origin(reason, settings.model, policy.card.checkpoint)
+        problem = with_origin(reason, settings.model, policy.card.checkpoint)
         raise CheckpointError(
-            f"{told}. To capture activations without acting, add --no-act. Probing works as usual; there is no "
+            f"{problem}. To capture activations without acting, add --no-act. Probing works as usual; there is no "
             "success rate"
         )
 

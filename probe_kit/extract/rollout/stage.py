@@ -115,7 +115,7 @@ class Stage:
         except ProbeKitError as error:
             raise self._named(error) from None
 
-    def look_exchanged(self) -> Seen:
+    def look_swapped(self) -> Seen:
         """What the item's other layout shows in the state that this episode is in; facts: its hash alone."""
         observation, frame = self._env.observe_exchanged()
         return Seen(self._observed(observation), {"first_frame_sha256": frame_sha256(frame)})

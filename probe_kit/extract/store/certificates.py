@@ -43,7 +43,7 @@ def read_certificate(root: Root) -> tuple[Record, list[Record]]:
     records = []
     for name, raw in root.location.read_all(CERTIFICATES, ".json").items():
         if not _NAMED.fullmatch(name):
-            continue  # nobody's, such as a copy that somebody made
+            continue  # not referenced, such as a copy
         record = _read(root, f"{CERTIFICATES}/{name}", raw)
         if sha256_json(record)[:DIGITS] != name.removesuffix(".json"):
             raise RunDamagedError(f"{root.location}/{CERTIFICATES}/{name} is another process's. {RESTORE}")

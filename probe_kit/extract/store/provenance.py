@@ -48,7 +48,7 @@ def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, 
 
 
 def _gpu_name(device: str) -> str | None:
-    """None where the GPUs are elsewhere: whoever only plans has none, and workers speak for themselves."""
+    """None where the GPUs are elsewhere: the planning process has none, and each worker names its own."""
     import torch
 
     return torch.cuda.get_device_name(device) if torch.cuda.is_available() else None
@@ -93,7 +93,7 @@ def read_provenances(root: Root) -> dict[str, Provenance]:
     location = root.location
     for file, raw in location.read_all(PROVENANCE, ".json").items():
         if not _NAMED.fullmatch(file):
-            continue  # a copy that somebody made
+            continue  # a copy under another name
         where, name = f"{location}/{PROVENANCE}/{file}", file.removesuffix(".json")
         content = read_record(raw, where, _RESTORE)
         del content[HASH]

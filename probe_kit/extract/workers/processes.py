@@ -24,19 +24,19 @@ def run_in_processes(
 
     Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
     """
-    crew = [_Hand(slot, settings, run) for slot in range(settings.workers)]
+    workers = [_Hand(slot, settings, run) for slot in range(settings.workers)]
     try:
         while not scheduler.finished:
-            for hand in crew:
+            for hand in workers:
                 hand.offer(scheduler)
-            ready = wait([hand.connection for hand in crew])
-            for hand in crew:
+            ready = wait([hand.connection for hand in workers])
+            for hand in workers:
                 if hand.connection in ready:
                     _receive(hand, scheduler, on_event)
     finally:
-        for hand in crew:
+        for hand in workers:
             hand.connection.close()  # all of them, so that they end side by side
-        for hand in crew:
+        for hand in workers:
             hand.close()
 
 

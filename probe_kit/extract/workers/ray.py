@@ -21,7 +21,7 @@ from probe_kit.extract.workers.worker_errors import tell_lost
 EPISODES_PER_CALL = 8
 # So many workers in a row that die before they could begin are no accident of one node.
 STILLBORN = 3
-# Seconds without any worker after which somebody should know.
+# Seconds without any worker before a warning.
 PATIENCE = 300.0
 
 
@@ -35,10 +35,10 @@ def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, on_event: 
     An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
     Raises MissingExtraError without Ray, UsageError if no cluster answers, and what an actor raises.
     """
-    with RayWorkers(settings, run) as crew:
+    with RayWorkers(settings, run) as workers:
         while not scheduler.finished:
-            crew.hand_out(scheduler)
-            for event in crew.collect(scheduler):
+            workers.hand_out(scheduler)
+            for event in workers.collect(scheduler):
                 on_event(event)
 
 

@@ -28,7 +28,7 @@ __all__ = ["ActivationCache", "EditFunction", "Reduce", "capture", "edit"]
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], None]
-_listening: WeakSet[Model] = WeakSet()
+_captured_now: WeakSet[Model] = WeakSet()
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     tap promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this model
     is being captured already or a tapped module is compiled.
     """
-    if model in _listening:
+    if model in _captured_now:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
     tape = ActivationCache()
 
@@ -50,13 +50,13 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         tape._kept[site] = activation.clone() if reduce is None else reduce(site, activation)
 
     with ExitStack() as stack:
-        _listening.add(model)
-        stack.callback(_listening.discard, model)
-        listeners = _attach(model, sites, keep, stack)
+        _captured_now.add(model)
+        stack.callback(_captured_now.discard, model)
+        hooks = _attach(model, sites, keep, stack)
         yield tape
-    for listener in listeners:
-        listener.check_count()
-        tape.fires[listener.name] = listener.count
+    for hook in hooks:
+        hook.check_count()
+        tape.fires[hook.name] = hook.count
     _check_non_finite(tape)
 
 
@@ -81,25 +81,25 @@ def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
         tap.write(passing, new)
 
     with ExitStack() as stack:
-        listeners = _attach(model, edits, write, stack)
+        hooks = _attach(model, edits, write, stack)
         yield
-    for listener in listeners:
-        listener.check_count()
+    for hook in hooks:
+        hook.check_count()
 
 
-def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStack) -> "list[_Listener]":
-    """One listener per module; sites that differ only in the iteration share it."""
+def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStack) -> "list[_CountingHook]":
+    """Attach one hook per module; sites that differ only in the iteration share it."""
     groups: dict[tuple[str, int, str], list[Site]] = defaultdict(list)
     for site in dict.fromkeys(sites):
         groups[site.stream, site.layer, site.quantity].append(site)
-    listeners = [_Listener(model.tap(group[0]), group, handle) for group in groups.values()]
-    for listener in listeners:
-        stack.callback(listener.attach().remove)
-    return listeners
+    hooks = [_CountingHook(model.tap(group[0]), group, handle) for group in groups.values()]
+    for hook in hooks:
+        stack.callback(hook.attach().remove)
+    return hooks
 
 
-class _Listener:
-    """Counts the calls of one module and hands the asked ones on."""
+class _CountingHook:
+    """A hook that counts the calls of one module and handles those of its sites."""
 
     def __init__(self, tap: Tap, sites: list[Site], handle: Handle) -> None:
         self.tap, self.first, self.handle = tap, sites[0], handle
@@ -117,20 +117,22 @@ class _Listener:
                 "load the model uncompiled to capture it"
             )
         if self.tap.end == "output":
-            return self.tap.module.register_forward_hook(lambda _, __, output: self._hear(output))
+            return self.tap.module.register_forward_hook(lambda _, __, output: self._fire(output))
         if self.tap.argument is None:
-            return self.tap.module.register_forward_pre_hook(lambda _, inputs: self._hear(inputs))
-        return self.tap.module.register_forward_pre_hook(self._hear_keyword, with_kwargs=True)
+            return self.tap.module.register_forward_pre_hook(lambda _, inputs: self._fire(inputs))
+        return self.tap.module.register_forward_pre_hook(self._fire_with_keyword, with_kwargs=True)
 
-    def _hear_keyword(self, _module: torch.nn.Module, _inputs: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+    def _fire_with_keyword(
+        self, _module: torch.nn.Module, _inputs: tuple[Any, ...], keywords: dict[str, Any]
+    ) -> None:
         if self.tap.argument not in keywords:
             raise CaptureError(
                 f"{self.first}: the module is called without the keyword {self.tap.argument!r} the tap names; it "
                 f"gets {', '.join(keywords) or 'none'}. Correct the tap"
             )
-        self._hear(keywords[self.tap.argument])
+        self._fire(keywords[self.tap.argument])
 
-    def _hear(self, passing: Any) -> None:
+    def _fire(self, passing: Any) -> None:
         site = self.at_fire.get(self.count - self.tap.first)
         self.count += 1
         if site is not None:

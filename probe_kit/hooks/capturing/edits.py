@@ -19,7 +19,7 @@ from probe_kit.hooks.contract.sites import Site
 
 Kind = Literal["zero", "add", "remove", "replace"]
 Vectors = Mapping[str, NDArray[np.float32]]
-"""Directions (D,) and donors (T, D) by their `vector_hash`."""
+"""Directions (D,) and sources (T, D) by their `vector_hash`."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Edit:
     """One change of some sites, applied row by row.
 
     kind: `zero` sets to zero; `add` adds `strength` times a direction; `remove` takes away `strength` times the
-    component along it; `replace` goes the share `strength` of the way to a donor, token by token.
+    component along it; `replace` goes the share `strength` of the way to a source, token by token.
     roles: of the tokens that change, such as `language` or `image`; None for all but padding.
-    vector: `vector_hash` of the direction (D,) or donor (T, D); "" for `zero`.
+    vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`.
     Raises UsageError for a combination that means nothing.
     """
 
@@ -55,6 +55,6 @@ class Edit:
 
 
 def vector_hash(vector: NDArray[np.floating]) -> str:
-    """Hex sha256 of shape and float32 bytes: the name of a direction or donor."""
+    """Hex sha256 of shape and float32 bytes: the name of a direction or source."""
     values = np.ascontiguousarray(vector, np.float32)
     return hashlib.sha256(str(values.shape).encode() + values.tobytes()).hexdigest()

@@ -28,7 +28,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     """
     try:
         folder = Path(checkpoint).expanduser()
-    except RuntimeError as error:  # ~nobody
+    except RuntimeError as error:  # ~name of an unknown user
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if folder.is_dir():
         return _possible(folder)

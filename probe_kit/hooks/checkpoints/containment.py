@@ -154,7 +154,7 @@ def _quoted_output() -> Iterator[None]:
 
 @contextmanager
 def _noted_interruptions() -> Iterator[Interruptions]:
-    """Note Ctrl-C and SIGTERM on their way to whoever answers them; only the main thread may listen."""
+    """Record Ctrl-C and SIGTERM before their handlers run; only the main thread can."""
     seen = Interruptions()
     before: dict[int, Callable[[int, FrameType | None], Any]] = {}
 

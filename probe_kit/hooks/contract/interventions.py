@@ -9,11 +9,13 @@ from probe_kit.errors import UnsupportedInterventionError, UsageError
 
 InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles"]
 Readout = Literal["first-chunk", "per-step"]
+"""first-chunk: lateral displacement by the first inference's actions, none of them executed.
+per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
 _UNDECLARED = {
-    "kv": "its adapter declares no `kv` stream. Interchange residual sites instead, or declare `Model.prompt_kv`",
+    "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
     "moves is read, whatever attention weighs",
-    "tiles": "its adapter does not say which picture token comes of which patch. Exchange all of `image`, or "
+    "tiles": "its adapter does not say which picture token comes of which patch. Patch all of `image`, or "
     "declare `Model.patch_order`",
 }
 

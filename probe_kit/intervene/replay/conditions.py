@@ -113,7 +113,7 @@ class ImagesSwapped:
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Only what is seen is another."""
-        return ConditionResult(context.session.act(context.replay_input.exchanged, context.replay_input.seed))
+        return ConditionResult(context.session.act(context.replay_input.swapped, context.replay_input.seed))
 
 
 AttentionRecord = tuple[int, int, NDArray[np.float32]]

@@ -63,10 +63,10 @@ def _evaluated(session: ReplaySession, replay_input: ReplayInput, conditions: Se
     attention_records: list[AttentionRecord] = []
     for call in count():
         assert isinstance(seen, Observation)
-        other = stage.look_exchanged().observation
+        other = stage.look_swapped().observation
         seed = derive_seed(planned.policy_seed, "inference", call)
         context = ConditionContext(
-            session, replace(replay_input, seen=seen, exchanged=other, seed=seed, tiles=stage.tile_masks())
+            session, replace(replay_input, seen=seen, swapped=other, seed=seed, tiles=stage.tile_masks())
         )
         plain = conditions[0].play(context)
         for number, condition in enumerate(conditions):

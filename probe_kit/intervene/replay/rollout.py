@@ -42,7 +42,7 @@ def play(
     episode_outcomes = np.zeros((len(conditions), len(replay_inputs)), "U7")
     found = replace(ReplayBatch.none_yet(replay_inputs, conditions), episode_outcomes=episode_outcomes)
     for column, replay_input in enumerate(replay_inputs):
-        plain = roll_out(session, replay_input, conditions[0], exchanging=False)
+        plain = roll_out(session, replay_input, conditions[0], swapping=False)
         found.replay_error[column] = apart_from_stored(session, replay_input, plain)
         for number, condition in enumerate(conditions):
             carried = roll_out(session, replay_input, condition) if number else plain
@@ -54,11 +54,11 @@ def play(
 
 
 def roll_out(
-    session: ReplaySession, replay_input: ReplayInput, condition: Condition, exchanging: bool = True
+    session: ReplaySession, replay_input: ReplayInput, condition: Condition, swapping: bool = True
 ) -> RolloutResult:
     """One episode under a condition that is in force at every inference.
 
-    exchanging: whether the condition looks at swapped images; they are then drawn at every inference.
+    swapping: whether the condition looks at swapped images; they are then drawn at every inference.
     """
     stage, planned = session.stage, planned_of(session, replay_input)
     seen: Answer = stage.begin(planned, False)
@@ -66,9 +66,9 @@ def roll_out(
     edit_logs = []
     for call in count():
         assert isinstance(seen, Observation)
-        other = stage.look_exchanged().observation if exchanging else seen
+        other = stage.look_swapped().observation if swapping else seen
         seed = derive_seed(planned.policy_seed, "inference", call)
-        here = replace(replay_input, seen=seen, exchanged=other, seed=seed, tiles=stage.tile_masks())
+        here = replace(replay_input, seen=seen, swapped=other, seed=seed, tiles=stage.tile_masks())
         played = condition.play(ConditionContext(session, here))
         edit_logs += [] if played.edit_log is None else [played.edit_log]
         past.append(played.chunk)

@@ -77,7 +77,7 @@ class ReplayInput:
     side_correct: Side
     layout: Layout
     seen: Observation
-    exchanged: Observation
+    swapped: Observation
     seed: int
     tiles: Mapping[Side, NDArray[np.bool_]] = field(repr=False)
     stored: Chunk | None = None
@@ -120,7 +120,7 @@ class ReplaySession:
             other: Layout = "swapped" if own == "original" else "original"
             if own not in frames:
                 frames[own] = self._look(item, own, int(record["scene_seed"]))
-                frames[other], tiles = self.stage.look_exchanged(), self.stage.tile_masks()
+                frames[other], tiles = self.stage.look_swapped(), self.stage.tile_masks()
             self._check_frame(record, frames[own])
             found.append(
                 ReplayInput(
@@ -132,7 +132,7 @@ class ReplaySession:
                     side_correct="left" if record["side_correct"] == "left" else "right",
                     layout=own,
                     seen=frames[own].observation,
-                    exchanged=frames[other].observation,
+                    swapped=frames[other].observation,
                     seed=derive_seed(int(record["policy_seed"]), "inference", 0),
                     tiles=tiles,
                     stored=self._stored(int(row)),

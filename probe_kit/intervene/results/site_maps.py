@@ -1,6 +1,6 @@
 """What a run's stored interventions found inside the network: maps, directions, steering. Needs no model.
 
-Each is read by itself, whatever else was stored before or after it; see `standing`. Family-wise p-values are
+Each is read by itself, independent of other stored results; see `store.selection`. Family-wise p-values are
 against everything that was tried in the same stream on the same episodes, in one intervention or in several.
 """
 
@@ -35,7 +35,7 @@ def stored_subspace_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
 
 
 def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
-    """By category and place (`backbone.02 image`), what steering did at every dose, controls included.
+    """By category and place (`backbone.02 image`), the effect of steering at every coefficient, controls included.
 
     Another direction than that of the class means, and another side than the wrong one, stand apart
     (`backbone.02 image, probe, toward left`).
@@ -129,7 +129,7 @@ def _chosen(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[
 
 
 def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]:
-    """The conditions of every place and role, controls and doses among them."""
+    """The conditions of every place and role, controls and coefficients among them."""
     found: dict[tuple[str, str], list[str]] = {}
     for condition in sorted(group.sources):
         named = ConditionName.parse(condition)

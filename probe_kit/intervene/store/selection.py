@@ -28,7 +28,7 @@ class StoredResult:
     """What one stored intervention says of one category. answers: of its episodes alone.
 
     own_readout: whether it was read as its family says it should be. misread: whether it was not, and the family
-    is one whose first inference says little (`shadow`).
+    is one whose first inference says little (`per-step`).
     """
 
     stored: StoredIntervention

@@ -2,18 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, get_args
 
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.interventions import Readout
 
 FORMAT = 2  # raise when stored numbers would be others
-Readout = Literal["first-chunk", "per-step"]
-READOUTS: Mapping[str, str] = {
-    "first-chunk": "where the first inference's actions would bring the hand, with nothing executed",
-    "per-step": "what every inference of the unedited episode would add laterally; only the clean one is executed",
-}
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
 
@@ -23,7 +19,7 @@ class InterventionSettings:
     """What is asked of every kind of intervention.
 
     categories: of the run; None for all. items: so many of each category, the first ones; None for all.
-    readout: what of the policy's answer is read, see `READOUTS`.
+    readout: what of the policy's answer is read, see `Readout`.
     """
 
     categories: tuple[str, ...] | None = None
@@ -33,8 +29,8 @@ class InterventionSettings:
     def __post_init__(self) -> None:
         if self.items is not None and self.items < 1:
             raise UsageError(f"items is {self.items}; expected at least 1")
-        if self.readout not in READOUTS:
-            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(READOUTS)}")
+        if self.readout not in get_args(Readout):
+            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(get_args(Readout))}")
 
     @property
     def kind(self) -> str:
@@ -102,10 +98,3 @@ def check_run_fits(run: Run) -> None:
         why = "its streams were edited already, and the stored run does not hold the vectors"
     if why is not None:
         raise UsageError(f"{run.location}: {why}")
-
-
-def readout_of(text: str) -> Readout:
-    """A readout by its name. Raises UsageError."""
-    if text not in READOUTS:
-        raise UsageError(f"unknown readout {text!r}; expected one of {', '.join(READOUTS)}")
-    return cast("Readout", text)

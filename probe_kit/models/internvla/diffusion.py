@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.models.internvla.config import HeadConfig, QueryConfig
+from probe_kit.models.internvla.layers import MLP, Attention
 from probe_kit.models.sinusoid import frequencies
 
 _SINUSOID = 256
@@ -57,37 +57,14 @@ class _ConditionEmbedder(_Embedder):
         self.uncondition = nn.Parameter(torch.zeros(conditions, inputs))
 
 
-class _Attention(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, stream: Tensor) -> Tensor:
-        query, key, value = self.qkv(stream).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        read = functional.scaled_dot_product_attention(query, key, value)
-        return cast(Tensor, self.proj(read.transpose(1, 2).flatten(2)))
-
-
-class _MLP(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(width, 4 * width)
-        self.fc2 = nn.Linear(4 * width, width)
-
-    def forward(self, stream: Tensor) -> Tensor:
-        return cast(Tensor, self.fc2(functional.gelu(self.fc1(stream), approximate="tanh")))
-
-
 class Block(nn.Module):
     """A pre-norm block; its norms have no weights."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.norm1, self.norm2 = _norm(width), _norm(width)
-        self.attn = _Attention(width, heads)
-        self.mlp = _MLP(width)
+        self.attn = Attention(width, heads)
+        self.mlp = MLP(width, "tanh")
 
     def forward(self, stream: Tensor) -> Tensor:
         """(B, C + A, D) from (B, C + A, D)."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from probe_kit.models.internvla.config import DinoConfig
+from probe_kit.models.internvla.layers import MLP, Attention
 
 _EPSILON = 1e-6
 _OFFSET = 0.1
@@ -25,39 +26,16 @@ class _Scale(nn.Module):
         return stream * self.gamma
 
 
-class _Attention(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, stream: Tensor) -> Tensor:
-        query, key, value = self.qkv(stream).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        read = functional.scaled_dot_product_attention(query, key, value)
-        return cast(Tensor, self.proj(read.transpose(1, 2).flatten(2)))
-
-
-class _MLP(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(width, 4 * width)
-        self.fc2 = nn.Linear(4 * width, width)
-
-    def forward(self, stream: Tensor) -> Tensor:
-        return cast(Tensor, self.fc2(functional.gelu(self.fc1(stream))))
-
-
 class Block(nn.Module):
     """A pre-norm block whose two halves are scaled per feature before they are added."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, eps=_EPSILON)
-        self.attn = _Attention(width, heads)
+        self.attn = Attention(width, heads)
         self.ls1 = _Scale(width)
         self.norm2 = nn.LayerNorm(width, eps=_EPSILON)
-        self.mlp = _MLP(width)
+        self.mlp = MLP(width, "none")
         self.ls2 = _Scale(width)
 
     def forward(self, stream: Tensor) -> Tensor:

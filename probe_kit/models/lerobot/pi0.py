@@ -17,7 +17,7 @@ from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
 from probe_kit.errors import CheckpointError
-from probe_kit.models.scoped import replaced
+from probe_kit.models.building import replaced
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from torch import Tensor
 from transformers import SmolVLMConfig
 
 from probe_kit.errors import CheckpointError
+from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
-from probe_kit.models.scoped import replaced
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:

@@ -130,7 +130,7 @@ class MagmaNetwork(nn.Module):
             ids.append(choose(logits[-1]))
         return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), decoding)
 
-    def unheard(self) -> Any:
+    def unhooked(self) -> Any:
         """A second language model with the same weights and without hooks, so that nothing is captured."""
         with torch.device("meta"):
             twin = LlamaForCausalLM(self.config.text).requires_grad_(False)
@@ -155,7 +155,7 @@ class Decoding:
     def feed(self, ids: Tensor, through: Any = None) -> Tensor:
         """(B, V) logits behind one more token (B,) per row.
 
-        through: another language model with the same weights, see `MagmaNetwork.unheard`.
+        through: another language model with the same weights, see `MagmaNetwork.unhooked`.
         """
         language_model = self.language_model if through is None else through
         self._positions = self._positions[:, -1:] + 1

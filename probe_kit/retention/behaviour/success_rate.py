@@ -116,9 +116,7 @@ def capture_only(episodes: "pd.DataFrame") -> bool:
 
 def _check_acted(episodes: "pd.DataFrame") -> None:
     if capture_only(episodes):
-        raise UsageError(
-            "this run's model was captured (extract --no-act): there is no success rate. Its probes are not affected"
-        )
+        raise UsageError("this run's model was captured (extract --no-act): there is no success rate, only probes")
 
 
 def shares_of(episodes: "pd.DataFrame", outcome: str) -> "NDArray[np.float64]":

@@ -204,7 +204,8 @@ RIGHT = share(
 FOLLOWS = Column(
     key="image_swap.follow_rate",
     heading="follow / reversal %",
-    help="With the two pictures swapped, and nothing else: share of episodes whose action turns to the other side. "
+    help="With the two pictures swapped, and nothing else: share of episodes whose action turns to the other "
+    "side. "
     "After the slash: share in which it does the reverse.",
     text=lambda row: (
         "–"

@@ -213,7 +213,7 @@ class _Conversion:
         return None
 
     def without_review(self, bundles: list[Bundle]) -> list[Bundle]:
-        """What may be emitted although nobody looked: worded by a rule, or by a trusted model."""
+        """Bundles that need no review: worded by a rule, or by a trusted model."""
         return _reviewed(
             bundles, {p.candidate_id: self._unreviewed(p) for b in bundles for p in b if self._passes(p)}
         )

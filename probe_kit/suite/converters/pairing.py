@@ -157,7 +157,7 @@ def _every_couple(candidates: Sequence[Candidate], rng: np.random.Generator) -> 
 def _disjoint_couples(
     candidates: Sequence[Candidate], rng: np.random.Generator
 ) -> list[tuple[Candidate, Candidate]]:
-    """Every picture in at most one couple, inside one family; within the family whoever is free and may meet."""
+    """Couples inside one family; every picture is in at most one, paired with the next free one that fits."""
     waiting: dict[str, list[Candidate]] = {}
     used: set[str] = set()
     couples = []

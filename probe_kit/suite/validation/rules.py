@@ -109,8 +109,10 @@ def no_side_words(suite: Suite) -> Iterator[Finding]:
         if named:
             yield error("E10", f"item {item.item_id}", f"the instruction names a side ({named[0]!r})")
         for wording in ("named", "neutral"):
-            if not item.side_word and (told := side_words(item.wordings.get(wording, ""))):
-                yield error("E10", f"item {item.item_id}", f"its wording {wording!r} names a side ({told[0]!r})")
+            if not item.side_word and (named_sides := side_words(item.wordings.get(wording, ""))):
+                yield error(
+                    "E10", f"item {item.item_id}", f"its wording {wording!r} names a side ({named_sides[0]!r})"
+                )
 
 
 def concepts_differ(suite: Suite) -> Iterator[Finding]:

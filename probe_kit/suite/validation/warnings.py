@@ -23,7 +23,7 @@ FEWEST_ITEMS = 30
 FEWEST_GROUPS = 5
 SCREEN_PIXELS = 40  # a tile's side on a 224 px frame, see docs/suite.md
 
-_FEWEST_USES = 5  # below, no balance can be told
+_FEWEST_USES = 5  # with fewer, balance cannot be judged
 _INK_STEP = 32  # levels that a pixel differs from the border of its picture
 _LEAST_EXTENT = 0.2  # of the tile, along the longer side of the ink's box
 _LEAST_INK = 0.02

@@ -1,14 +1,14 @@
 """The protocol of a run: what probes and retention need from it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.extract.store.locations.summary import DescribedRun
+from probe_kit.hooks.contract.sites import Site
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,46 +40,12 @@ class Tokens(Protocol):
         """(E, T)."""
 
 
-class RunReader(Protocol):
+class RunReader(DescribedRun, Protocol):
     """A finished or growing run, as `open_run` gives it. Any object with these members will do."""
-
-    @property
-    def location(self) -> Location:
-        """Where the run lies; probe results go to `probes` there. For a folder: `locate(folder)`."""
-
-    @property
-    def model(self) -> str:
-        """Name of the policy."""
-
-    @property
-    def label(self) -> str:
-        """What tables and legends call the run; two runs of one model differ in it."""
-
-    @property
-    def weights_sha256(self) -> str | None:
-        """Hash of the weights that acted; None for a policy without weights."""
-
-    @property
-    def random_weights(self) -> bool:
-        """Whether the policy was never trained; marked in every table and figure."""
-
-    @property
-    def suite(self) -> str:
-        """Identity of the suite, `name@version#hash`."""
 
     @property
     def settings_sha256(self) -> str:
         """Hash of the settings the run was extracted with."""
-
-    @property
-    def episodes(self) -> "pd.DataFrame":
-        """One row per finished episode, with at least `episode_id`, `item_id`, `category`, `group_id`,
-        `layout`, `side_correct`, `outcome` and `side_placed`.
-        """
-
-    @property
-    def streams(self) -> Mapping[str, Stream]:
-        """Captured streams by name; empty for a policy without activations."""
 
     def views(self, stream: str) -> Sequence[str]:
         """Pooled views stored for `stream`."""

@@ -44,7 +44,7 @@ def test_forward_kinematics_equal_those_of_pybullet(arm, postures, arm_env):
 
 def test_jacobian_equals_finite_differences(arm, postures):
     q, step = postures[0], 1e-6
-    for joint, column in enumerate(arm.chain.jacobian(q).T):
+    for joint, column in enumerate(arm.chain.pose_and_jacobian(q)[1].T):
         nudge = step * np.eye(len(q))[joint]
         ahead, behind = arm.chain.pose(q + nudge), arm.chain.pose(q - nudge)
         velocity = (ahead.position - behind.position) / (2 * step)

@@ -44,7 +44,7 @@ class Called(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("with_tokens", [False, True])
-def test_listening_adds_nothing_to_an_inference_that_waits_for_the_device(
+def test_capture_adds_nothing_to_an_inference_that_waits_for_the_device(
     pi0_tiny: Pi0, observation: Observation, with_tokens: bool
 ) -> None:
     """The same code runs on a GPU; what waits there is known by its name here."""

@@ -1,4 +1,4 @@
-"""Two groups of stages take turns; what a stage does by itself while the policy thinks for the others."""
+"""Two groups of stages take turns; a stage simulates while the policy infers for the others."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ PICTURE = np.zeros((4, 4, 3), np.uint8)
 class Quick:
     """A stage that has done everything by the time it is asked the next thing, and says in `log` what it did.
 
-    length: inferences after which an episode ends. bad: episodes whose actions cannot be carried out.
+    length: inferences after which an episode ends. bad: episodes whose actions cannot be executed.
     """
 
     def __init__(self, log: list[tuple[str, int]], length: int, bad: set[int]) -> None:
@@ -90,7 +90,9 @@ def played(
 
 @pytest.mark.parametrize("capture_only", [False, True])
 @pytest.mark.parametrize(("batch", "length"), [(1, 1), (1, 2), (2, 1), (2, 3)])
-def test_stages_begin_what_follows_before_they_are_heard(batch: int, length: int, capture_only: bool) -> None:
+def test_stages_begin_what_follows_before_their_results_are_collected(
+    batch: int, length: int, capture_only: bool
+) -> None:
     """So that setting up an episode never falls between two inferences."""
     results, log = played(12, batch, length, capture_only=capture_only)
     assert sorted(result.planned.index for result in results if isinstance(result, Rollout)) == list(range(12))

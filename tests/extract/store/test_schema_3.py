@@ -1,4 +1,4 @@
-"""Runs of schema 3 are read as ever, and not continued."""
+"""Runs of schema 3 are read with the same numbers, and not continued."""
 
 import json
 import shutil

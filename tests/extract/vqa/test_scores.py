@@ -1,4 +1,4 @@
-"""Logits as sides: a tie is no answer, and a preference for a letter is told from knowledge."""
+"""Logits as sides: a tie is no answer, and a preference for a letter is separated from knowledge."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def test_a_tie_is_no_answer_and_never_the_first_option() -> None:
 
 @pytest.mark.parametrize(("content", "bias"), [(0.75, 2.0), (-0.25, 0.5), (0.0, -1.0)])
 def test_letter_bias_and_content_are_separated(content: float, bias: float) -> None:
-    """A is left in the first pass and right in the second; whoever likes A likes it in both."""
+    """A is left in the first pass and right in the second; a preference for A applies in both."""
     first = {"left": 3 + content / 2 + bias, "right": 3 - content / 2}
     second = {"left": 1 + content / 2, "right": 1 - content / 2 + bias}
     choice = Choice([first, second])

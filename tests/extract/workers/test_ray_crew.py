@@ -55,7 +55,7 @@ class Call:
 
 @dataclass
 class Cluster:
-    """room: actors that can run at a time. dies: told each call that is due, whether its actor dies with it.
+    """room: actors that can run at a time. dies: of each due call, whether its actor dies with it.
 
     begins_with: what workers answer to `begin` if anything is wrong. alive: names of its nodes.
     """
@@ -136,11 +136,11 @@ def run(
             yield cluster
 
         monkeypatch.setattr(crew, "ray_cluster", connected)
-        scheduler, heard = Scheduler(range(EPISODES)), list[Event]()
+        scheduler, captured = Scheduler(range(EPISODES)), list[Event]()
         settings: Any = SimpleNamespace(workers=workers, ray="a cluster", device="cpu")
-        run_on_ray(settings, str(tmp_path / "run"), scheduler, heard.append)
+        run_on_ray(settings, str(tmp_path / "run"), scheduler, captured.append)
         assert all(actor.dead for actor in cluster.actors), "none outlives the extraction"
-        return scheduler, heard
+        return scheduler, captured
 
     return play
 
@@ -155,10 +155,10 @@ def test_a_lost_node_whose_worker_finds_no_room_again_holds_nobody_up(run: Any) 
     with pytest.warns(
         WorkerLostWarning, match=r"on node first .* is lost: in play; 8 episodes it held are played"
     ):
-        scheduler, heard = run(cluster, 2)
+        scheduler, captured = run(cluster, 2)
     assert scheduler.done == set(range(EPISODES))
     assert not scheduler.given_up
-    assert sorted(event.number for event in heard if isinstance(event, Done)) == list(range(EPISODES))
+    assert sorted(event.number for event in captured if isinstance(event, Done)) == list(range(EPISODES))
     assert len(cluster.actors) == 3
     played = {call.actor for call in cluster.calls if call.name == "play"}
     assert len(played) == 2, "the third never ran, and was given nothing to play"

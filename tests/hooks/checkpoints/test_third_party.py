@@ -22,14 +22,14 @@ from probe_kit.hooks.checkpoints.third_party import while_acting, while_loading,
 def test_an_error_about_a_checkpoint_names_its_family_and_its_folder(
     context: Callable[[str, str], AbstractContextManager[None]], kind: type[ProbeKitError]
 ) -> None:
-    told = r"^pi0 from /models/mine: normalisation 7 is not one of MEAN_STD$"
-    with pytest.raises(kind, match=told) as raised, context("pi0", "/models/mine"):
+    expected = r"^pi0 from /models/mine: normalisation 7 is not one of MEAN_STD$"
+    with pytest.raises(kind, match=expected) as raised, context("pi0", "/models/mine"):
         raise kind("normalisation 7 is not one of MEAN_STD")
     assert type(raised.value) is kind
 
 
 @pytest.mark.parametrize(
-    ("reason", "told"),
+    ("reason", "expected"),
     [
         ("/models/mine/config.json is missing", "pi0: /models/mine/config.json is missing"),
         ("pi0 has no such key", "/models/mine: pi0 has no such key"),
@@ -37,9 +37,9 @@ def test_an_error_about_a_checkpoint_names_its_family_and_its_folder(
         ("pi0 cannot be loaded from /models/mine: x", "pi0 cannot be loaded from /models/mine: x"),
     ],
 )
-def test_what_a_message_names_already_is_not_said_twice(reason: str, told: str) -> None:
-    assert with_origin(reason, "pi0", "/models/mine") == told
-    assert with_origin(told, "pi0", "/models/mine") == told
+def test_what_a_message_names_already_is_not_said_twice(reason: str, expected: str) -> None:
+    assert with_origin(reason, "pi0", "/models/mine") == expected
+    assert with_origin(expected, "pi0", "/models/mine") == expected
 
 
 def test_a_slash_at_the_end_makes_no_other_folder() -> None:
@@ -47,8 +47,8 @@ def test_a_slash_at_the_end_makes_no_other_folder() -> None:
 
 
 def test_a_folder_called_like_the_model_is_not_its_name() -> None:
-    told = with_origin("/golden/pi0/checkpoint/config.json is missing", "pi0", "/golden/pi0/checkpoint")
-    assert told == "pi0: /golden/pi0/checkpoint/config.json is missing"
+    expected = with_origin("/golden/pi0/checkpoint/config.json is missing", "pi0", "/golden/pi0/checkpoint")
+    assert expected == "pi0: /golden/pi0/checkpoint/config.json is missing"
 
 
 def test_other_errors_of_ours_are_left_as_they_are() -> None:

@@ -89,7 +89,7 @@ def test_a_view_brings_flat_tokens_to_rows_and_carries_edits_back() -> None:
     torch.testing.assert_close(changed, ROWS.reshape(8, 3) + 1)
 
 
-def test_a_tensor_given_by_keyword_is_heard_and_another_keyword_is_an_error() -> None:
+def test_a_tensor_given_by_keyword_is_captured_and_another_keyword_is_an_error() -> None:
     class Called(nn.Module):
         def forward(self, *, hidden: Tensor) -> Tensor:
             return hidden

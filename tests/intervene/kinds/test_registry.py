@@ -31,8 +31,8 @@ def with_entry(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 def invoke(module: ModuleType, *arguments: str) -> tuple[int, str, str]:
     own = typer.Typer()
     own.command(cls=module.KindHelp)(module.intervene)
-    told = CliRunner().invoke(own, arguments, env={"COLUMNS": "200"})
-    return told.exit_code, told.stdout, told.stderr
+    answer = CliRunner().invoke(own, arguments, env={"COLUMNS": "200"})
+    return answer.exit_code, answer.stdout, answer.stderr
 
 
 def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
@@ -74,9 +74,9 @@ def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
 ) -> None:
     code, _, _ = invoke(with_entry, str(copy.path), "--kind", KIND.name, "--coefficients", "1", "--sites", "kv.*")
     assert code == 1
-    told = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "erase", "--target-side", "left"])
-    assert told.exit_code == 2
-    said = " ".join(told.stderr.split())
+    answer = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "erase", "--target-side", "left"])
+    assert answer.exit_code == 2
+    said = " ".join(answer.stderr.split())
     assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in said
 
 

@@ -25,7 +25,7 @@ def replay_input(session: ReplaySession, copy: Run) -> ReplayInput:
 
 def test_pictures_differ_where_tiles_are_and_nowhere_else(replay_input: ReplayInput) -> None:
     """Up to light that tiles throw on nothing: there is none."""
-    differs = (replay_input.seen.image != replay_input.exchanged.image).any(axis=-1)
+    differs = (replay_input.seen.image != replay_input.swapped.image).any(axis=-1)
     tiles = replay_input.tiles["left"] | replay_input.tiles["right"]
     assert differs.any()
     assert not (differs & ~tiles).any()

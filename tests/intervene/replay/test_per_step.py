@@ -1,4 +1,4 @@
-"""Shadow: conditions are evaluated at every inference of the unedited episode, and not carried out."""
+"""Per-step readout: conditions are evaluated at every inference of the unedited episode, and not executed."""
 
 from dataclasses import replace
 from math import ceil

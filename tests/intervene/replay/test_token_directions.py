@@ -71,14 +71,14 @@ def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
 def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     session: ReplaySession, copy: Run
 ) -> None:
-    """Held against numpy's decomposition of the tokens that the policy has there."""
+    """Compared with numpy's decomposition of the tokens that the policy has there."""
     items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))[:6]
     (place,) = resolve_sites("backbone.02", session.policy)
-    heard: list[tuple[int, int]] = []
-    session.on_fit_progress = lambda done, total, _: heard.append((done, total))
+    captured: list[tuple[int, int]] = []
+    session.on_fit_progress = lambda done, total, _: captured.append((done, total))
     (axes,) = fit_token_directions(session, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
     session.on_fit_progress = None
-    assert heard == [(done, len(items)) for done in range(1, len(items) + 1)]
+    assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
     assert isinstance(axes, TokenDirections)
     replay_inputs = [replay_input for item in items for replay_input in session.replay_inputs(item)]
     rows = []

@@ -26,9 +26,9 @@ def store(run: Run, intervention: ImageSwap | ConceptErasure) -> str:
 
 
 def shown(run: Run, *options: str) -> str:
-    told = CliRunner().invoke(app, ["run", "show", str(run.path), *options])
-    assert told.exit_code == 0, told.stderr
-    return told.stdout if "--json" in options else " ".join(told.stdout.split())
+    answer = CliRunner().invoke(app, ["run", "show", str(run.path), *options])
+    assert answer.exit_code == 0, answer.stderr
+    return answer.stdout if "--json" in options else " ".join(answer.stdout.split())
 
 
 def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> None:

@@ -89,7 +89,7 @@ def attention_records(episodes: int, *roles: str) -> tuple[ConditionOutcomes, di
 
 
 def ended(outcomes: ConditionOutcomes) -> ConditionOutcomes:
-    """Carried out, with nothing turned."""
+    """Outcomes of a closed loop without any flip."""
     changed = moved(outcomes, {"backbone.02|image": 0.0})
     return replace(changed, episode_outcomes=np.full(changed.displacement.shape, "correct"))
 
@@ -277,7 +277,7 @@ def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun
 def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
     tmp_path: Path, run: ArrayRun, names: list[str], said: tuple[str, ...] | None
 ) -> None:
-    """That a single role, iteration, block or direction carries nothing says nothing of the others."""
+    """A null result for one role, iteration, block or direction does not rule out the others."""
     alone = replace(run, path=tmp_path)
     for name in names:
         store(alone, name)

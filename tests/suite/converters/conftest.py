@@ -1,4 +1,4 @@
-"""Look-alikes of the five sources: their layouts and defects, with pictures and sentences of our own."""
+"""Imitations of the five sources: their layouts and faults, with pictures and sentences of our own."""
 
 import base64
 import csv

@@ -122,7 +122,7 @@ def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_r
 @pytest.mark.parametrize("name", ["review.jsonl", "review.csv"])
 def test_a_review_is_not_written_over(name: str, compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / name
-    for _ in range(2):  # nobody has looked so far
+    for _ in range(2):  # no pair is reviewed so far
         convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
     reviewed = path.read_text(encoding="utf-8").replace("pending", "accept", 1)
     path.write_text(reviewed, encoding="utf-8")

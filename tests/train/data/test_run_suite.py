@@ -164,7 +164,7 @@ def test_the_same_control_is_the_default_in_python_and_on_the_command_line(fille
     answer = CliRunner().invoke(app, ["train", str(runs[1].location), "--permutations", "1"])
     assert answer.exit_code == 0, answer.stderr
     assert "chance only" not in answer.stderr
-    by_command = train_probes(runs[1], permutations=1, controls=())  # read back
+    by_command = train_probes(runs[1], permutations=1, controls=())  # loaded
     assert by_python.scores["exceeds_random_features"].notna().all()
     assert by_python.controls == by_command.controls
 

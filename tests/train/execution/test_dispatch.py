@@ -139,6 +139,6 @@ def test_ray_gives_the_same_numbers_and_raises_what_a_task_raises() -> None:
         assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(ray="auto")))
         with pytest.raises(TooFewGroupsError, match="same label"):
             list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(ray="auto", jobs=1)))
-        assert ray.is_initialized()  # a cluster somebody else started stays
+        assert ray.is_initialized()  # a cluster that was started elsewhere stays
     finally:
         ray.shutdown()

@@ -248,7 +248,7 @@ def bundle_problems(location: Location, deep: bool) -> Iterator[str]:
 def _identity(location: Location) -> str | None:
     """That of the run; None for one that nothing protects.
 
-    Bundles may also lie where there is no run, beside arrays that somebody has in memory.
+    Bundles may also lie where there is no run, beside arrays in memory.
     """
     try:
         return read_root(location).identity

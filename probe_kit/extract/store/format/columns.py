@@ -126,7 +126,7 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str,
     """All that count, each checked."""
     for file, raw in root.location.read_all(SEALED, ".json").items():
         if not _NAMED.fullmatch(file):
-            continue  # a copy that somebody made
+            continue  # a copy under another name
         name = f"{root.location}/{SEALED}/{file}"
         advice = f"Delete it; `probe-kit run seal {root.location}` builds the columns again"
         seal = read_record(raw, name, advice)

@@ -41,11 +41,6 @@ def in_current_words(record: Mapping[str, Any], kind: RecordKind) -> dict[str, A
     return {name: _translated(value, name, words) for name, value in _renamed(record, words).items()}
 
 
-def current_word(word: str, kind: RecordKind, part: str) -> str:
-    """What `word`, stored as the value of `part` in a record of `kind`, is called now."""
-    return STORED_WORDS[kind].values.get(part, {}).get(word, word)
-
-
 def _renamed(record: Mapping[str, Any], words: Words) -> dict[str, Any]:
     return {words.keys.get(name, name): value for name, value in record.items()}
 

@@ -43,7 +43,7 @@ _QUICK = timedelta(seconds=5)
 """For a store that never answered."""
 STAMP_DIGITS = 16
 _NO_BUCKET = "NoSuchBucket"
-# Where a client looks last for credentials: what a machine of a cloud is told about itself.
+# Where a client looks last for credentials: the metadata services of cloud machines.
 _ASKED_FOR_CREDENTIALS = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
 
@@ -118,7 +118,7 @@ class Bucket(Location):
         """What the store answers.
 
         obstore repeats requests that change nothing, and is repeated here: a listing that breaks off, a
-        conditional put or a deletion that nobody answered. All of them may be done twice.
+        conditional put or a deletion without an answer. All of them may be done twice.
         """
         from obstore.exceptions import AlreadyExistsError, GenericError
 

@@ -199,7 +199,7 @@ class Folder(Location):
     def _object(self, key: str) -> Path:
         """Where an object lies. Raises FileNotFoundError for what is no plain file, or not in the folder.
 
-        Records of others may name a device or a pipe, which never ends, and anybody's files.
+        Records of others may name a device, a pipe, which never ends, or a file outside the run.
         """
         path = self._path / key
         if not (_inside(key) and path.is_file()):
@@ -229,7 +229,7 @@ class Folder(Location):
         with (self._path / RUN_FILE).open("rb") as run, (self._path / PLAN_FILE).open("rb") as turn:
             fcntl.flock(run, fcntl.LOCK_SH)
             fcntl.flock(turn, fcntl.LOCK_EX)
-            for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: whoever seals holds this lock
+            for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: a live one holds this lock
                 shutil.rmtree(leftover, ignore_errors=True)
             yield
 
@@ -241,7 +241,7 @@ class Folder(Location):
         handle = os.open(path, os.O_RDONLY)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
-            with suppress(PermissionError):  # whoever may only read the run finds what is stored all the same
+            with suppress(PermissionError):  # a run that may only be read is listed too
                 for leftover in path.glob("*.tmp"):
                     leftover.unlink()
             yield
@@ -271,7 +271,7 @@ def _inside(key: str) -> bool:
 
 
 def _alone(file: IO[bytes]) -> bool:
-    """Hold the lock alone, if nobody else holds it."""
+    """Hold the lock alone, if no other process holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

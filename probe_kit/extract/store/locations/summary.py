@@ -1,5 +1,6 @@
 """A run in one line and as a notebook table; and the runs that a folder contains."""
 
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -15,10 +16,12 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.sites import Stream
 
 
-class Summarised(Protocol):
-    """What of a run is said in a few words; see `Run`."""
+class DescribedRun(Protocol):
+    """Name, origin and content of a run."""
 
-    location: "Location"
+    @property
+    def location(self) -> "Location":
+        """Where the run lies; probe results go to `probes` there. For a folder: `locate(folder)`."""
 
     @property
     def model(self) -> str:
@@ -26,31 +29,37 @@ class Summarised(Protocol):
 
     @property
     def label(self) -> str:
-        """What the run is called."""
+        """Name of the run in tables and legends; two runs of one model differ in it."""
 
     @property
     def weights_sha256(self) -> str | None:
-        """Hash of the weights that acted."""
+        """Hash of the weights that ran; None for a policy without weights."""
 
     @property
     def random_weights(self) -> bool:
-        """Whether the weights are random."""
+        """Whether the weights are random; marked in every table and figure."""
 
     @property
     def suite(self) -> str:
-        """Identity of the suite."""
+        """Identity of the suite, `name@version#hash`."""
+
+    @property
+    def episodes(self) -> "pd.DataFrame":
+        """One row per finished episode, with at least `episode_id`, `item_id`, `category`, `group_id`,
+        `layout`, `side_correct`, `outcome` and `side_placed`.
+        """
+
+    @property
+    def streams(self) -> "Mapping[str, Stream]":
+        """Captured streams by name; empty for a policy without activations."""
+
+
+class Summarised(DescribedRun, Protocol):
+    """A run with a plan; see `Run`."""
 
     @property
     def planned(self) -> int:
         """Episodes of the plan."""
-
-    @property
-    def episodes(self) -> "pd.DataFrame":
-        """Committed episodes."""
-
-    @property
-    def streams(self) -> "dict[str, Stream]":
-        """Captured streams."""
 
 
 def run_text(run: Summarised) -> str:

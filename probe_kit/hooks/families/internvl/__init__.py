@@ -8,11 +8,11 @@ FAMILIES = (
         "internvl",
         "InternVL3.5 (InternViT, Qwen3 decoder; pictures as tiles), on transformers' own network",
         "OpenGVLab/InternVL3_5-8B-HF",
-        "probe_kit.hooks.families.internvl.adapter:load_internvl",
+        "probe_kit.hooks.families.internvl.adapter:InternVL.load",
         streams="backbone 37 layers, answer 37 layers (8B)",
         embodiment="none: answers, does not act",
         notes="the repositories that end in -HF; 8B 17 GB, 38B 77 GB in bfloat16",
-        verifier="probe_kit.hooks.families.internvl.adapter:verify_internvl",
+        verifier="probe_kit.hooks.families.internvl.adapter:InternVL.verify",
         config_types=("internvl",),
         instead=(
             (

@@ -1,33 +1,29 @@
 """The adapter for InternVL: Qwen's chat without a system turn, pictures as tiles."""
 
-from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from numpy.typing import NDArray
 from torch import Tensor
 from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.qwen.reader import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Loaded, Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.adapter import Loaded, Pictures
+from probe_kit.hooks.families.shared.vlm.loading import Recipe
+from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
 from probe_kit.hooks.families.shared.vlm.text import Frame
-from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
-from probe_kit.hooks.verification.verify import Comparison
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
 TILES = ("auto", "1")
-_RECIPE = Recipe(InternVLConfig.from_dict, build_internvl, FILE_NAMES)
 
 
-class InternVL(VisionLanguageModel):
+class InternVL(RecipeReader):
     """A loaded InternVL. tiles: `auto` cuts pictures as released, `1` shows every one as one tile."""
 
     family: ClassVar[str] = "internvl"
     frame: ClassVar[Frame] = Frame(f"{USER}<img>", "</img>\n", USER, ASSISTANT)
+    recipe: ClassVar[Recipe] = Recipe(InternVLConfig.from_dict, build_internvl, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<IMG_CONTEXT>"
 
     def __init__(self, loaded: Loaded, tokenizer: str | None = None, tiles: str = "auto") -> None:
@@ -67,26 +63,3 @@ class InternVL(VisionLanguageModel):
     def shown(self, pictures: Pictures) -> dict[str, Tensor]:
         """pixel_values (tiles of all pictures, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
-
-
-def load_internvl(
-    checkpoint: str | None = None,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    tiles: str = "auto",
-    tokenizer: str | None = None,
-    weights_seed: int = 0,
-) -> InternVL:
-    """Load InternVL of any size, from a folder or hub id in the layout of the `-HF` repositories; see `load_vlm`.
-
-    tiles: see `InternVL`. tokenizer: folder of another one.
-    """
-    loaded = load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed)
-    return InternVL(loaded, tokenizer, tiles)
-
-
-def verify_internvl(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
-    """Compare a reference."""
-    return verify_vlm(load_internvl(str(folder / "checkpoint"), dtype="float32"), folder, recorded)

@@ -20,7 +20,7 @@ INTERVENTIONS = Interventions(
         "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
-"""DINOv2's features reach the bridge past the backbone: an exchange of backbone sites is not the whole picture."""
+"""DINOv2's features reach the bridge past the backbone: patching backbone sites does not patch everything."""
 
 FAMILIES = (
     Family(

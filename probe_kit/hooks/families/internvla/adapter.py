@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
@@ -207,7 +207,7 @@ class InternVLA(QwenVLA):
             condition = self.network.read(inputs, views)
             return self.network.denoise(condition, noise, self.schedule, self.guidance)
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """The chat; the queries; conditions and actions."""
@@ -253,12 +253,6 @@ class InternVLA(QwenVLA):
         if site.quantity == "residual":
             return Tap(block.norm1, steps, rows=rows)
         return Tap(block.attn if site.quantity == "attention" else block.mlp, steps, "output", rows=rows)
-
-    @property
-    def merger_entry(self) -> nn.Module:
-        """The merger's norm."""
-        norm: nn.Module = self.tower.merger.ln_q
-        return norm
 
 
 def load_internvla(

@@ -39,7 +39,7 @@ def verify_internvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     policy = load_internvla(str(folder / "checkpoint"), dtype="float32", steps=steps, guidance=guidance)
     inputs, pixels = _inputs(policy, recorded), _pixels(policy, recorded)
     network = policy.network
-    heard = {
+    modules = {
         "merger": policy.tower.merger,
         "dino": network.dino_encoder.body,
         "projected": network.dino_pro,
@@ -47,7 +47,7 @@ def verify_internvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
         "final": network.head.final_layer,
     }
     with ExitStack() as stack:
-        calls: dict[str, list[Any]] = {name: outputs_of(module, stack) for name, module in heard.items()}
+        calls: dict[str, list[Any]] = {name: outputs_of(module, stack) for name, module in modules.items()}
         calls["head"] = _given(network.head, stack)
         every = [*policy.sites(), *policy.backbone_stream().sites("final_norm")]
         every += [site for stream in policy.further_streams.values() for site in stream.sites()]

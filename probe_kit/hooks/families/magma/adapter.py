@@ -225,12 +225,12 @@ class Magma(Policy, AnswerModel):
     def _behind(self, decoded: Decoded) -> Tensor:
         """(B, V) logits behind the seven tokens, from modules without hooks."""
         with torch.inference_mode():
-            return decoded.decoding.feed(decoded.ids[:, -1], self._unheard)
+            return decoded.decoding.feed(decoded.ids[:, -1], self._unhooked)
 
     @cached_property
-    def _unheard(self) -> Any:
+    def _unhooked(self) -> Any:
         """The language model's weights in modules of their own, so that what runs there fires no tap."""
-        return self.network.unheard()
+        return self.network.unhooked()
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more for the position that chooses a token."""
@@ -261,11 +261,11 @@ class Magma(Policy, AnswerModel):
             raise UsageError("this reading does not come from Magma; pass what its read() returned")
         while len(answer.ids) < tokens and not answer.over(self.text.ends):
             with torch.inference_mode():
-                answer.go_on(self._unheard)
+                answer.advance(self._unhooked)
         rows = torch.stack(answer.ids[:tokens], dim=1).tolist() if tokens else [[]] * len(answer.ids[0])
         return [self.text.decode(row) for row in rows]
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""

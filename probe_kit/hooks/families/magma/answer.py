@@ -21,6 +21,6 @@ class Answer:
         spoken = torch.stack(self.ids, dim=1).cpu().numpy()
         return bool(np.isin(spoken, list(ends)).any(axis=1).all())
 
-    def go_on(self, unheard: Any) -> None:
+    def advance(self, unhooked: Any) -> None:
         """One more greedy token per row."""
-        self.ids.append(greedy(self._decoding.feed(self.ids[-1], unheard)))
+        self.ids.append(greedy(self._decoding.feed(self.ids[-1], unhooked)))

@@ -13,8 +13,10 @@ from torch import Tensor
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.module_outputs import numpy_of
 from probe_kit.hooks.families.shared.qwen.reader import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.qwen.tower import by_picture
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures
+from probe_kit.hooks.families.shared.vlm.loading import Recipe
+from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.hooks.families.shared.vlm.verify import Reference, questions_of, verify_vlm
 from probe_kit.hooks.verification.verify import Comparison, Produce
@@ -29,14 +31,14 @@ from probe_kit.models.ovis2_5 import (
 
 STREAMS = 1e-4
 """Tolerance of activations, which enter through a softmax over visual words."""
-_RECIPE = Recipe(OvisConfig.from_values, build_ovis2_5)
 
 
-class Ovis25(VisionLanguageModel):
+class Ovis25(RecipeReader):
     """A loaded Ovis2.5."""
 
     family: ClassVar[str] = "ovis2.5"
     frame: ClassVar[Frame] = Frame(USER, "\n", USER, f"{ASSISTANT}<think>\n\n</think>\n\n")
+    recipe: ClassVar[Recipe] = Recipe(OvisConfig.from_values, build_ovis2_5)
     marks: ClassVar[int] = 1
     _grid: Tensor | None = None
     """Of the pictures under way: the tower runs over the patches of all rows at once."""
@@ -65,9 +67,7 @@ class Ovis25(VisionLanguageModel):
         return Tap(blocks[layer].layer_norm1, 1, view=self._by_picture)
 
     def _by_picture(self, patches: Tensor) -> Tensor:
-        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
-        count = 1 if self._grid is None or bool((self._grid != self._grid[0]).any()) else len(self._grid)
-        return patches.view(count, -1, patches.shape[-1])
+        return by_picture(patches, self._grid)
 
     @cached_property
     def pictures(self) -> OvisPictures:
@@ -84,36 +84,24 @@ class Ovis25(VisionLanguageModel):
         device = self.loaded.device
         return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
 
+    @classmethod
+    def verify(cls, folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
+        """As of every reader, with the visual words and patches in the order of the authors' code."""
+        model = cls.load(str(folder / "checkpoint"), dtype="float32")
+        reference = Reference(model, questions_of(folder, recorded, model), recorded)
 
-def load_ovis2_5(
-    checkpoint: str | None = None,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    tokenizer: str | None = None,
-    weights_seed: int = 0,
-) -> Ovis25:
-    """Load Ovis2.5 from a folder or hub id; see `load_vlm`. tokenizer: folder of another one."""
-    return Ovis25(load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed), tokenizer)
+        def vision() -> NDArray[Any]:
+            return reference.vision()[:, _windows_first(model)]
 
+        @torch.inference_mode()
+        def words() -> NDArray[Any]:
+            shown = model.shown([reference.questions[0].seen.image])
+            probabilities = model.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
+            missing = model.network.config.words - probabilities.shape[1]
+            return np.pad(numpy_of(probabilities), ((0, 0), (0, missing)))
 
-def verify_ovis2_5(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
-    """Compare a reference."""
-    model = load_ovis2_5(str(folder / "checkpoint"), dtype="float32")
-    reference = Reference(model, questions_of(folder, recorded, model), recorded)
-
-    def vision() -> NDArray[Any]:
-        return reference.vision()[:, _windows_first(model)]
-
-    @torch.inference_mode()
-    def words() -> NDArray[Any]:
-        shown = model.shown([reference.questions[0].seen.image])
-        probabilities = model.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
-        return np.pad(numpy_of(probabilities), ((0, 0), (0, model.network.config.words - probabilities.shape[1])))
-
-    further: dict[str, Produce] = {"vision_resid_row0": vision, "visual_probabilities_row0": words}
-    return verify_vlm(model, folder, recorded, further, STREAMS)
+        further: dict[str, Produce] = {"vision_resid_row0": vision, "visual_probabilities_row0": words}
+        return verify_vlm(model, folder, recorded, further, STREAMS)
 
 
 def _windows_first(model: Ovis25) -> NDArray[np.intp]:

@@ -1,35 +1,31 @@
 """The adapter for PaliGemma: image, beginning of sequence, question, newline, with bidirectional attention."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from transformers import PaliGemmaConfig
 
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures
+from probe_kit.hooks.families.shared.vlm.loading import Recipe
+from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
 from probe_kit.hooks.families.shared.vlm.text import Frame
-from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
-from probe_kit.hooks.verification.verify import Comparison
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.packing import LeftPacked
 from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
 
-_RECIPE = Recipe(PaliGemmaConfig.from_dict, build_paligemma, FILE_NAMES)
 _FIRST_POSITION = 1
 
 
-class PaliGemma(VisionLanguageModel):
+class PaliGemma(RecipeReader):
     """A loaded PaliGemma."""
 
     family: ClassVar[str] = "paligemma"
     frame: ClassVar[Frame] = Frame("", "<bos>", "<bos>", "\n")
+    recipe: ClassVar[Recipe] = Recipe(PaliGemmaConfig.from_dict, build_paligemma, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<image>"
 
     @property
@@ -69,19 +65,6 @@ class PaliGemma(VisionLanguageModel):
         return {"token_type_ids": torch.zeros_like(packed.ids)}
 
 
-def load_paligemma(
-    checkpoint: str | None = None,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    tokenizer: str | None = None,
-    weights_seed: int = 0,
-) -> PaliGemma:
-    """Load PaliGemma from a folder or hub id; see `load_vlm`. tokenizer: folder of another one."""
-    return PaliGemma(load_vlm(_RECIPE, checkpoint, device, dtype, random_weights, weights_seed), tokenizer)
-
-
 def load_vlm_tiny(
     checkpoint: str | None = None,
     device: str = "cpu",
@@ -91,11 +74,6 @@ def load_vlm_tiny(
 ) -> PaliGemma:
     """The embedded reader: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
     place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
-    reader = PaliGemma(load_vlm(_RECIPE, place, device, dtype, random_weights, weights_seed))
+    reader = PaliGemma.load(place, device, dtype, random_weights, weights_seed=weights_seed)
     reader.card = replace(reader.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
     return reader
-
-
-def verify_paligemma(folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
-    """Compare a reference."""
-    return verify_vlm(load_paligemma(str(folder / "checkpoint"), dtype="float32"), folder, recorded)

@@ -9,54 +9,45 @@ from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
 from probe_kit.hooks.family import Family
 
-_TINY_STREAMS = "backbone 4 layers, expert 4 layers x 10 iterations"
 _VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
 _VLM_TINY = SourceWeights(
     sha256="77a4486bf2d356c1e11cfd2a7a0f835683dacf1a7864f714feef92cb19fa0650", parameters=658_944
 )
 
+
+def _embedded(name: str, summary: str, notes: str) -> Family:
+    """One of the embedded policies."""
+    return Family(
+        name,
+        summary,
+        None,
+        f"probe_kit.hooks.families.pi0.adapter:load_{name.replace('-', '_')}",
+        streams="backbone 4 layers, expert 4 layers x 10 iterations",
+        notes=notes,
+        verifier=_VERIFIER,
+        config_types=("pi0",),
+        source="vlm-tiny",
+        source_weights=_VLM_TINY,
+        interventions=FLOW,
+        home=RELEASED,
+    )
+
+
 FAMILIES = (
-    Family(
+    _embedded(
         "pi0-tiny",
         "pi0 at 0.84 million parameters, the embedded default: vlm-tiny's backbone, acts on Color and Shape",
-        None,
-        "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny",
-        streams=_TINY_STREAMS,
-        notes="State is readable in its backbone and not acted on; nothing else was trained",
-        verifier=_VERIFIER,
-        config_types=("pi0",),
-        source="vlm-tiny",
-        source_weights=_VLM_TINY,
-        interventions=FLOW,
-        home=RELEASED,
+        "State is readable in its backbone and not acted on; nothing else was trained",
     ),
-    Family(
+    _embedded(
         "pi0-tiny-early",
         "the embedded default before its training: vlm-tiny's backbone, an expert with random weights",
-        None,
-        "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny_early",
-        streams=_TINY_STREAMS,
-        notes="a model organism: see `probe-kit demo --compare`",
-        verifier=_VERIFIER,
-        config_types=("pi0",),
-        source="vlm-tiny",
-        source_weights=_VLM_TINY,
-        interventions=FLOW,
-        home=RELEASED,
+        "a model organism: see `probe-kit demo --compare`",
     ),
-    Family(
+    _embedded(
         "pi0-tiny-state",
         "the embedded default, but that it was trained to act on State too",
-        None,
-        "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny_state",
-        streams=_TINY_STREAMS,
-        notes="a model organism: see `probe-kit demo --compare`",
-        verifier=_VERIFIER,
-        config_types=("pi0",),
-        source="vlm-tiny",
-        source_weights=_VLM_TINY,
-        interventions=FLOW,
-        home=RELEASED,
+        "a model organism: see `probe-kit demo --compare`",
     ),
     Family(
         "pi0",

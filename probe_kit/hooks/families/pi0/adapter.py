@@ -7,7 +7,7 @@ Suffix: the state, then the action chunk.
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
-from probe_kit.hooks.families.shared.attention_weights import Note, returned, weighed
+from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, returned
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.embedded.folder import embedded_checkpoint
@@ -132,7 +132,9 @@ class Pi0(EvaluatedPi0):
         def own(block: int, iteration: int, weights: Tensor) -> None:
             note(block, iteration, weights[:, :, acting, : weights.shape[-1] - len(acting)])
 
-        return weighed([layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned)
+        return recording_weights(
+            [layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned
+        )
 
     def patch_order(self) -> NDArray[np.int64]:
         """A token per patch, row by row."""
@@ -172,37 +174,20 @@ def load_pi0_tiny(
     dtype: str | None = None,
     random_weights: bool = False,
     weights_seed: int = 0,
+    *,
+    name: str = "pi0-tiny",
 ) -> Pi0:
-    """The embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape."""
-    return _load_embedded("pi0-tiny", checkpoint, device, dtype, random_weights, weights_seed)
+    """The embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape.
 
-
-def load_pi0_tiny_early(
-    checkpoint: str | None = None,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    weights_seed: int = 0,
-) -> Pi0:
-    """The embedded default as it was before its training: the reader's backbone and a random expert."""
-    return _load_embedded("pi0-tiny-early", checkpoint, device, dtype, random_weights, weights_seed)
-
-
-def load_pi0_tiny_state(
-    checkpoint: str | None = None,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    weights_seed: int = 0,
-) -> Pi0:
-    """The embedded default but for one thing: it was trained to act on State too."""
-    return _load_embedded("pi0-tiny-state", checkpoint, device, dtype, random_weights, weights_seed)
-
-
-def _load_embedded(
-    name: str, checkpoint: str | None, device: str, dtype: str | None, random_weights: bool, weights_seed: int
-) -> Pi0:
+    name: of the embedded checkpoint.
+    """
     place = checkpoint or str(embedded_checkpoint(name))
     policy = Pi0.load(place, device, dtype, random_weights, weights_seed)
     policy.card = replace(policy.card, family=name, checkpoint=checkpoint or "embedded")
     return policy
+
+
+load_pi0_tiny_early = partial(load_pi0_tiny, name="pi0-tiny-early")
+"""The embedded default before its training: the VLM's backbone and a random expert."""
+load_pi0_tiny_state = partial(load_pi0_tiny, name="pi0-tiny-state")
+"""The embedded default, trained to act on State too."""

@@ -142,7 +142,7 @@ class PrismaticModel(Model):
                 packed.ids.to(device), packed.mask.to(device), pixel_values, self.steps, choose
             )
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""

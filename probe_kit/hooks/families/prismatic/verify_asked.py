@@ -56,7 +56,7 @@ class _Asked:
         self.model, self.questions, self.recorded = model, questions, recorded
 
     @cached_property
-    def heard(self) -> list[tuple[ActivationCache, Prefill]]:
+    def captured(self) -> list[tuple[ActivationCache, Prefill]]:
         """Every row alone, with everything that is stored of it."""
         rows = []
         for question in self.questions:
@@ -96,7 +96,7 @@ class _Asked:
             "projector_features": self._projected,
             "backbone_resid": lambda: self._streams(range(model.streams["backbone"].layers), "residual"),
             "backbone_final_norm": lambda: self._streams([model.streams["backbone"].layers - 1], "final_norm")[0],
-            "logits_last": lambda: numpy_of(torch.cat([prefill.logits for _, prefill in self.heard])),
+            "logits_last": lambda: numpy_of(torch.cat([prefill.logits for _, prefill in self.captured])),
             "batch_logits_last": lambda: numpy_of(model.prefill(self.questions).logits),
             "option_ids": options,
             "option_logits": lambda: model.read(self.questions).option_logits,
@@ -113,7 +113,7 @@ class _Asked:
     def _streams(self, layers: Sequence[int], quantity: str) -> NDArray[Any]:
         """(layers, B, P + T, D)."""
         rows = []
-        for tape, _ in self.heard:
+        for tape, _ in self.captured:
             parts = [
                 torch.stack([tape[Site(stream, layer, quantity, step)][0] for layer in layers])
                 for stream, step in (("backbone", None), (self.model.output, 0))
@@ -132,5 +132,5 @@ class _Asked:
     def _greedy(self) -> NDArray[np.int64]:
         length, text = self.recorded["greedy_ids"].shape[1], self.model.config.text
         with torch.inference_mode():
-            said = [prefill.speak(length, self.model.ends)[0].numpy() for _, prefill in self.heard]
+            said = [prefill.speak(length, self.model.ends)[0].numpy() for _, prefill in self.captured]
         return padded_answers(said, length, self.model.ends, int(text.pad_token_id or 0))

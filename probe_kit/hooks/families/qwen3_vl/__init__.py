@@ -8,11 +8,11 @@ FAMILIES = (
         "qwen3-vl",
         "Qwen3-VL (vision tower with DeepStack, Qwen3 decoder), on transformers' own network",
         "Qwen/Qwen3-VL-8B-Instruct",
-        "probe_kit.hooks.families.qwen3_vl.adapter:load_qwen3_vl",
+        "probe_kit.hooks.families.qwen3_vl.adapter:Qwen3VL.load",
         streams="backbone 37 layers, answer 37 layers (8B)",
         embodiment="none: answers, does not act",
         notes="8B 18 GB, 32B 67 GB in bfloat16; 4B is Xiaomi-R0's source",
-        verifier="probe_kit.hooks.families.qwen3_vl.adapter:verify_qwen3_vl",
+        verifier="probe_kit.hooks.families.qwen3_vl.adapter:Qwen3VL.verify",
         config_types=("qwen3_vl",),
         full_size="probe_kit.models.qwen:full_size_qwen3_vl",
         sizes=(

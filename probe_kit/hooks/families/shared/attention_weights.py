@@ -20,20 +20,20 @@ Weights = Callable[[Any, tuple[Any, ...], dict[str, Any], Any], Tensor]
 
 
 @contextmanager
-def weighed(attentions: Sequence[nn.Module], note: Note, weights: Weights) -> Iterator[None]:
-    """Note what `weights` makes of every call of every module."""
+def recording_weights(attentions: Sequence[nn.Module], note: Note, weights: Weights) -> Iterator[None]:
+    """Record the weights of every call of every module, as `weights` computes them."""
 
-    def listener(block: int) -> Callable[..., None]:
+    def hook_of(block: int) -> Callable[..., None]:
         calls = count()
 
-        def hear(module: nn.Module, inputs: tuple[Any, ...], given: dict[str, Any], output: Any) -> None:
+        def hook(module: nn.Module, inputs: tuple[Any, ...], given: dict[str, Any], output: Any) -> None:
             note(block, next(calls), weights(module, inputs, given, output))
 
-        return hear
+        return hook
 
     with ExitStack() as stack:
         for block, module in enumerate(attentions):
-            stack.callback(module.register_forward_hook(listener(block), with_kwargs=True).remove)
+            stack.callback(module.register_forward_hook(hook_of(block), with_kwargs=True).remove)
         yield
 
 
@@ -92,4 +92,6 @@ def on_the_prompt(note: Note) -> Note:
 
 def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:
     """A context over the attention of a decoder that puts out tokens."""
-    return weighed([layer.self_attn for layer in layers], on_the_prompt(note), returned if eager else recomputed)
+    return recording_weights(
+        [layer.self_attn for layer in layers], on_the_prompt(note), returned if eager else recomputed
+    )

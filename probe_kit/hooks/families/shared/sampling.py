@@ -9,7 +9,7 @@ from probe_kit.errors import UsageError
 
 Choose = Callable[[Tensor], Tensor]
 """(B,) ids of the next tokens from their logits (B, V)."""
-# What `generate` of transformers 4 keeps of the distribution where nobody says otherwise.
+# What `generate` of transformers 4 keeps of the distribution by default.
 TOP = 50
 
 

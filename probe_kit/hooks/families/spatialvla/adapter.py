@@ -59,7 +59,7 @@ _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 class SpatialVLA(Policy):
     """A loaded SpatialVLA.
 
-    steps: greedy tokens per inference. heard: how many of them the stream `action` captures.
+    steps: greedy tokens per inference. captured: how many of them the stream `action` captures.
     """
 
     family: ClassVar[str] = "spatialvla"
@@ -72,7 +72,7 @@ class SpatialVLA(Policy):
         statistics: ActionStatistics,
         camera: str,
         steps: int,
-        heard: int,
+        captured: int,
         constrained: bool,
         ensemble: bool = False,
     ) -> None:
@@ -89,7 +89,7 @@ class SpatialVLA(Policy):
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
         self.streams = {
             "backbone": Stream("backbone", layers, width),
-            "action": Stream("action", layers, width, heard, part="action"),
+            "action": Stream("action", layers, width, captured, part="action"),
         }
         seeing = len(self.tower.encoder.layers) + 1
         self.further_streams = {
@@ -242,7 +242,7 @@ class SpatialVLA(Policy):
         """Gemma-2's attention is eager, for its soft cap, and returns its weights."""
         return of_decoder(self.decoder.layers, note, eager=True)
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Patches, beginning of sequence, text; padding behind it where another prompt is longer."""

@@ -65,7 +65,7 @@ class _Reference:
         self.pictures, self.cameras = self.policy.pictures(self.seen), self.policy.cameras(self.seen)
 
     def _policy(self, steps: int) -> SpatialVLA:
-        """The ordinary adapter, listening to every one of `steps` tokens."""
+        """The ordinary adapter, capturing every one of `steps` tokens."""
         loaded = self.loaded
         speech = Speech.of(loaded.config, loaded.folder, None, lowercase=True, tokenizer=None)
         camera = _camera(loaded, self.recorded)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
@@ -27,7 +27,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
-from probe_kit.hooks.families.shared.attention_weights import Note, weighed
+from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights
 from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
@@ -209,7 +209,7 @@ class Xiaomi(QwenVLA):
             actions: Tensor = self.network(inputs, state, used, noise, self.steps)
         return actions
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """The chat; then sink, state, actions."""
@@ -225,7 +225,7 @@ class Xiaomi(QwenVLA):
         def acting(layer: int, iteration: int, weights: Tensor) -> None:
             note(first + layer, iteration, weights[:, :, own:, : weights.shape[-1] - weights.shape[2]])
 
-        return weighed(
+        return recording_weights(
             [layer.attn for layer in layers], acting, lambda module, given, _, __: module.weights(*given)
         )
 
@@ -247,12 +247,6 @@ class Xiaomi(QwenVLA):
         if site.quantity == "residual":
             return Tap(layer.input_layernorm, self.steps)
         return Tap(parts[site.quantity], self.steps, "output")
-
-    @property
-    def merger_entry(self) -> nn.Module:
-        """The merger's norm stands before its patches are joined."""
-        norm: nn.Module = self.tower.merger.norm
-        return norm
 
 
 def load_xiaomi(

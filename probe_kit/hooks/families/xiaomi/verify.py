@@ -33,7 +33,7 @@ def verify_xiaomi(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     policy = load_xiaomi(str(folder / "checkpoint"), dtype="float32", steps=steps)
     inputs = _inputs(policy, recorded)
     given = {name: torch.from_numpy(recorded[name]) for name in ("in_state", "in_action_mask", "in_noise")}
-    heard = {
+    watched = {
         "layers": list(policy.language.layers),
         "dit": list(policy.network.dit.layers),
         "velocity": [policy.network.action_output_layer],
@@ -41,7 +41,7 @@ def verify_xiaomi(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
         "merger": [policy.tower.merger],
     }
     with ExitStack() as stack:
-        calls = {name: [outputs_of(module, stack) for module in modules] for name, modules in heard.items()}
+        calls = {name: [outputs_of(module, stack) for module in modules] for name, modules in watched.items()}
         every = [*policy.sites(), *policy.backbone_stream().sites("final_norm"), *policy.vision_stream().sites()]
         tape = stack.enter_context(capture(policy, every))
         actions = policy.infer(inputs, given["in_state"], given["in_action_mask"], given["in_noise"])
@@ -82,7 +82,7 @@ def _backbone(
         ),
         "vision_merged": lambda: numpy_of(calls["merger"][0][0]),
         "backbone_layer_input": lambda: stacked(tape, backbone)[0],
-        "backbone_layer_output": lambda: numpy_of(torch.stack([heard[0] for heard in calls["layers"]])),
+        "backbone_layer_output": lambda: numpy_of(torch.stack([layer[0] for layer in calls["layers"]])),
         "backbone_final_norm": lambda: stacked(tape, backbone, "final_norm")[0, 0],
         "kv_keys": lambda: numpy_of(torch.stack([layer.keys for layer in cache])),
         "kv_values": lambda: numpy_of(torch.stack([layer.values for layer in cache])),
@@ -93,7 +93,7 @@ def _expert(policy: Xiaomi, tape: ActivationCache, calls: Mapping[str, list[list
     return {
         "dit_layer_input": lambda: stacked(tape, policy.streams["expert"])[:, :-1],
         "dit_layer_output": lambda: numpy_of(
-            torch.stack([torch.stack([heard[step] for heard in calls["dit"]]) for step in range(policy.steps)])
+            torch.stack([torch.stack([layer[step] for layer in calls["dit"]]) for step in range(policy.steps)])
         ),
     }
 

@@ -196,7 +196,7 @@ def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
 
     Raises RunDamagedError.
     """
-    return {category: weighed for category, (_, weighed) in preferred_attention(run).items()}
+    return {category: category_shares for category, (_, category_shares) in preferred_attention(run).items()}
 
 
 def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, AttentionShares]]:
@@ -207,9 +207,9 @@ def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, Attenti
         key, before = result.stored.key, found.get(result.category)
         if key not in read:
             read[key] = AttentionShares.from_bytes(result.stored.bundle.read(ATTENTION_FILE))
-        weighed = read[key].only(read[key].categories == result.category)
-        if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(weighed.roles)):
-            found[result.category] = result, weighed
+        category_shares = read[key].only(read[key].categories == result.category)
+        if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(category_shares.roles)):
+            found[result.category] = result, category_shares
     return found
 
 

@@ -108,8 +108,8 @@ class AttentionReadout(Intervention):
 
     def _roles(self, policy: "Policy") -> tuple[str, ...]:
         stream = backbone_of(policy)
-        told = policy.interventions.supports("tiles")
-        wanted = self.roles or tuple(role for role in ROLES if told or role not in TILES)
+        has_tiles = policy.interventions.supports("tiles")
+        wanted = self.roles or tuple(role for role in ROLES if has_tiles or role not in TILES)
         there = roles_of(policy, stream, wanted)
         if missing := [role for role in self.roles if role not in there]:
             raise UsageError(

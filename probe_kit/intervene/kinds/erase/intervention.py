@@ -71,7 +71,7 @@ class ConceptErasure(Intervention):
         if tiles := set(self.roles) & set(TILES):
             raise UsageError(
                 f"{', '.join(sorted(tiles))} is of other patches in every episode, and an eraser is of positions; "
-                "erase `image`, or exchange the tile (--kind interchange)"
+                "erase `image`, or patch the tile (--kind interchange)"
             )
         object.__setattr__(self, "method", str(Method.of(self.method)))
 

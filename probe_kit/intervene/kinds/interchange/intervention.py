@@ -124,7 +124,7 @@ class Interchange(Intervention):
 class PatchedFromSource:
     """The tokens of one role at one place, from the inference with swapped images.
 
-    donors: all sites of which that inference is asked, once for all conditions. direction: the name of one of
+    sources: all sites of which that inference is asked, once for all conditions. direction: the name of one of
     `bases`, empty to patch tokens in full.
     """
 
@@ -170,11 +170,11 @@ def source_of(context: ConditionContext, sites: Sequence[Site]) -> "ActivationCa
     """What all these sites hold with swapped images, with the question's state and noise; made once."""
     from probe_kit.hooks import capture
 
-    if "donor" not in context.memo:
+    if "source" not in context.memo:
         with capture(context.session.policy, sites) as tape:
             context.memo["first-chunk"] = context.session.act(
-                context.replay_input.exchanged, context.replay_input.seed
+                context.replay_input.swapped, context.replay_input.seed
             )
-        context.memo["donor"] = tape
-    source: ActivationCache = context.memo["donor"]
+        context.memo["source"] = tape
+    source: ActivationCache = context.memo["source"]
     return source

@@ -61,7 +61,7 @@ class Steering(Intervention):
         if self.role in TILES:
             raise UsageError(
                 f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
-                "exchange the tile (--kind interchange)"
+                "patch the tile (--kind interchange)"
             )
         if self.direction not in DIRECTIONS:
             raise UsageError(

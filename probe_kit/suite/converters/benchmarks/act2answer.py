@@ -80,13 +80,13 @@ def _category(root: Path, asked: Sequence[str] | None) -> str:
         return check_categories(asked, list(CATEGORIES))[0]
     words = set(re.findall(r"[a-z]+", root.resolve().name.lower()))
     words |= {word.removesuffix("s") for word in words}
-    told = [slug for slug in CATEGORIES if set(slug.split("-")) <= words]
-    if len(told) != 1:
+    named = [slug for slug in CATEGORIES if set(slug.split("-")) <= words]
+    if len(named) != 1:
         raise UsageError(
-            f"{SOURCE}: the folder's name {root.resolve().name!r} tells {' and '.join(told) or 'no category'}; "
-            f"say which one its questions are counted under: --categories with one of {', '.join(CATEGORIES)}"
+            f"{SOURCE}: folder name {root.resolve().name!r} contains {' and '.join(named) or 'no category'}; "
+            f"name the category of its questions: --categories with one of {', '.join(CATEGORIES)}"
         )
-    return told[0]
+    return named[0]
 
 
 class _Assets:

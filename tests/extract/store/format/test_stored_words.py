@@ -3,7 +3,7 @@
 import pytest
 
 from probe_kit.extract.store.format import stored_words
-from probe_kit.extract.store.format.stored_words import Words, current_word, in_current_words
+from probe_kit.extract.store.format.stored_words import Words, in_current_words
 
 OLD = {
     "kind": "follow",
@@ -39,6 +39,6 @@ def test_another_kind_of_record_keeps_its_words_and_the_record_itself_is_not_cha
 
 
 def test_a_single_word_is_translated_as_in_a_record() -> None:
-    assert current_word("plain", "intervention", "conditions") == "clean"
-    assert current_word("exchanged", "intervention", "conditions") == "exchanged"
-    assert current_word("plain", "outcome", "conditions") == "plain"
+    assert in_current_words({"conditions": "plain"}, "intervention") == {"conditions": "clean"}
+    assert in_current_words({"conditions": "exchanged"}, "intervention") == {"conditions": "exchanged"}
+    assert in_current_words({"conditions": "plain"}, "outcome") == {"conditions": "plain"}

@@ -1,4 +1,4 @@
-"""Trajectories: stored with every episode, protected like the rest, and read back."""
+"""Trajectories: stored with every episode, protected like the rest, and loaded."""
 
 import shutil
 from pathlib import Path

@@ -114,7 +114,7 @@ def test_full_size_keys_are_equal(golden_internvla: Path) -> None:
     assert verify_keys("internvla-m1", golden_internvla / "real_keys.json.gz").passed
 
 
-# -- what it listens to ------------------------------------------------------------------------------------------
+# -- captured sites ------------------------------------------------------------------------------------------
 
 
 def test_every_stream_is_the_sum_of_what_its_blocks_add(loaded: InternVLA, observation: Observation) -> None:

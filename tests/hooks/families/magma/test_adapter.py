@@ -157,7 +157,7 @@ def test_what_is_generated_behind_the_action_fires_no_tap(loaded: Magma) -> None
     with capture(loaded, loaded.sites()) as tape:
         loaded.act(example_observations(INSTRUCTIONS), [0, 1])
     assert set(tape.fires.values()) == {7}
-    own, twin = loaded.network.language_model, loaded.network.unheard()
+    own, twin = loaded.network.language_model, loaded.network.unhooked()
     assert all(a.data_ptr() == b.data_ptr() for a, b in zip(own.parameters(), twin.parameters(), strict=True))
 
 
@@ -196,7 +196,7 @@ def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
 
 
 def test_roles_point_at_what_they_name(loaded: Magma) -> None:
-    """Held against the embeddings themselves."""
+    """Compared with the embeddings themselves."""
     one = example_observations(INSTRUCTIONS[:1])[0]
     with capture(loaded, [Site("backbone", 0)]) as tape:
         loaded.act([one], [0])
@@ -227,7 +227,7 @@ def test_an_option_that_means_nothing_is_refused(folder: Path, option: str, valu
         load_magma(str(folder), **{option: value})
 
 
-# -- listening -------------------------------------------------------------------------------------------
+# -- capture ---------------------------------------------------------------------------------------------
 
 
 def test_every_stage_of_the_trunk_is_a_stream_of_its_own_width(loaded: Magma) -> None:

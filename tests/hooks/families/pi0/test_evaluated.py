@@ -168,12 +168,12 @@ def test_openness_as_the_release_has_it_uses_the_fingers_of_our_widowx() -> None
     assert state[0, 7] == 1.0
 
 
-def test_listening_is_the_inference_that_acting_makes(policy: Pi0, seen: Observation) -> None:
-    heard = policy.infer_without_acting([seen], [SEED])
-    np.testing.assert_array_equal(policy.action_units.restore(heard), policy.act([seen], [SEED]))
+def test_inference_without_acting_equals_that_of_acting(policy: Pi0, seen: Observation) -> None:
+    captured = policy.infer_without_acting([seen], [SEED])
+    np.testing.assert_array_equal(policy.action_units.restore(captured), policy.act([seen], [SEED]))
 
 
-def test_a_checkpoint_of_other_actions_and_another_state_can_be_listened_to(
+def test_a_checkpoint_of_other_actions_and_another_state_can_be_captured(
     folder: Path, tmp_path: Path, seen: Observation
 ) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "base"))
@@ -186,10 +186,10 @@ def test_a_checkpoint_of_other_actions_and_another_state_can_be_listened_to(
     assert policy.zero_filled_inputs() == ("state",)
     with pytest.raises(CheckpointError, match="acts in 32 dimensions"):
         policy.act([seen], [0])
-    heard = policy.infer_without_acting([seen], [SEED])
-    assert heard.shape == (1, 4, 32)
+    captured = policy.infer_without_acting([seen], [SEED])
+    assert captured.shape == (1, 4, 32)
     moved = replace(seen, state=seen.state + 1)
-    np.testing.assert_array_equal(policy.infer_without_acting([moved], [SEED]), heard)
+    np.testing.assert_array_equal(policy.infer_without_acting([moved], [SEED]), captured)
 
 
 @pytest.mark.parametrize("option", [{"picture": "cropped"}, {"openness": "wide"}])

@@ -72,7 +72,7 @@ def test_a_tensor_of_the_old_layout_that_is_missing_is_named(golden: Path, tmp_p
 
 @pytest.mark.parametrize("change", ["absent", "unfilled"])
 def test_statistics_that_nobody_filled_are_no_statistics(golden: Path, tmp_path: Path, change: str) -> None:
-    """lerobot filled the buffers with infinity until somebody gave them statistics."""
+    """lerobot filled the buffers with infinity until statistics were given."""
     copy = old_copy(golden, tmp_path)
     weights = load_file(copy / "model.safetensors")
     name = "unnormalize_outputs.buffer_action.std"

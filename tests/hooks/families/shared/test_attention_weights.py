@@ -1,4 +1,4 @@
-"""Attention that is computed once more is what was paid: weighed with it, values give what was read."""
+"""Recomputed attention weights equal those of the inference: weights times values give its output."""
 
 import pytest
 import torch
@@ -6,7 +6,13 @@ from torch.nn import functional
 from transformers import DynamicCache, LlamaConfig, LlamaModel
 
 from probe_kit.errors import UnsupportedInterventionError
-from probe_kit.hooks.families.shared.attention_weights import on_the_prompt, recomputed, returned, shares, weighed
+from probe_kit.hooks.families.shared.attention_weights import (
+    on_the_prompt,
+    recomputed,
+    recording_weights,
+    returned,
+    shares,
+)
 from probe_kit.models.xiaomi.transformer import Attention
 
 
@@ -34,22 +40,22 @@ def test_llamas_last_position_is_weighed_as_eager_attention_weighs_it() -> None:
     config._attn_implementation = "eager"
     network, cache = LlamaModel(config).eval(), DynamicCache(config=config)
     attentions = [layer.self_attn for layer in network.layers]
-    told: dict[str, dict[tuple[int, int], torch.Tensor]] = {"returned": {}, "recomputed": {}}
+    recorded: dict[str, dict[tuple[int, int], torch.Tensor]] = {"returned": {}, "recomputed": {}}
 
     def noting(name: str):
-        return on_the_prompt(lambda block, iteration, weights: told[name].update({(block, iteration): weights}))
+        return on_the_prompt(lambda block, iteration, mass: recorded[name].update({(block, iteration): mass}))
 
     with (
         torch.inference_mode(),
-        weighed(attentions, noting("returned"), returned),
-        weighed(attentions, noting("recomputed"), recomputed),
+        recording_weights(attentions, noting("returned"), returned),
+        recording_weights(attentions, noting("recomputed"), recomputed),
     ):
         for ids in ([[1, 2, 3, 4, 5, 6]], [[7]], [[8]]):
             network(input_ids=torch.tensor(ids), past_key_values=cache, use_cache=True)
-    assert told["returned"].keys() == {(block, iteration) for block in (0, 1) for iteration in (0, 1, 2)}
-    for read, weights in told["returned"].items():
+    assert recorded["returned"].keys() == {(block, iteration) for block in (0, 1) for iteration in (0, 1, 2)}
+    for read, weights in recorded["returned"].items():
         assert weights.shape == (1, 4, 1, 5)  # the prompt without its last token
-        torch.testing.assert_close(told["recomputed"][read], weights)
+        torch.testing.assert_close(recorded["recomputed"][read], weights)
 
 
 def test_xiaomis_weights_on_its_values_are_what_its_attention_reads() -> None:

@@ -101,7 +101,7 @@ class TestWithoutDepth(_Letters, AdapterContract):
         return flat
 
 
-# -- listening -------------------------------------------------------------------------------------------------
+# -- capture ---------------------------------------------------------------------------------------------------
 
 
 def test_what_a_block_adds_is_what_the_residual_stream_gains(plain: SpatialVLA, seen: list[Observation]) -> None:
@@ -118,7 +118,7 @@ def test_what_a_block_adds_is_what_the_residual_stream_gains(plain: SpatialVLA, 
             torch.testing.assert_close(before + gained, after, rtol=0, atol=1e-5)
 
 
-def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_heard(
+def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
     folder: Path, plain: SpatialVLA, seen: list[Observation]
 ) -> None:
     whole = load_spatialvla(str(folder), iterations="chunk")

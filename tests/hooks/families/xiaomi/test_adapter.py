@@ -87,7 +87,7 @@ def test_full_size_keys_are_equal(golden_xiaomi: Path) -> None:
     assert verify_keys("xiaomi-r0", golden_xiaomi / "real_keys.json.gz").passed
 
 
-# -- what it listens to ------------------------------------------------------------------------------------------
+# -- captured sites ------------------------------------------------------------------------------------------
 
 
 def test_the_experts_quantities_are_what_its_layers_compute(loaded: Xiaomi, observation: Observation) -> None:

@@ -161,11 +161,11 @@ def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, attention_rec
 def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: InterventionResult) -> None:
     def ask(style: str) -> str:
         options = ["--kind", "attention", "--categories", "color", "--items", "2", "--format", style]
-        told = CliRunner().invoke(app, ["intervene", str(copy.path), *options])
-        assert told.exit_code == 0
-        assert f"stored as {attention_records.key}" in told.stderr
-        assert "not causal" in " ".join(told.stderr.split())
-        return told.stdout
+        answer = CliRunner().invoke(app, ["intervene", str(copy.path), *options])
+        assert answer.exit_code == 0
+        assert f"stored as {attention_records.key}" in answer.stderr
+        assert "not causal" in " ".join(answer.stderr.split())
+        return answer.stdout
 
     shown = " ".join(ask("table").split())
     assert "What does it attend to?" in shown

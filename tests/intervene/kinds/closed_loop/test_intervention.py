@@ -143,7 +143,7 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
 
     class Watching(CleanRun):
         def play(self, context):  # type: ignore[no-untyped-def]
-            seen.append((context.replay_input.seen, context.replay_input.exchanged))
+            seen.append((context.replay_input.seen, context.replay_input.swapped))
             return super().play(context)
 
     session: ReplaySession

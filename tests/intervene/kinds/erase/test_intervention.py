@@ -140,7 +140,7 @@ def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, bas
     assert row.kept == pytest.approx(own)
     assert row.control_kept == pytest.approx(beside)
     assert row.p is not None
-    # Twelve items, all the same way: the smallest there can be.
+    # Twelve items with the same sign: the smallest possible p.
     assert row.p == 2.0**-12
     assert row.right == (own > 0)
 

@@ -148,6 +148,6 @@ def test_a_family_without_a_memory_is_refused_before_anything_is_loaded(
 
     with pytest.raises(UnsupportedInterventionError, match=r"internvla-m1.*`bridge`"):
         run_intervention(copy, Interchange(sites=("backbone.*", "kv.00")), source, load=load)
-    told = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "interchange", "--sites", "kv.*"])
-    assert told.exit_code != 0
-    assert isinstance(told.exception, UnsupportedInterventionError) or "bridge" in told.output
+    answer = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "interchange", "--sites", "kv.*"])
+    assert answer.exit_code != 0
+    assert isinstance(answer.exception, UnsupportedInterventionError) or "bridge" in answer.output

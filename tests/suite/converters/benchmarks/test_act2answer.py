@@ -160,7 +160,7 @@ def test_the_folders_name_tells_the_category(original: Path, tmp_path: Path, nam
 
 def test_a_name_that_tells_no_category_needs_one(original: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(original, tmp_path / "symmetry_color_v2"))
-    with pytest.raises(UsageError, match="tells color and symmetry; say which one"):
+    with pytest.raises(UsageError, match="contains color and symmetry; name the category"):
         convert("act2answer", folder, tmp_path / "suite")
     with pytest.raises(UnknownCategoryError):
         convert("act2answer", folder, tmp_path / "suite", categories=["shapes"])

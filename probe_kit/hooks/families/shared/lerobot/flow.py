@@ -59,7 +59,7 @@ class LerobotFlow(Policy):
     unread: ClassVar[tuple[str, ...]]
     """Parameters that inference never reads and a file may lack."""
     other_roles: ClassVar[tuple[str, ...]]
-    """What positions of the prefix play besides pictures and padding."""
+    """What positions of the backbone hold besides pictures and padding."""
     suffix_roles: ClassVar[tuple[str, ...]]
 
     def __init__(self, network: Any, folder: Path) -> None:
@@ -131,11 +131,11 @@ class LerobotFlow(Policy):
     @property
     @abstractmethod
     def tokens_per_camera(self) -> int:
-        """Patches of one picture in the prefix."""
+        """Patches of one picture in the backbone."""
 
     @abstractmethod
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """The role of every prefix position of one row, from those of its language positions."""
+        """The role of every backbone position of one row, from those of its language positions."""
 
     @abstractmethod
     def suffix_labels(self) -> list[str]:
@@ -420,7 +420,7 @@ class LerobotFlow(Policy):
     def _buffers(self) -> dict[str, NDArray[np.float32]]:
         return read_buffers(self.folder)
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the stack's final norm, or a block's output.

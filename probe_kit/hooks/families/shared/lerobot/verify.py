@@ -121,7 +121,7 @@ def _preparation(policy: LerobotFlow, batch: dict[str, Tensor], recorded: Arrays
 
 
 def _prefix_pad(policy: LerobotFlow, recorded: Arrays) -> NDArray[np.bool_]:
-    """(B, T) validity of every prefix position, as the adapter's own roles say it."""
+    """(B, T) validity of every backbone position, as the adapter's own roles say it."""
     tokens, mask = (torch.from_numpy(recorded[name]) for name in ("in_lang_tokens", "in_lang_mask"))
     return np.stack([row.valid for row in policy.packed_roles(tokens, mask.bool())["backbone"]])
 
@@ -145,10 +145,10 @@ def _record_positions(policy: LerobotFlow, stack: ExitStack) -> list[Tensor]:
     """Position ids as the backbone's first layer gets them, where the layer is called with them."""
     positions: list[Tensor] = []
 
-    def hear(_module: nn.Module, _inputs: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+    def note_keywords(_module: nn.Module, _inputs: tuple[Any, ...], keywords: dict[str, Any]) -> None:
         positions.append(keywords["position_ids"].detach().clone())
 
-    handle = policy.stacks["backbone"].layers[0].register_forward_pre_hook(hear, with_kwargs=True)
+    handle = policy.stacks["backbone"].layers[0].register_forward_pre_hook(note_keywords, with_kwargs=True)
     stack.callback(handle.remove)
     return positions
 

@@ -3,10 +3,12 @@
 from functools import cached_property
 from typing import Any, ClassVar
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures
+from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.packing import LeftPacked
 from probe_kit.models.qwen import QwenPictures, merged_tokens
@@ -20,7 +22,7 @@ def qwen_frame(system: str = "") -> Frame:
     return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 
-class QwenReader(VisionLanguageModel):
+class QwenReader(RecipeReader):
     """A reader on one of transformers' Qwen networks."""
 
     picture_token: ClassVar[str | None] = "<|image_pad|>"
@@ -37,22 +39,12 @@ class QwenReader(VisionLanguageModel):
         """Blocks and width of the vision tower."""
         return len(self.tower.blocks), int(self.network.config.vision_config.hidden_size)
 
-    @property
-    def merger_entry(self) -> nn.Module:
-        """The module that reads what leaves the vision tower."""
-        merger = self.tower.merger
-        entry: nn.Module = merger.ln_q if hasattr(merger, "ln_q") else merger.norm
-        return entry
-
     def vision_tap(self, layer: int) -> Tap:
         """The first norm of a block, or what reads the last one; patches in the tower's own order."""
-        blocks = self.tower.blocks
-        return Tap(self.merger_entry if layer == len(blocks) else blocks[layer].norm1, 1, view=self._by_picture)
+        return tower_tap(self.tower, layer, self._by_picture)
 
     def _by_picture(self, patches: Tensor) -> Tensor:
-        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
-        count = 1 if self._grid is None or bool((self._grid != self._grid[0]).any()) else len(self._grid)
-        return patches.view(count, -1, patches.shape[-1])
+        return by_picture(patches, self._grid)
 
     @cached_property
     def pictures(self) -> QwenPictures:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit.errors import InstructionError
 from probe_kit.hooks.contract.model import Policy, Tap
@@ -17,6 +17,7 @@ from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
+from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
 from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
 
 CAMERA = "primary"
@@ -77,11 +78,6 @@ class QwenVLA(Policy):
         """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
         return self.look(seen)
 
-    @property
-    @abstractmethod
-    def merger_entry(self) -> nn.Module:
-        """The module that reads what leaves the vision tower."""
-
     # -- inputs ------------------------------------------------------------------------------------------
 
     @cached_property
@@ -135,7 +131,7 @@ class QwenVLA(Policy):
     def _image_token(self) -> int:
         return int(self.vlm.config.image_token_id)
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def backbone_roles(self, seen: Sequence[Observation]) -> list[Roles]:
         """Chat marks, picture, text; padding behind it where another prompt is longer."""
@@ -164,14 +160,10 @@ class QwenVLA(Policy):
 
     def vision_tap(self, site: Site) -> Tap:
         """The first norm of the block, or what reads the last one; patches in the tower's own order."""
-        blocks = self.tower.blocks
-        module = self.merger_entry if site.layer == len(blocks) else blocks[site.layer].norm1
-        return Tap(module, 1, view=self._by_picture)
+        return tower_tap(self.tower, site.layer, self._by_picture)
 
     def _by_picture(self, patches: Tensor) -> Tensor:
-        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
-        count = 1 if self._grid is None or bool((self._grid != self._grid[0]).any()) else len(self._grid)
-        return patches.view(count, -1, patches.shape[-1])
+        return by_picture(patches, self._grid)
 
 
 def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:

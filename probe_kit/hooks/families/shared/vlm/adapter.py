@@ -205,7 +205,7 @@ class VisionLanguageModel(AnswerModel):
             ids = reading.state.speak(tokens, self.text.ends)
         return [self.text.decode(row) for row in ids.tolist()]
 
-    # -- listening ---------------------------------------------------------------------------------------
+    # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the observations' instructions as questions."""

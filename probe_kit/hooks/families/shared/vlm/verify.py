@@ -111,7 +111,7 @@ class Reference:
         return self.model.packed([self.model.prompt(question) for question in self.questions])
 
     @cached_property
-    def heard(self) -> tuple[ActivationCache, Prefill]:
+    def captured(self) -> tuple[ActivationCache, Prefill]:
         """One pass over all rows, with everything that is stored of it."""
         model = self.model
         with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
@@ -162,7 +162,7 @@ class Reference:
 
     def _streams(self) -> dict[str, Produce]:
         def joined(layer: int, quantity: str) -> torch.Tensor:
-            tape = self.heard[0]
+            tape = self.captured[0]
             parts = [Site("backbone", layer, quantity), Site(ANSWER, layer, quantity, 0)]
             return torch.cat([tape[site] for site in parts], dim=1)
 
@@ -192,7 +192,7 @@ class Reference:
             return np.array([model.text.option(prompt, option) for option in self.questions[0].options])
 
         return {
-            "logits_last": lambda: numpy_of(self.heard[1].logits),
+            "logits_last": lambda: numpy_of(self.captured[1].logits),
             "single_logits_last": lambda: numpy_of(torch.cat([prefill.logits for prefill in self.alone])),
             "textonly_logits_last": lambda: numpy_of(model.prefill([self.bare]).logits),
             "option_ids": options,
@@ -204,7 +204,7 @@ class Reference:
         """What is said behind every row, padded behind its end."""
         length = self.recorded["greedy_ids"].shape[1]
         with torch.inference_mode():
-            said = self.heard[1].speak(length, self.model.text.ends).numpy()
+            said = self.captured[1].speak(length, self.model.text.ends).numpy()
         return padded_answers(said, length, self.model.text.ends, self.model.text.padding)
 
 

@@ -1,4 +1,4 @@
-"""A scripted expert with privileged state: an upper bound on the success rate."""
+"""Scripted policies: an expert with privileged state, and one that does nothing, as bounds of the success rate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -135,3 +135,20 @@ class ScriptedExpert:
             return self._height
         model = self._env.scene.arm.model
         return max(self._env.scene_spec.cube_side / 2 + model.hand_drop, model.clearance)
+
+
+class Idle:
+    """Never moves the tool, and leaves the gripper as it was at the start: shut around a cube in hand, else open.
+
+    env: an Act2AnswerEnv, wrapped or not.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self._env: Act2AnswerEnv = env.unwrapped
+
+    def reset(self) -> None:
+        """There is nothing to plan."""
+
+    def act(self) -> NDArray[np.float32]:
+        """The next action (7,) float32."""
+        return np.array([0, 0, 0, 0, 0, 0, not self._env.scene_spec.start_grasped], np.float32)
