@@ -1,4 +1,4 @@
-"""What a stranger sees: nothing clipped, the width used, marks that mean the same, colours that are told apart."""
+"""What a stranger sees: nothing clipped, the width used, marks that mean the same, colours that differ."""
 
 import io
 from collections.abc import Callable, Iterator
@@ -247,7 +247,7 @@ def linear(colour: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def lab(colour: NDArray[np.float64], seen: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """CIELAB of an sRGB colour, through the eyes of somebody who sees by the matrix `seen`."""
+    """CIELAB of an sRGB colour, as seen with the matrix `seen`."""
     light = linear(colour)
     light = light if seen is None else (seen @ light).clip(0, 1)
     ratios = _XYZ @ light / [0.95047, 1, 1.08883]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Name, colour, hatch: told apart without colour too.
+# Name, colour, hatch: distinct without colour too.
 _PARTS = (
     ("right in both layouts", GREEN, ""),
     ("right in one", SKY, "..."),

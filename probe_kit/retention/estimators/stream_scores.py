@@ -160,7 +160,8 @@ class PooledScores:
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
         """(K, L) covariance of the scores; 0 on other groups.
 
-        Of a stream with itself it leaves room for unseen groups, in which one run holds nothing.
+        Of a stream with itself it leaves room for unseen groups, in which one run may hold
+        all and the other nothing.
         """
         if self.fit is None or other.fit is None or self.fit.seed != other.fit.seed:
             return np.zeros((len(self.names), len(other.names)))
@@ -168,8 +169,7 @@ class PooledScores:
         for name in set(self.names) & set(other.names):
             row, column = self.names.index(name), other.names.index(name)
             variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
-            most = max(abs(self.scores.above[row]), abs(other.scores.above[column]))
-            between[row, column] = _not_surer(between[row, column], variances, self.fit.n_groups, most)
+            between[row, column] = _not_surer(between[row, column], variances, self.fit.n_groups, CHANCE)
         return between
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
@@ -185,7 +185,7 @@ class PooledScores:
 def _not_surer(covariance: float, variances: tuple[float, float], n_groups: int, most: float) -> float:
     """The covariance of two estimates on the same groups, less where their difference would be known too well.
 
-    Two runs that agree in all G groups may differ in those that nobody has seen: in a share t of them, by `most`
+    Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most`
     each, with t² = 2 / ((G + 1)(G + 2)) on average, see `CrossFit.covariance`.
     """
     unseen = 2 * most**2 / ((n_groups + 1) * (n_groups + 2))

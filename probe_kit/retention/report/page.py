@@ -161,7 +161,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _pictures(exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str]) -> list[list[Picture]]:
-    """Figures of one subject by kind: those of several runs stand beside each other.
+    """Figures of one subject by kind: those of several runs side by side.
 
     All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
     figure shows side by side.

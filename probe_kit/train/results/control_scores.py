@@ -95,7 +95,7 @@ class Controls:
 
     @cached_property
     def _beaten(self) -> dict[tuple[str, str, str], dict[str, bool]]:
-        """By category, view and site: the controls it was held against, and whether it is better."""
+        """By category, view and site: the controls it was compared with, and whether it is better."""
         beaten: dict[tuple[str, str, str], dict[str, bool]] = {}
         for one in self.excess:
             beaten.setdefault((one.category, one.view, one.site), {})[one.control] = one.p < SIGNIFICANCE

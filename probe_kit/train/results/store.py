@@ -77,7 +77,7 @@ def _directions(results: ProbeResults) -> bytes:
 
 
 def _controls(results: ProbeResults) -> dict[str, bytes]:
-    """What the probes were held against, as a file; nothing where nothing was controlled."""
+    """The controls of the probes, as a file; nothing without controls."""
     if results.controls == Controls():
         return {}
     return {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}

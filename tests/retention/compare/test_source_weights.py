@@ -72,7 +72,7 @@ def test_a_checkpoint_that_is_not_the_familys_own_grew_from_unknown_weights(tmp_
 
 
 def test_runs_of_before_whose_cards_hold_a_family_only_are_unknown(tmp_path: Path) -> None:
-    """Their `source` is a name; a run without a certificate says nothing at all."""
+    """Their `source` is a name; a run without a certificate has an unknown source."""
     old = acted(tmp_path / "p", RIGHT, "xiaomi-r0", source="qwen3-vl")
     assert grew_from(old, reader(tmp_path, QWEN_4B)) == "unknown"
     assert grew_from(old, asked(tmp_path / "r", RIGHT)) == "unknown"

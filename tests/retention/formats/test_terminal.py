@@ -1,4 +1,4 @@
-"""What a terminal shows, read back number by number."""
+"""What a terminal shows, parsed number by number."""
 
 import io
 import json
