@@ -29,10 +29,10 @@ KEYS = {
         "share_outside",
         "regime",
     },
-    "backbone": {"accuracy", "layer", "p_fwe"},
-    "action": {"accuracy", "layer", "iteration"},
-    "retention": {"published", "debiased", "ci"},
-    "controls": {"chance", "probe_minus_sr"},
+    "backbone": {"score", "ci", "peak", "at_most", "verdict", "layer", "p_fwe"},
+    "action": {"score", "ci", "peak", "at_most", "verdict", "layer", "iteration"},
+    "retention": {"value", "ci", "published", "defined", "note"},
+    "controls": {"missing", "probe_minus_sr"},
 }
 
 

@@ -26,11 +26,11 @@ from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
 from probe_kit.retention.report.category_summary import verdict
-from probe_kit.retention.rows.parts import BackbonePeak, RunInfo, SwapEffect
+from probe_kit.retention.rows.parts import BackbonePart, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 
 
-def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
+def row(sr: float, p: float | None, **controls: bool) -> RetentionRow:
     """p: of the backbone's best site against chance."""
     chance = None if p is None else p < 0.05
     run = RunInfo(
@@ -42,8 +42,8 @@ def row(sr: float, p: float | None, **beats: bool) -> RetentionRow:
         view="mean",
         run=run,
         success=SuccessRate(n_episodes=48, n_items=24, sr=sr, regime=regime(sr, 0.14, 1 - sr, 0.0)[0]),
-        backbone=BackbonePeak(
-            accuracy=0.9, p_fwe=p, exceeds={"chance": chance, "random-features": None, "untrained": None} | beats
+        backbone=BackbonePart(
+            score=0.9, p_fwe=p, exceeds={"chance": chance, "random-features": None, "untrained": None} | controls
         ),
     )
 
@@ -77,10 +77,10 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
     assert (EARLY.expected("color"), EARLY.expected("state")) == ("encoded, unused", "encoded, unused")
     assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
     assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
-    twins = [one for one in ORGANISMS if one.random_weights]
-    assert twins == [UNTRAINED_NETWORK, *OTHER_TWINS]
-    assert [one.weights_seed for one in twins] == [0, 1, 2]
-    assert {one.expected(category) for one in twins for category in ("color", "state")} == {"absent"}
+    untrained = [one for one in ORGANISMS if one.random_weights]
+    assert untrained == [UNTRAINED_NETWORK, *OTHER_TWINS]
+    assert [one.weights_seed for one in untrained] == [0, 1, 2]
+    assert {one.expected(category) for one in untrained for category in ("color", "state")} == {"absent"}
 
 
 @pytest.mark.parametrize(
@@ -100,12 +100,12 @@ def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothin
     assert measured(replace(alone, image_swap=SwapEffect(used="used")), shown) == "used"
 
 
-def test_a_random_twin_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
+def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
     """Its pictures are exchanged before its own weights; those of another seed are refused."""
-    twin = replace(OTHER_TWINS[0], max_steps=1)
-    settings = replace(settings_of(twin, small_suite), categories=("color",), items=2, video="none", env_workers=0)
+    other = replace(OTHER_TWINS[0], max_steps=1)
+    settings = replace(settings_of(other, small_suite), categories=("color",), items=2, video="none", env_workers=0)
     run = extract_run(settings, tmp_path / "run")
-    assert len(run_intervention(run, ImageSwap(), source_of(twin, small_suite)).table) == 1
+    assert len(run_intervention(run, ImageSwap(), source_of(other, small_suite)).table) == 1
     with pytest.raises(SettingsMismatchError, match="weights"):
         run_intervention(run, InstructionSwap(), source_of(UNTRAINED_NETWORK, small_suite))
 

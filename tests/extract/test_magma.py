@@ -107,7 +107,7 @@ def test_it_stands_in_one_table_beside_another_family_with_its_flagged_steps(
     shares = [rows[str(run.location)].success.share_invalid_action for run in runs]
     assert shares == [0, 1, None]
     assert [rows[str(run.location)].run.action_stream for run in runs] == ["action", "action", "expert"]
-    assert all(rows[str(run.location)].backbone.accuracy is not None for run in runs)
+    assert all(rows[str(run.location)].backbone.score is not None for run in runs)
     text = table.to_markdown()
     assert "invalid actions %" in text
     assert "100.0" in text

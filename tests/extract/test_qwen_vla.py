@@ -107,5 +107,5 @@ def test_they_stand_in_one_table_beside_another_family(
         if row.category == "color" and row.view == "mean"
     }
     assert [rows[str(run.location)].run.action_stream for run in runs] == ["expert"] * 3
-    assert all(rows[str(run.location)].backbone.accuracy is not None for run in runs)
-    assert all(rows[str(run.location)].action.accuracy is not None for run in runs)
+    assert all(rows[str(run.location)].backbone.score is not None for run in runs)
+    assert all(rows[str(run.location)].action.score is not None for run in runs)

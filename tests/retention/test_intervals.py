@@ -3,16 +3,14 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import product
+from math import isnan, sqrt
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from probe_kit.retention.estimators.bootstrap_draws import average, probe_estimates, sr_estimate
-from probe_kit.retention.estimators.combined import area_fit, bounded_fit
-from probe_kit.retention.estimators.cross_fit import GroupScores, crossfit
-from scipy.special import stdtrit
+from scipy import stats
 
-from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import (
     Difference,
     RetentionRow,
@@ -21,8 +19,15 @@ from probe_kit.retention import (
     measure_retention,
     retention_table,
 )
+from probe_kit.retention.behaviour.success_rate import success_share
 from probe_kit.retention.displays import LayerCurveDisplay
-from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.retention.estimators.retention import curve_scores
+from probe_kit.retention.estimators.stream_scores import PooledScores, Rate, limits
+from probe_kit.statistics.estimates.balanced import GroupSums
+from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.retention import retention, retention_difference
+from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
 from probe_kit.train.controls.fit_controls import add_untrained
 
@@ -31,105 +36,225 @@ PERFECT = ([1.0, 1.0], [[1.0, 1.0]])
 HOPELESS = ([0.0, 0.5], [[0.0, 0.5]])
 GOOD = ([0.5, 0.9], [[0.6, 0.7]])
 NONE = ([0.5, 0.52], [[0.5, 0.51]])
+ITERATED = ([0.5, 0.8], [[0.6, 0.7], [0.75, 0.75]])
 WORLDS = {
     "perfect": {"color": PERFECT},
     "perfect and good": {"color": PERFECT, "shape": GOOD},
     "perfect everywhere": {"color": PERFECT, "shape": PERFECT, "state": PERFECT},
     "hopeless": {"color": HOPELESS, "shape": NONE},
     "good": {"color": GOOD},
-    "mixed": {"color": GOOD, "shape": NONE, "state": PERFECT},
+    "mixed": {"color": GOOD, "shape": NONE, "state": PERFECT, "time": ITERATED},
 }
+Found = tuple[str, float, float, float]
 
 
 @pytest.fixture(params=WORLDS)
 def table(request: pytest.FixtureRequest, probed_run: ProbedRun) -> RetentionTable:
-    """A run of the world against an equal one and against a good one."""
+    """A run of the world against an equal one, and a group of two good ones."""
     world = WORLDS[request.param]
     runs = {name: [probed_run(world, name)] for name in ("one", "again")}
-    return retention_table({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), "other")]})
+    return retention_table({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), f"other{at}") for at in "ab"]})
 
 
-def intervals(rows: Sequence[RetentionRow] | Sequence[Difference]) -> Iterator[tuple[str, float, float, float]]:
-    """Name, value and limits of every interval that has any; unbounded ones are an answer of their own."""
-    values = {
-        "backbone_ci": "backbone_accuracy", "action_ci": "action_accuracy",
-        "success": "sr", "backbone": "accuracy", "action": "accuracy", "retention": "debiased",
-    }  # fmt: skip
+# -- every interval that there is ----------------------------------------------------------------------------
+
+OF_PART = {
+    "success": "sr", "backbone": "score", "action": "score", "retention": "value",
+    "sr_models": "difference", "retention_models": "difference",
+}  # fmt: skip
+"""Whose interval `ci` of a part is."""
+
+
+def intervals(rows: Sequence[RetentionRow] | Sequence[Difference]) -> Iterator[Found]:
+    """Name, value and limits of every interval that has any; no limits are an answer of their own."""
     for row in rows:
         fields = asdict(row)
         parts = [("", fields), *((name, part) for name, part in fields.items() if isinstance(part, dict))]
         for part, inner in parts:
-            for name, limits in inner.items():
-                if not (name == "ci" or name.endswith("_ci")) or limits is None or limits == (None, None):
+            for name, found in inner.items():
+                if not (name == "ci" or name.endswith("_ci")) or found is None or found == (None, None):
                     continue
-                of = values[part] if name == "ci" else values.get(name, name.removesuffix("_ci"))
-                yield f"{row.category} {part}.{name}", inner[of], *limits
+                of = OF_PART[part] if name == "ci" else name.removesuffix("_ci")
+                yield f"{row.category} {part}.{name}", inner[of], *found
+
+
+def of_probes(table: RetentionTable) -> Iterator[Found]:
+    for results in table.results.values():
+        for row in results.scores.itertuples():
+            yield f"scores {row.category} {row.site}", row.accuracy, row.ci_low, row.ci_high
+        for line in (
+            line
+            for category in results.settings.categories
+            for stream in LayerCurveDisplay.from_results(results, category).streams
+            for line in stream.lines
+        ):
+            for at, value in enumerate(line.accuracy):
+                yield f"curve, layer {at}", value, line.low[at], line.high[at]
 
 
 def test_no_interval_is_without_width_and_each_holds_its_number(table: RetentionTable) -> None:
-    found = [*intervals(table.all_rows), *intervals(table.differences)]
-    assert len(found) > 20
+    found = [*intervals(table.all_rows), *intervals(table.differences), *of_probes(table)]
+    assert len(found) > 40
+    names = {name.split(" ", 1)[1] for name, *_ in found}
+    assert names >= {"success.ci", "backbone.ci", "action.ci", "rules.sr_answered_ci"}
+    assert names >= {".sr_ci", ".backbone_ci", ".action_ci"}
     for name, value, low, high in found:
         assert high - low > 1e-3, name
         assert low <= value <= high, name
 
 
-def test_one_number_has_one_interval_in_rows_scores_and_curves(table: RetentionTable) -> None:
+def test_shares_stay_shares_and_differences_of_shares_differences(table: RetentionTable) -> None:
+    for name, _, low, high in [*intervals(table.all_rows), *of_probes(table)]:
+        if "retention" not in name and "minus" not in name:
+            assert 0 <= low < high <= 1, name
+    for name, _, low, high in intervals(table.differences):
+        if "retention" not in name and "models" not in name:
+            assert -1 <= low < high <= 1, name
+
+
+def test_equal_runs_differ_by_nothing_and_not_surely_so(table: RetentionTable) -> None:
+    """Two models that agree in all 100 groups may differ in 3.6 % of others, and no more is allowed for."""
+    rows = [row for row in table.differences if (row.group, row.minus) == ("one", "again")]
+    assert rows
+    for row in rows:
+        for name in ("sr", "backbone", "action"):
+            low, high = getattr(row, f"{name}_ci")
+            assert getattr(row, name) == 0
+            categories = max(1, len(row.categories))
+            assert 0.001 < high < 0.08 / sqrt(categories) + 0.01, name
+            assert 0.001 < -low < 0.08 / sqrt(categories) + 0.01, name
+
+
+# -- one number has one interval -----------------------------------------------------------------------------
+
+
+def test_one_number_has_one_interval_in_rows_curves_and_scores(table: RetentionTable) -> None:
     for row in table.rows:
-        results = table.results[row.run.location]
-        scores = results.scores[results.scores["category"] == row.category]
-        display = LayerCurveDisplay.from_results(results, row.category)
-        for stream, layer, step, limits in (
-            ("backbone", row.backbone.layer, None, row.backbone.ci),
-            ("expert", row.action.layer, row.action.iteration, row.action.ci),
-        ):
-            site = scores[(scores["stream"] == stream) & (scores["layer"] == layer)]
-            site = site if step is None else site[site["iteration"] == step]
-            assert limits == (site["ci_low"].item(), site["ci_high"].item())
-            (curve,) = [one for one in display.streams if one.stream == stream]
-            at = list(curve.layers).index(layer)
-            assert limits == (curve.low[at], curve.high[at])
+        curve = table.results[row.run.location].curves[row.category, "mean"]
+        streams = curve_scores(curve, suite=row.run.suite)
+        assert streams is not None
+        for name, part in (("backbone", row.backbone), ("action", row.action)):
+            assert part.score == streams.accuracy(name)
+            assert part.ci == limits(streams.interval(name))
+        again = measure_retention(curve, suite=row.run.suite)
+        assert again is not None
+        value = None if isnan(again.value) else again.value
+        assert (row.retention.value, row.retention.ci) == (value, limits(again.interval))
 
 
-def test_a_mean_is_as_wide_as_its_only_category_and_never_wider_known_than_its_parts(
-    table: RetentionTable,
-) -> None:
+def test_the_interval_of_a_site_is_korn_and_graubards_in_scores_and_figures(table: RetentionTable) -> None:
+    for results in table.results.values():
+        for (category, view), curve in results.curves.items():
+            own = results.scores[(results.scores["category"] == category) & (results.scores["view"] == view)]
+            display = LayerCurveDisplay.from_results(results, category)
+            drawn = {
+                (stream.stream, int(layer), line.iteration): (line.low[at], line.high[at])
+                for stream in display.streams
+                for line in stream.lines
+                for at, layer in enumerate(line.layers)
+            }
+            for row, (_, score) in enumerate(own.iterrows()):
+                wanted = korn_graubard(curve.correct[row].reshape(-1, 2).sum(axis=1))
+                assert (score["ci_low"], score["ci_high"]) == pytest.approx(wanted)
+                site = curve.sites[row]
+                assert drawn[site.stream, site.layer, site.iteration] == pytest.approx(wanted)
+
+
+def korn_graubard(right: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float]:
+    """Clopper and Pearson's, of (G,) hits in groups of two, with as many episodes as count."""
+    groups, episodes = right.size, 2 * right.size
+    share = right.sum() / episodes
+    variance = np.sum((right - 2 * share) ** 2) * groups / (groups - 1) / episodes**2
+    if variance == 0:
+        count = float(groups)
+    else:
+        lost = stats.t.ppf(0.975, episodes - 1) / stats.t.ppf(0.975, groups - 1)
+        count = min(share * (1 - share) / variance, episodes) * lost**2
+    hits, misses = share * count, (1 - share) * count
+    low = stats.beta.ppf(0.025, hits, misses + 1) if hits else 0.0
+    high = stats.beta.ppf(0.975, hits + 1, misses) if misses else 1.0
+    return float(low), float(high)
+
+
+# -- means ---------------------------------------------------------------------------------------------------
+
+
+def test_a_mean_is_as_wide_as_its_only_category_and_else_as_its_parts_together(table: RetentionTable) -> None:
+    """Independent categories: squares of the arms add up, and accuracies have Student's t of all of them."""
     for mean in table.means:
         own = [row for row in table.rows if row.run.location == mean.run.location]
-        for name in ("success", "backbone", "action", "retention"):
-            parts = [getattr(row, name).ci for row in own if name != "retention" or row.retention.defined]
-            limits = getattr(mean, name).ci
-            if len(parts) == 1:
-                assert limits == parts[0], name
-            elif parts and (None, None) in parts:
-                assert limits == (None, None), name
-            elif parts:
-                widest = max(high - low for low, high in parts)
-                assert limits[1] - limits[0] > 0.8 * widest / len(parts), name
+        if len(own) == 1:
+            for name in ("success", "backbone", "action", "retention"):
+                assert getattr(mean, name).ci == pytest.approx(getattr(own[0], name).ci), name
+            continue
+        sr, arms = mean.success.sr, [(row.success.sr, *row.success.ci) for row in own]  # type: ignore[misc]
+        below = sqrt(sum((value - low) ** 2 for value, low, _ in arms)) / len(arms)
+        above = sqrt(sum((high - value) ** 2 for value, _, high in arms)) / len(arms)
+        assert mean.success.ci == pytest.approx((sr - below, sr + above))
+        scores = [scores_of(table, row) for row in own]
+        V, t = sum(one.covariance for one in scores) / len(own) ** 2, stats.t.ppf(0.975, 50 * len(own))
+        for at, part in enumerate((mean.action, mean.backbone)):
+            assert part.score is not None
+            wanted = part.score - t * sqrt(V[at, at]), part.score + t * sqrt(V[at, at])
+            assert part.ci == pytest.approx((max(0, wanted[0]), min(1, wanted[1])))
+
+
+def scores_of(table: RetentionTable, row: RetentionRow) -> Scores:
+    found = curve_scores(table.results[row.run.location].curves[row.category, "mean"], suite=row.run.suite)
+    assert found is not None
+    return found.scores
+
+
+def test_limits_of_mean_retention_are_fiellers_for_the_mean_scores(table: RetentionTable) -> None:
+    """All ratios whose numerator minus ratio times denominator is not shown to differ from 0."""
+    for mean in table.means:
+        own = [row for row in table.rows if row.run.location == mean.run.location]
+        scores = [scores_of(table, row) for row in own]
+        V, t = sum(one.covariance for one in scores) / len(own) ** 2, stats.t.ppf(0.975, 50 * len(own))
+        top, bottom = np.mean([one.above for one in scores], axis=0)
+        low, high = mean.retention.ci or (None, None)
+        if bottom - t * sqrt(V[1, 1]) < bottom / 4 or bottom <= 0:
+            assert (low, high) == (None, None)
+            continue
+        assert mean.retention.value == pytest.approx(top / bottom)
+        for ratio in (low, high):
+            assert ratio is not None
+            variance = V[0, 0] - 2 * ratio * V[0, 1] + ratio**2 * V[1, 1]
+            assert abs(top - ratio * bottom) == pytest.approx(t * sqrt(variance))
 
 
 def test_a_mean_of_equal_categories_without_variance_has_a_width(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": PERFECT, "shape": PERFECT})])
     (mean,) = table.means
     low, high = mean.backbone.ci  # type: ignore[misc]
-    assert (mean.backbone.accuracy, high) == (1.0, 1.0)
-    assert table.rows[0].backbone.ci[0] < low < 0.99, "two categories are known better than one"  # type: ignore[index]
+    assert (mean.backbone.score, high) == (1.0, 1.0)
+    assert table.rows[0].backbone.ci[0] < low < 0.995, "two categories are known better than one"  # type: ignore[index,operator]
+
+
+# -- groups that agree ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("value", "count"), [*product([0.0, 0.25, 0.5, 1.0], [1, 2, 12, 150])])
 def test_groups_that_agree_have_an_interval_that_narrows_with_their_number(value: float, count: int) -> None:
-    column = np.full((4 * count, 1), value)
-    low, high = group_bootstrap(column, np.arange(4 * count) // 4, seed=0)
-    fewer_low, fewer_high = group_bootstrap(column[: 2 * count + 2], np.arange(2 * count + 2) // 4, seed=0)
-    assert 0.0 <= low[0] <= value <= high[0] <= 1.0
-    assert 0 < high[0] - low[0] <= fewer_high[0] - fewer_low[0] + 1e-9
-    assert high[0] - low[0] < 4 / count
+    """As many tosses as groups, however many episodes these have."""
+    names = np.repeat([f"g{at:03}" for at in range(count + 1)], 4)
+    found, more = (Share.of(np.full(4 * n, value), names[: 4 * n]).interval() for n in (count, count + 1))
+    assert 0.0 <= found.low <= value <= found.high <= 1.0
+    assert 0 < more.high - more.low < found.high - found.low + 1e-12
+    if count == 1:
+        assert (found.low, found.high) == (0, 1)
+    elif value in (0, 1):
+        exact = stats.binomtest(int(value * count), count).proportion_ci(0.95, "exact")
+        assert (found.low, found.high) == pytest.approx((exact.low, exact.high))
+        assert found.high - found.low < 4 / count
 
 
-def test_a_twin_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
+def test_an_untrained_network_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": PERFECT}, "one"))
-    twin = load_results(probed_run({"color": HOPELESS}, "twin", random_weights=True))
-    for score in add_untrained(results, twin).controls.untrained:
+    untrained = load_results(probed_run({"color": HOPELESS}, "untrained", random_weights=True))
+    scores = add_untrained(results, untrained).controls.untrained
+    assert scores
+    for score in scores:
         assert -1 <= score.ci[0] <= score.difference <= score.ci[1] <= 1
         assert score.ci[1] - score.ci[0] > 1e-3
 
@@ -142,67 +267,67 @@ def test_a_band_of_few_relabellings_is_not_drawn(probed_run: ProbedRun) -> None:
     layer_curve(replace(results, curves=few))
 
 
+# -- ratios --------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(("backbone", "expert"), [(1.0, 1.0), (0.95, 0.75), (0.8, 0.6)])
-@pytest.mark.parametrize("items", [3, 6, 8, 30])
+@pytest.mark.parametrize("items", [3, 4, 6, 8, 30])
 def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
     curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
     expert: float,
 ) -> None:  # fmt: skip
-    curve = curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]])
-    found = measure_retention(curve)
+    found = measure_retention(curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]]))
     assert found is not None
-    drawn = probe_estimates(curve, {}, found, "suite")
-    for kind, interval, fit in (
-        ("debiased", found.interval, found.fit),
-        ("bounded", found.bounded_interval, found.bounded_fit),
-        ("area", found.area_interval, found.area_fit),
-    ):
-        quantile = stdtrit(min(items - 1, 100), 0.975)
-        known = fit.backbone - quantile * fit.covariance[1, 1] ** 0.5 >= fit.backbone / 4 > 0
-        assert interval.bounded == known, kind
-        assert (drawn[f"retention_{kind}"].ci == (None, None)) >= (not known), kind
-        if known:  # four times what the expert alone would allow at the most
-            most = fit.expert + quantile * fit.covariance[0, 0] ** 0.5
-            assert interval.high <= 4 * most / fit.backbone, kind
-        halved = replace(drawn[f"retention_{kind}"], value=0.5)
-        assert ((halved - drawn[f"retention_{kind}"]).ci == (None, None)) >= (not known), kind
+    if items == 3:
+        assert found.streams is None
+        assert not found.interval.bounded
+        return
+    assert found.streams is not None
+    scores = found.streams.scores
+    quantile = stats.t.ppf(0.975, items - 1)
+    (top, bottom), V = scores.above, scores.covariance
+    known = bottom - quantile * sqrt(V[1, 1]) >= bottom / 4 > 0
+    assert found.interval.bounded == known
+    if known:  # four times what the expert alone would allow at the most
+        assert found.interval.high <= 4 * (top + quantile * sqrt(V[0, 0])) / bottom
+    pooled = PooledScores.of([found.streams])
+    assert pooled is not None
+    difference = retention_difference(scores, scores, pooled.covariance_with(pooled)).interval
+    assert difference.bounded == known
 
 
-def test_six_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_mean_and_difference_with_them(
+def test_four_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_difference_with_them(
     curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame]
 ) -> None:
-    few, many = (curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]) for items in (6, 60))
-    scores = [measure_retention(one) for one in (few, many)]
-    estimates = [probe_estimates(one, {}, score, "suite") for one, score in zip((few, many), scores, strict=True)]
-    assert [score.bounded_interval.bounded for score in scores if score] == [False, True]
-    for name in (f"retention_{kind}" for kind in ("debiased", "bounded", "area")):
-        here, there = (found[name] for found in estimates)
-        assert here.value == there.value == 1
-        assert there.ci != (None, None)
-        for unclear in (here, here - there, there - here, average([here, there]), average([here, there]).centred):
-            assert unclear.ci == (None, None), name
+    """Not the mean with a category of many groups: its backbone is known well enough to divide by."""
+    few, many = (
+        curve_scores(curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]), suite="suite") for items in (4, 60)
+    )
+    assert few is not None
+    assert many is not None
+    here, there = retention(few.scores), retention(many.scores)
+    assert here.value == there.value == 1
+    assert (here.interval.bounded, there.interval.bounded) == (False, True)
+    for one, other in ((few, many), (many, few)):
+        assert not retention_difference(one.scores, other.scores).interval.bounded
+    mean = retention(Scores.mean([few.scores, many.scores]))
+    assert mean.interval.bounded
+    assert np.diff([mean.interval.low, mean.interval.high]) > np.diff([there.interval.low, there.interval.high])
 
 
 @pytest.mark.parametrize("right", [3.0, 0.0])
 @pytest.mark.parametrize("groups", [10, 16])
-def test_a_ratio_is_no_better_known_for_one_group_that_is_unlike_the_others(right: float, groups: int) -> None:
+def test_a_score_is_no_better_known_for_one_group_that_is_unlike_the_others(right: float, groups: int) -> None:
     sizes = np.full(groups, 4.0)
-    alike = GroupScores(np.full((3, groups), 4.0), sizes)
+    alike = GroupSums(np.full((3, groups), 4.0), sizes)
     sums = alike.sums.copy()
     sums[:, 0] = right
-    one = GroupScores(sums, sizes)
-    places = [Site("backbone", layer) for layer in range(3)]
-    for fit in (
-        lambda scores: crossfit(scores, scores, 0.5, 0),
-        lambda scores: bounded_fit(scores, scores, (places, places), 0.5, 0),
-        lambda scores: area_fit(scores, scores, 0.5),
-    ):
-        for stream in range(2):
-            least = [
-                (found.expert, found.backbone)[stream] - 1.96 * found.covariance[stream, stream] ** 0.5
-                for found in (fit(one), fit(alike))
-            ]
-            assert least[0] < least[1]
+    streams = [[Stream.of(found, range(3))] * 2 for found in (GroupSums(sums, sizes), alike)]
+    one, same = (crossfit(pair, 0) for pair in streams)
+    for stream in range(2):
+        assert accuracy_interval(one, stream).low < accuracy_interval(same, stream).low
+        known = [Scores.mean([Scores.of(fit)]).accuracy_interval(stream).low for fit in (one, same)]
+        assert known[0] < known[1]
 
 
 def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_never_do(
@@ -211,11 +336,11 @@ def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_nev
     right = outcome_table(32, 0, 0)
     wrong = right.copy()
     wrong.loc[wrong["item_id"] == wrong["item_id"].iloc[0], "outcome"] = "wrong"
-    here, there = (sr_estimate(one, "suite") for one in (right, wrong))
-    same, other = (here - here).ci, (here - there).ci
-    assert same[0] is not None
-    assert same[1] is not None
-    assert other[0] >= same[0]  # type: ignore[operator]
-    assert other[1] >= same[1]  # type: ignore[operator]
-    several = average([here, there])
-    assert there.ci[0] <= several.ci[0] <= here.ci[0]  # type: ignore[operator]
+    here, there = (Rate.pooled([success_share(one, "suite")]) for one in (right, wrong))
+    same, other = here.minus(here).interval, here.minus(there).interval
+    assert same.low < 0 < same.high
+    assert other.low >= same.low
+    assert other.high >= same.high
+    assert there.interval.low < here.interval.low, "a group that is wrong makes nothing surer"
+    several = Rate.pooled([success_share(one, "suite") for one in (right, wrong)])
+    assert there.interval.low < several.interval.low < several.value < several.interval.high

@@ -1,8 +1,10 @@
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from sklearn.metrics import balanced_accuracy_score
 
 from probe_kit.errors import (
     NonFiniteActivationError,
@@ -50,11 +52,29 @@ def test_every_site_has_a_complete_row(planted_run: PlantedRun) -> None:
 
 def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> None:
     run = planted_run()
-    curve = train_probes(run, permutations=10, target="chosen").curves["color", "mean"]
+    results = train_probes(run, permutations=10, target="chosen")
+    curve = results.curves["color", "mean"]
     in_zone = run.episodes[run.episodes["side_placed"] != "none"]
     assert curve.episodes.tolist() == in_zone["episode_id"].tolist()
     assert (curve.labels == (in_zone["side_placed"] == "left")).all()
-    assert curve.chance > 0.5
+    assert curve.labels.mean() != 0.5, "more went to one side"
+    assert (results.scores["chance"] == 0.5).all()
+
+
+def test_scores_are_balanced_between_the_sides(planted_run: PlantedRun) -> None:
+    """Where one side has more episodes, naming it is worth nothing."""
+    results = train_probes(planted_run({PLANTED: 2.0}), permutations=0, target="chosen")
+    curve = results.curves["color", "mean"]
+    left = curve.labels
+    for row in range(len(curve.sites)):
+        shifted = curve.decisions[row].copy()
+        for fold in np.unique(curve.fold_of):
+            trained = left[curve.fold_of != fold]
+            shifted[curve.fold_of == fold] -= np.log(trained.sum() / (~trained).sum())
+        assert results.scores["accuracy"][row] == pytest.approx(balanced_accuracy_score(left, shifted > 0))
+    always_left = replace(curve, decisions=np.full_like(curve.decisions, 9.0))
+    np.testing.assert_allclose(always_left.sums.accuracies, 0.5)
+    assert (always_left.correct.mean(axis=1) == left.mean()).all()
 
 
 def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run: PlantedRun) -> None:

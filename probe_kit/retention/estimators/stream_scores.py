@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.estimates.balanced import CHANCE, balanced_sums
 from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
-from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
+from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, mean_interval, not_surer
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import at_most
@@ -19,8 +18,6 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 
 ACTION, BACKBONE = "action", "backbone"
 """Names of the two streams, in the order of the scores: retention is the first over the second."""
-_NOTHING = 1e-12
-"""A variance below this is the rounding of 0."""
 Limits = tuple[float | None, float | None]
 """A 95 % interval as rows, JSON and data frames hold it; (None, None) where the data set no limits."""
 
@@ -113,12 +110,10 @@ class Rate:
 
     def minus(self, other: "Rate") -> "Rate":
         """The difference, paired where both are of the same groups."""
-        correlation = 0.0
-        if self.share is not None and other.share is not None and self.paired_with(other):
-            variances = self.share.variance, other.share.variance
-            shared = _not_surer(self.share.covariance(other.share), variances, self.share.groups.size, 1.0)
-            correlation = _correlation(shared, variances)
-        gap = difference_interval(self.value, self.interval, other.value, other.interval, correlation)
+        if self.share is not None and other.share is not None:
+            gap = self.share.difference(other.share)
+        else:
+            gap = difference_interval(self.value, self.interval, other.value, other.interval)
         return Rate(self.value - other.value, gap)
 
     def paired_with(self, other: "Rate") -> bool:
@@ -169,7 +164,7 @@ class PooledScores:
         for name in set(self.names) & set(other.names):
             row, column = self.names.index(name), other.names.index(name)
             variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
-            between[row, column] = _not_surer(between[row, column], variances, self.fit.n_groups, CHANCE)
+            between[row, column] = not_surer(between[row, column], variances, self.fit.n_groups, CHANCE)
         return between
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
@@ -177,25 +172,9 @@ class PooledScores:
         here, there = self.accuracy(name), other.accuracy(name)
         row, column = self.names.index(name), other.names.index(name)
         variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
-        correlation = _correlation(float(self.covariance_with(other)[row, column]), variances)
-        gap = difference_interval(here.value, here.interval, there.value, there.interval, correlation)
+        related = correlation_of(float(self.covariance_with(other)[row, column]), variances)
+        gap = difference_interval(here.value, here.interval, there.value, there.interval, related)
         return Rate(here.value - there.value, gap)
-
-
-def _not_surer(covariance: float, variances: tuple[float, float], n_groups: int, most: float) -> float:
-    """The covariance of two estimates on the same groups, less where their difference would be known too well.
-
-    Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most`
-    each, with t² = 2 / ((G + 1)(G + 2)) on average, see `CrossFit.covariance`.
-    """
-    unseen = 2 * most**2 / ((n_groups + 1) * (n_groups + 2))
-    return min(covariance, max(0.0, (sum(variances) - unseen) / 2))
-
-
-def _correlation(covariance: float, variances: tuple[float, float]) -> float:
-    """0 where one of them does not vary, or is of a single group."""
-    scale = sqrt(variances[0] * variances[1]) if all(map(isfinite, variances)) else 0.0
-    return float(np.clip(covariance / scale, -1, 1)) if scale > _NOTHING else 0.0
 
 
 def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:

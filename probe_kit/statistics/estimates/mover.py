@@ -4,13 +4,15 @@ Zou and Donner, “Construction of confidence limits about effect measures”, S
 """
 
 from collections.abc import Sequence
-from math import inf, sqrt
+from math import inf, isfinite, sqrt
 from statistics import fmean
 
 from probe_kit.errors import UsageError
 from probe_kit.statistics.fieller import Interval
 
 NO_LIMITS = Interval(-inf, inf)
+_NOTHING = 1e-12
+"""A variance below this is the rounding of 0."""
 
 
 def difference_interval(
@@ -47,6 +49,23 @@ def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interv
     above = sqrt(sum((interval.high - value) ** 2 for value, interval in pairs)) / len(pairs)
     middle = fmean(values)
     return Interval(middle - below, middle + above)
+
+
+def not_surer(covariance: float, variances: tuple[float, float], n_groups: int, most: float) -> float:
+    """The covariance of two estimates on the same groups, less where their difference would be known too well.
+
+    Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most`
+    each. As in `CrossFit.covariance` t² is 2 / ((G + 1)(G + 2)) on average, and the variance of the difference is
+    at least t² · most².
+    """
+    unseen = 2 * most**2 / ((n_groups + 1) * (n_groups + 2))
+    return min(covariance, max(0.0, (sum(variances) - unseen) / 2))
+
+
+def correlation_of(covariance: float, variances: tuple[float, float]) -> float:
+    """Correlation of two estimates; 0 where one of them does not vary, or is of a single group."""
+    scale = sqrt(variances[0] * variances[1]) if all(map(isfinite, variances)) else 0.0
+    return max(-1.0, min(1.0, covariance / scale)) if scale > _NOTHING else 0.0
 
 
 def _combined(first: float, second: float, correlation: float) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, not_surer
 from probe_kit.statistics.fieller import Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -97,6 +98,18 @@ class Share:
             return 0.0
         scale = sqrt(self.variance * other.variance)
         return float(np.clip(self.covariance(other) / scale, -1, 1)) if scale > _NOTHING else 0.0
+
+    def difference(self, other: "Share") -> Interval:
+        """95 % interval of this share minus another (MOVER), paired where both are of the same groups.
+
+        Where the two agree in all groups it leaves room for unseen ones, see `not_surer`.
+        """
+        related = 0.0
+        if np.array_equal(self.groups, other.groups):
+            variances = self.variance, other.variance
+            shared = not_surer(self.covariance(other), variances, self.groups.size, 1.0)
+            related = correlation_of(shared, variances)
+        return difference_interval(self.value, self.interval(), other.value, other.interval(), related)
 
     def interval(self) -> Interval:
         """95 % interval by `share_interval`; 0 to 1 with a single group."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.mover import difference_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
@@ -218,8 +217,5 @@ def _gain_limits(
     here: NDArray[np.float64], there: NDArray[np.float64], groups: NDArray[np.str_]
 ) -> tuple[float, float]:
     """95 % interval of the difference of two accuracies on the same episodes."""
-    mine, theirs = Share.of(here, groups), Share.of(there, groups)
-    gap = difference_interval(
-        mine.value, mine.interval(), theirs.value, theirs.interval(), mine.correlation(theirs)
-    )
+    gap = Share.of(here, groups).difference(Share.of(there, groups))
     return gap.low, gap.high

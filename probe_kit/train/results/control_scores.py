@@ -143,7 +143,7 @@ _FORMER_WORDS = {
     "twin": "untrained",
     "twin_site": "untrained_site",
     "twin_accuracy": "untrained_accuracy",
-    "random-features": "random-features",
+    "binding": "random-features",
 }
 
 

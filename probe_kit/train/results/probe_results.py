@@ -68,7 +68,7 @@ class ProbeResults:
         fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are consistent
         within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`: no p-value
         can be lower with so many relabellings. `exceeds_random_features`, `exceeds_untrained`: whether the site
-        is better than that control, missing where it was not run; `has_signal`: than chance, family-wise, and
+        is better than that control, missing where it was not run; `signal`: than chance, family-wise, and
         every control that was run.
         """
         import pandas as pd

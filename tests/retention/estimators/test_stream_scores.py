@@ -232,15 +232,15 @@ def test_only_streams_that_all_runs_have_are_pooled(
 
 
 def test_a_run_minus_its_equal_is_nothing_in_every_number_and_narrow(scored: Callable[..., StreamScores]) -> None:
-    """In 60 groups, scores may differ by what a share of 6 % without anything would cost."""
+    """Of 60 groups that all agree, 6 % would not have been missed in which one run knows all and one nothing."""
     one = pooled(scored([0.5, 0.85], [[0.6, 0.75]]))
-    for name, above in zip(one.names, one.scores.above, strict=True):
+    most = (1 - 0.025 ** (1 / 60)) / 2
+    for name in one.names:
         gap = one.accuracy_difference(one, name)
         assert gap.value == 0
-        most = stats.t.ppf(0.975, 50) * sqrt(2 * above**2 / (61 * 62))
         assert 0.7 * most < min(gap.interval.high, -gap.interval.low), name
         own = one.accuracy(name).interval
-        assert gap.interval.high - gap.interval.low < 0.4 * (own.high - own.low), name
+        assert gap.interval.high - gap.interval.low < 0.5 * (own.high - own.low), name
     ratio, own = retention_difference(one.scores, one.scores, one.covariance_with(one)), retention(one.scores)
     assert ratio.value == 0
     assert 0.01 < ratio.interval.high < 0.35 * (own.interval.high - own.interval.low)

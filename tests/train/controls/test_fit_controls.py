@@ -47,8 +47,8 @@ def test_controls_are_added_to_stored_probes_without_fitting_those_again(planted
     assert "instruction" in again.controls.of_category("color")
 
 
-def test_the_twin_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -> None:
-    trained, untrained = planted_run({PLANTED: 2.0}), named(planted_run(), "twin", random_weights=True)
+def test_the_untrained_network_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -> None:
+    trained, untrained = planted_run({PLANTED: 2.0}), named(planted_run(), "random", random_weights=True)
     results = train_probes(trained, permutations=5, untrained=untrained)
     accuracy = results.curves["color", "mean"].correct.mean(axis=1)
     others = load_results(untrained).curves["color", "mean"].correct.mean(axis=1)
@@ -60,18 +60,18 @@ def test_the_twin_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -
     assert sites[2].ci[0] < 0.0 < sites[2].ci[1] < 0.15, "20 groups that agree are no certainty"
     peak = results.controls.untrained_peak("color", "mean", "backbone")
     assert peak is not None
-    assert (peak.site, peak.untrained) == (str(PLANTED), "twin (random weights)")
+    assert (peak.site, peak.untrained) == (str(PLANTED), "random (random weights)")
     assert peak.difference == pytest.approx(accuracy.max() - others[:5].max())
 
 
-def test_a_twin_of_other_episodes_is_refused(planted_run: PlantedRun) -> None:
+def test_an_untrained_network_of_other_episodes_is_refused(planted_run: PlantedRun) -> None:
     run = planted_run()
     episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
     with pytest.raises(UsageError, match="not the same"):
-        train_probes(run, permutations=0, untrained=named(run, "twin", episodes=episodes))
+        train_probes(run, permutations=0, untrained=named(run, "random", episodes=episodes))
 
 
-def test_a_twin_of_other_episodes_costs_no_work(planted_run: PlantedRun) -> None:
+def test_an_untrained_network_of_other_episodes_costs_no_work(planted_run: PlantedRun) -> None:
     run = planted_run()
     episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
     done: list[int] = []
@@ -79,26 +79,26 @@ def test_a_twin_of_other_episodes_costs_no_work(planted_run: PlantedRun) -> None
         train_probes(
             run,
             permutations=0,
-            untrained=named(run, "twin", episodes=episodes),
+            untrained=named(run, "random", episodes=episodes),
             progress=lambda *at: done.append(at[0]),
         )
     assert not done
 
 
-def test_a_run_is_not_its_own_twin(planted_run: PlantedRun) -> None:
+def test_a_run_is_not_its_own_untrained_control(planted_run: PlantedRun) -> None:
     run = planted_run()
     with pytest.raises(UsageError, match="its own untrained control"):
         train_probes(run, permutations=0, untrained=run)
 
 
-def test_the_probes_of_a_twin_are_read_only_where_nobody_asked_for_others(planted_run: PlantedRun) -> None:
-    run, twin = planted_run({PLANTED: 2.0}), named(planted_run(), "twin", random_weights=True)
-    own = train_probes(twin, permutations=3)
-    with_untrained = train_probes(run, permutations=2, untrained=twin)
-    assert load_results(twin).key == own.key
+def test_the_probes_of_an_untrained_network_are_read_only_where_nobody_asked_for_others(planted_run: PlantedRun) -> None:
+    run, control = planted_run({PLANTED: 2.0}), named(planted_run(), "random", random_weights=True)
+    own = train_probes(control, permutations=3)
+    with_untrained = train_probes(run, permutations=2, untrained=control)
+    assert load_results(control).key == own.key
     assert with_untrained.settings.permutations == 2
-    assert {probes.state for probes in inventory(twin).probes} == {"used", "other"}
-    other = named(planted_run(), "other twin", random_weights=True)
+    assert {probes.state for probes in inventory(control).probes} == {"used", "other"}
+    other = named(planted_run(), "other random", random_weights=True)
     train_probes(run, permutations=2, untrained=other)
     assert load_results(other).settings.permutations == 2
 

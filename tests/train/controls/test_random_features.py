@@ -1,4 +1,4 @@
-"""The control that a random network must not beat, and that a network which knows must."""
+"""The control that a random network must not exceed, and that a network which knows must."""
 
 from pathlib import Path
 
@@ -44,14 +44,14 @@ def probed(suite: Suite, path: Path, knowledge: float = 0.0) -> ProbeResults:
     return train_probes(run, permutations=39, controls=("random-features",), suite=suite.folder)
 
 
-def test_a_random_network_is_no_better_than_binding(suite: Suite, tmp_path: Path) -> None:
+def test_a_random_network_does_not_exceed_random_features(suite: Suite, tmp_path: Path) -> None:
     scores = probed(suite, tmp_path / "random").scores
     assert not scores["exceeds_random_features"].any()
     assert not scores["signal"].any()
     assert scores["exceeds_untrained"].isna().all()
 
 
-def test_a_network_that_knows_the_answer_is_better_than_binding(suite: Suite, tmp_path: Path) -> None:
+def test_a_network_that_knows_the_answer_exceeds_random_features(suite: Suite, tmp_path: Path) -> None:
     results = probed(suite, tmp_path / "knowing", knowledge=1.5)
     best = results.scores.loc[results.scores["accuracy"].idxmax()]
     assert best["exceeds_random_features"]

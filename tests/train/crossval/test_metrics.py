@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 from sklearn import metrics
 
-from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.metrics import balanced_accuracy, chance_level, fold_auc, log_loss
 
@@ -33,26 +34,32 @@ def test_chance_is_the_larger_class() -> None:
     assert chance_level(np.array([True, False, False, False])) == 0.75
 
 
+def limits(right: NDArray[np.bool_], groups: NDArray[np.int64]) -> tuple[float, float]:
+    found = Share.of(right, groups).interval()
+    return found.low, found.high
+
+
 def test_interval_widens_when_episodes_of_a_group_agree() -> None:
-    right = np.repeat(GENERATOR.random(50) < 0.6, 4)[:, None]
-    low, high = group_bootstrap(right, np.arange(200) // 4, seed=0)
-    low_ungrouped, high_ungrouped = group_bootstrap(right, np.arange(200), seed=0)
-    assert high - low == pytest.approx(2 * (high_ungrouped - low_ungrouped), rel=0.15)
+    right = np.repeat(GENERATOR.random(50) < 0.6, 4)
+    grouped, apart = (np.diff(limits(right, groups))[0] for groups in (np.arange(200) // 4, np.arange(200)))
+    assert grouped == pytest.approx(2 * apart, rel=0.15)
 
 
 def test_an_interval_where_all_agree_is_that_of_clopper_and_pearson_over_groups() -> None:
-    right = np.array([[True, False, True], [True, False, False]]).repeat(20, axis=0)
-    low, high = group_bootstrap(right, np.arange(40) // 4, seed=0)
+    groups = np.arange(40) // 4
     exact = binomtest(10, 10).proportion_ci()
-    assert (low[0], high[0]) == (pytest.approx(exact.low, abs=1e-4), 1.0)
-    assert (low[1], high[1]) == (0.0, pytest.approx(1 - exact.low, abs=1e-4))
-    assert 0.0 < low[2] < high[2] < 1.0
+    assert limits(np.ones(40, bool), groups) == pytest.approx((exact.low, 1.0))
+    assert limits(np.zeros(40, bool), groups) == pytest.approx((0.0, 1 - exact.low))
+    low, high = limits(np.arange(40) < 20, groups)
+    assert 0.0 < low < 0.5 < high < 1.0
 
 
-def test_interval_covers_the_truth_nineteen_times_in_twenty() -> None:
+@pytest.mark.parametrize("alike", [False, True], ids=["episodes apart", "groups of four alike"])
+def test_interval_covers_the_truth_nineteen_times_in_twenty(alike: bool) -> None:
     covered = []
-    for draw in range(300):
-        right = np.random.default_rng(draw).random((200, 1)) < 0.7
-        low, high = group_bootstrap(right, np.arange(200), seed=draw, draws=500)
-        covered.append(low[0] <= 0.7 <= high[0])
-    assert 0.92 <= np.mean(covered) <= 0.98
+    for draw in range(400):
+        generator = np.random.default_rng(draw)
+        right = np.repeat(generator.random(50) < 0.7, 4) if alike else generator.random(200) < 0.7
+        low, high = limits(right, np.arange(200) // 4)
+        covered.append(low <= 0.7 <= high)
+    assert 0.92 <= np.mean(covered) <= 0.99

@@ -8,7 +8,7 @@ def baseline(name: str, p: float | None = 0.5, accuracy: float = 0.5) -> Baselin
     return BaselineScore(name, "color", accuracy, (0.4, 0.6), p, 0.5, 80)
 
 
-def twin(site: str, peak: bool) -> UntrainedScore:
+def untrained(site: str, peak: bool) -> UntrainedScore:
     return UntrainedScore("color", "mean", site, site, peak, 0.9, 0.5, 0.4, (0.3, 0.5), "tiny (random weights)")
 
 
@@ -18,8 +18,8 @@ def test_above_chance_means_a_small_p() -> None:
     assert not baseline("pixels", None).above_chance
 
 
-def test_a_newer_baseline_replaces_an_older_one_and_keeps_the_twin() -> None:
-    controls = Controls((baseline("pixels"), baseline("position")), (twin("backbone.01.residual", True),))
+def test_a_newer_baseline_replaces_an_older_one_and_keeps_the_untrained_network() -> None:
+    controls = Controls((baseline("pixels"), baseline("position")), (untrained("backbone.01.residual", True),))
     merged = controls.with_baselines([baseline("pixels", accuracy=0.9)])
     assert {name: score.accuracy for name, score in merged.of_category("color").items()} == {
         "pixels": 0.9,
@@ -29,18 +29,18 @@ def test_a_newer_baseline_replaces_an_older_one_and_keeps_the_twin() -> None:
     assert merged.of_category("shape") == {}
 
 
-def test_the_twin_of_a_stream_is_its_peak() -> None:
+def test_the_untrained_network_of_a_stream_is_its_peak() -> None:
     scores = [
-        twin("backbone.01.residual", False),
-        twin("expert.00.residual@1", True),
-        twin("backbone.03.residual", True),
+        untrained("backbone.01.residual", False),
+        untrained("expert.00.residual@1", True),
+        untrained("backbone.03.residual", True),
     ]
     controls = Controls().with_untrained(scores)
     assert controls.untrained_peak("color", "mean", "backbone") == scores[2]
     assert controls.untrained_peak("color", "last", "backbone") is None
 
 
-def test_signal_must_beat_every_control_that_was_run() -> None:
+def test_a_signal_must_exceed_every_control_that_was_run() -> None:
     site = "backbone.01.residual"
     controls = Controls().with_excess([ControlComparison("random-features", "color", "mean", site, 0.6, 0.2)])
     assert controls.exceeds("color", "mean", site, 0.001) == {
@@ -64,5 +64,26 @@ def test_signal_must_beat_every_control_that_was_run() -> None:
 
 def test_json_gives_the_same_controls_back() -> None:
     excess = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.6, 0.2)
-    controls = Controls((baseline("pixels", None),), (twin("backbone.01.residual", True),), (excess,))
+    controls = Controls((baseline("pixels", None),), (untrained("backbone.01.residual", True),), (excess,))
     assert Controls.from_json(json.loads(json.dumps(controls.to_json()))) == controls
+
+
+def test_controls_of_former_versions_are_read_under_the_names_of_today() -> None:
+    excess = ControlComparison("random-features", "color", "mean", "backbone.01.residual", 0.6, 0.2)
+    other = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.5, 0.01)
+    today = Controls(
+        (baseline("random-features"), baseline("pixels")), (untrained("backbone.01.residual", True),), (excess, other)
+    )
+    former = json.dumps(today.to_json())
+    for now, before in (
+        ('"random-features"', '"binding"'),
+        ('"control": "untrained"', '"control": "twin"'),
+        ('"untrained": [', '"twin": ['),
+        ('"untrained": "', '"twin": "'),
+        ("untrained_site", "twin_site"),
+        ("untrained_accuracy", "twin_accuracy"),
+    ):
+        assert now in former
+        former = former.replace(now, before)
+    assert "untrained" not in former
+    assert Controls.from_json(json.loads(former)) == today

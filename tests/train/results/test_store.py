@@ -1,6 +1,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,23 @@ def test_stored_results_equal_the_fitted_ones(planted_run: PlantedRun) -> None:
     assert stored.settings == fitted.settings
     pd.testing.assert_frame_equal(stored.scores, fitted.scores)
     for pair, curve in fitted.curves.items():
-        for name, value in vars(curve).items():
-            np.testing.assert_array_equal(getattr(stored.curves[pair], name), value)
+        for member in fields(curve):
+            np.testing.assert_array_equal(
+                getattr(stored.curves[pair], member.name), getattr(curve, member.name), member.name
+            )
+
+
+def test_probes_that_were_read_can_be_stored_again(planted_run: PlantedRun) -> None:
+    """What a curve has computed of itself is not part of it."""
+    run = planted_run()
+    fitted = train_probes(run, permutations=1)
+    stored = load_results(run, fitted.key)
+    assert len(stored.scores) == len(stored.curves["color", "mean"].sums.accuracies)
+    again = replace(stored, settings=replace(stored.settings, seed=1))
+    assert len(again.scores) == len(stored.scores)
+    save_results(again, run.path)
+    read = load_results(run, again.key)
+    np.testing.assert_array_equal(read.curves["color", "mean"].decisions, stored.curves["color", "mean"].decisions)
 
 
 def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun) -> None:
