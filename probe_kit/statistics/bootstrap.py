@@ -70,22 +70,6 @@ def _sums(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -
     return sums, np.bincount(group_of).astype(np.float64)
 
 
-def bootstrap_ratios(
-    values: NDArray[np.floating], weights: NDArray[np.floating], groups: ArrayLike, seed: int, draws: int = DRAWS
-) -> Matrix:
-    """A conditional share in every draw of whole groups: (draws,) sums of values over sums of weights, (E,) each.
-
-    values: at most the weights. NaN in a draw without weight.
-    """
-    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
-    tops, bottoms = (np.bincount(group_of, part, names.size) for part in (values, weights))
-    times = draw_groups(names.size, seed, draws)
-    below = (times @ bottoms).astype(np.float64)
-    ratios: Matrix = np.full(draws, np.nan)
-    np.divide(times @ tops, below, where=below > 0, out=ratios)
-    return ratios
-
-
 def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bounds = SHARES) -> Matrix:
     """(B, S) draws, of which no quantile lies nearer to the (S,) `value` than that of `unseen` groups.
 

@@ -66,13 +66,3 @@ def t_quantile(df: float, tail: float = TAIL) -> float:
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
     return float(stdtrit(df, 1 - tail))
-
-
-def accuracy_correlation(first: Scores, second: Scores, between: Matrix, row: int) -> float:
-    """Correlation of one stream's accuracy in two runs on the same groups, for `difference_interval`.
-
-    between: (K, K) covariance of the first run's scores with the second's, as `CrossFit.covariance_with` gives it;
-    of means over n categories their sum over n². 0 where one of the two does not vary.
-    """
-    scale = sqrt(first.covariance[row, row] * second.covariance[row, row])
-    return float(np.clip(between[row, row] / scale, -1, 1)) if scale > 0 else 0.0

@@ -14,12 +14,6 @@ def correctness(decisions: Matrix, labels: NDArray[np.bool_]) -> NDArray[np.bool
     return right
 
 
-def balanced_accuracy(decisions: Matrix, labels: NDArray[np.bool_]) -> float:
-    """Mean of the two classes' accuracies, for (E,) decisions."""
-    right = correctness(decisions, labels)
-    return float((right[labels].mean() + right[~labels].mean()) / 2)
-
-
 def log_loss(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
     """Mean of −log P(label), in nats, over the first axis."""
     loss: Matrix = np.logaddexp(0.0, np.where(labels, -decisions, decisions)).mean(axis=0)

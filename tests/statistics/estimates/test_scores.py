@@ -5,7 +5,7 @@ from scipy.stats import t
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
 from probe_kit.statistics.estimates.crossfit import Stream, crossfit
-from probe_kit.statistics.estimates.scores import Scores, accuracy_correlation, accuracy_interval, t_quantile
+from probe_kit.statistics.estimates.scores import Scores, accuracy_interval, t_quantile
 
 
 def stream(share: float, groups: int, seed: int = 0) -> Stream:
@@ -61,16 +61,3 @@ def test_no_categories_have_no_mean() -> None:
 def test_quantiles_are_students(df: int) -> None:
     assert t_quantile(df) == pytest.approx(t.ppf(0.975, df))
     assert t_quantile(df, 0.05) == pytest.approx(t.ppf(0.95, df))
-
-
-def test_accuracies_of_two_runs_are_correlated_as_their_halves_are() -> None:
-    one, other = crossfit([stream(0.7, 40, seed=1)], 5), crossfit([stream(0.7, 40, seed=2)], 5)
-    scores = Scores.of(one), Scores.of(other)
-    assert accuracy_correlation(scores[0], scores[0], one.covariance_with(one), 0) == pytest.approx(1)
-    found = accuracy_correlation(scores[0], scores[1], one.covariance_with(other), 0)
-    cosine = one.differences[0] @ other.differences[0]
-    cosine /= np.linalg.norm(one.differences[0]) * np.linalg.norm(other.differences[0])
-    assert found == pytest.approx(cosine)
-    assert abs(found) < 0.5, "independent runs"
-    nothing = Scores(np.zeros(1), np.zeros((1, 1)), 11)
-    assert accuracy_correlation(nothing, scores[0], np.zeros((1, 1)), 0) == 0
