@@ -20,6 +20,7 @@ from probe_kit.retention.columns.text import (
     difference_interval,
     difference_test,
     exceeds_text,
+    models_test,
     number,
     p_text,
     percent,
@@ -158,6 +159,25 @@ DIFFERENCE_P = Column(
     text=lambda _: "",
     sort=lambda _: None,
     difference=difference_test,
+)
+_MODELS = (
+    "Of a difference between groups of models: exact p of exchanging the models' labels, the model as the unit. "
+    "In brackets the least p that so few models allow, and Welch's 95 % interval over models. All other numbers of "
+    "the row are of these models on other items."
+)
+SR_MODELS = Column(
+    key="difference.sr_models",
+    heading="p over models (least)",
+    help=_MODELS,
+    text=lambda _: "",
+    sort=lambda _: None,
+    difference=lambda row: models_test(row.sr_models, 100, 1),
+)
+RETENTION_MODELS = replace(
+    SR_MODELS,
+    key="difference.retention_models",
+    heading="retention, p over models (least)",
+    difference=lambda row: models_test(row.retention_models, 1, 2),
 )
 MARGIN = share(
     "success.chance_margin",
@@ -555,7 +575,7 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
     "Success rate": (
         ColumnGroup(
             "Does it act on the answer?",
-            (SR, DIFFERENCE_P, MARGIN, PAPER_MARGIN, REGIME, LEFT, RIGHT),
+            (SR, SR_MODELS, DIFFERENCE_P, MARGIN, PAPER_MARGIN, REGIME, LEFT, RIGHT),
         ),
         ColumnGroup("Where the cube ended", (WRONG, OUTSIDE, NEVER_MOVED, INVALID_ACTION)),
         ColumnGroup("With the two pictures swapped", (FOLLOWS, USED), section="interventions"),
@@ -563,12 +583,14 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
         ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
     ),
     "Accuracy of answers": (
-        ColumnGroup("Does it know the answer?", (ACCURACY, DIFFERENCE_P, MARGIN, REGIME, LEFT, RIGHT)),
+        ColumnGroup("Does it know the answer?", (ACCURACY, SR_MODELS, DIFFERENCE_P, MARGIN, REGIME, LEFT, RIGHT)),
         ColumnGroup("How it answered", ANSWERS, section="answers"),
         ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
     ),
     "Retention": (
-        ColumnGroup("What is retained", (RETENTION, PUBLISHED, PROBE_MINUS_SR), section="retention"),
+        ColumnGroup(
+            "What is retained", (RETENTION, RETENTION_MODELS, PUBLISHED, PROBE_MINUS_SR), section="retention"
+        ),
         ColumnGroup(
             "In the backbone", (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS), section="probes"
         ),

@@ -13,12 +13,12 @@ TERMS = {
         "picture, in episodes and questions it was not fitted on."
     ),
     "n/a": (
-        "The backbone's best layer does not beat chance and every control that was run, so there is nothing "
-        "that could be retained."
+        "The backbone's signal is not shown: its best layer is not shown to exceed chance and every control that "
+        "was run. So there may be nothing to retain."
     ),
     "A − B": (
-        "Difference of two runs on the same questions: of both the same groups of questions are drawn, over "
-        "and over, and the interval holds 95 % of what that gives. Zero inside it: they may be equal."
+        "Difference of two runs on the same questions, which count as pairs, with its 95 % interval. Zero inside "
+        "it: they may be equal."
     ),
     "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),
 }

@@ -12,6 +12,7 @@ from probe_kit.retention.columns.text import (
     is_vlm,
     model_name,
     number,
+    p_text,
     percent,
     ratio_difference,
     with_limits,
@@ -27,12 +28,14 @@ CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, no
 """A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
-LEGEND = (
-    "VLM: share of its answers that are right. Backbone, action: accuracy of probes in the policy's backbone and "
-    "where its action is made, at sites that other questions chose. Success: the cube ends on the right "
-    "picture. "
-    f"{MARK} above every control that was run. Retention: share of the backbone's signal left in the action"
-)
+_LEGENDS = {
+    "VLM %": "VLM: share of its answers that are right",
+    "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
+    "action %": "Action: the same at the action's sites",
+    "success %": "Success: the cube ends on the right picture",
+    "retention": "Retention: share of the backbone's signal left in the action",
+}
+"""What a column shows."""
 
 
 def verdict(row: RetentionRow) -> CategoryVerdict:
@@ -235,9 +238,10 @@ def summary_table(
     headings = ("category", "run", *HEADINGS)
     shown = [at for at in range(len(headings)) if at == 0 or (several and at == 1)]
     shown += [at for at in range(2, len(headings)) if any(line[at] not in ("–", "") for line in lines)]
+    legend = [_LEGENDS[headings[at]] for at in shown if headings[at] in _LEGENDS]
     return TextTable(
         f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
-        LEGEND,
+        ". ".join([*legend, f"{MARK} above every control that was run"]),
         tuple(headings[at] for at in shown),
         tuple(tuple(line[at] for at in shown) for line in lines),
     )
@@ -255,8 +259,15 @@ def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:
             )
         ),
         ratio_difference(row.retention, row.retention_ci if intervals else None),
-        "" if row.p is None else f"p {difference_test(row)}",
+        _difference_p(row),
     )
+
+
+def _difference_p(row: Difference) -> str:
+    """Over models where a side is a group of several, else over items."""
+    if row.sr_models is not None:
+        return f"over models p {p_text(row.sr_models.p)} (least {p_text(row.sr_models.smallest_p)})"
+    return "" if row.p is None else f"p {difference_test(row)}"
 
 
 def _name(category: str) -> str:

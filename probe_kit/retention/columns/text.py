@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.differences import Difference, ModelTest
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
@@ -161,6 +161,14 @@ def ratio_difference(value: float | None, limits: Limits | None) -> str:
 def difference_test(row: Difference) -> str:
     """p of a difference of success rates, and corrected by Holm."""
     return "" if row.p is None else f"{p_text(row.p)} ({p_text(row.p_holm)})"
+
+
+def models_test(test: ModelTest | None, scale: float, digits: int) -> str:
+    """p over models, the least possible one, and Welch's interval; empty without groups of models."""
+    if test is None:
+        return ""
+    limits = with_limits("", test.ci, lambda value: f"{scale * (value or 0):+.{digits}f}").strip()
+    return f"{p_text(test.p)} ({p_text(test.smallest_p)}) {limits}"
 
 
 def p_text(value: float | None) -> str:
