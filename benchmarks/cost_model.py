@@ -45,9 +45,7 @@ class Input:
 
 INPUTS = {
     "episodes": Input(3440, "per model", "the paper's suite: 1,720 questions in two layouts"),
-    "models": Input(
-        7, "checkpoints", "the paper's count is larger where co-trained twins are added; an assumption"
-    ),
+    "models": Input(7, "checkpoints", "the paper also has co-trained variants; an assumption"),
     "calls": Input(12, "inferences per episode", "60 actions, 5 executed per inference; families differ"),
     "inference": Input(0.3, "s on a GPU", "NOT MEASURED here (no GPU): an assumption, pass your own"),
     "simulate": Input(0.25, "CPU-s per episode", "benchmarks/env.py speed: 60 actions, a picture every fifth"),

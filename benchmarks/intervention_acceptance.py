@@ -59,10 +59,10 @@ class Trial:
         return run_intervention(self.run, asked, self.source)
 
 
-def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, twin: Run | None) -> Run:
+def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, untrained: Run | None) -> Run:
     """The organism's episodes, probes and `follow`; what `demo --compare` made of the same suite is reused."""
     shorter = organism if steps is None else replace(organism, max_steps=steps)
-    run, _ = probed(shorter, suite, folder, PERMUTATIONS, lambda _: lambda *_: None, twin)
+    run, _ = probed(shorter, suite, folder, PERMUTATIONS, lambda _: lambda *_: None, untrained)
     return run
 
 
@@ -217,9 +217,10 @@ def main() -> int:
     arguments = parser.parse_args()
     truth = dict(TRAINED.truth)
     suite = build_suite(arguments.folder / "suite", [*truth, ABSENT], arguments.items, seed=arguments.seed)
-    twin = acted(UNTRAINED_NETWORK, suite, arguments.folder, arguments.steps, None)
+    folder, steps = arguments.folder, arguments.steps
+    untrained = acted(UNTRAINED_NETWORK, suite, folder, steps, None)
     runs = [
-        (one, twin if one == UNTRAINED_NETWORK else acted(one, suite, arguments.folder, arguments.steps, twin))
+        (one, untrained if one == UNTRAINED_NETWORK else acted(one, suite, folder, steps, untrained))
         for one in ORGANISMS
     ]
     run = dict(runs)[TRAINED]

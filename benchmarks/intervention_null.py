@@ -1,7 +1,7 @@
 """False alarms: how often is something found in policies that know nothing, or with shuffled labels?
 
-    python benchmarks/intervention_null.py FOLDER [--twins 50] [--inside 10] [--items 12] [--categories …]
-                                           [--shuffles 100] [--model pi0-tiny]
+    python benchmarks/intervention_null.py FOLDER [--networks 50] [--inside 10] [--items 12] [--categories …]
+                                              [--shuffles 100] [--model pi0-tiny]
 
 Untrained networks of a policy, each with weights of its own, infer on the first frames of a drawn suite, drawn
 once: `follow` for all of them, an interchange at every backbone layer and role for the first `--inside`. Labels
@@ -119,17 +119,17 @@ def report(title: str, counts: dict[str, Count]) -> None:
             print(f"  {name:45} {found}")
 
 
-def measure(frames: Frames, model: str, folder: Path, twins: Iterable[int], inside: int, shuffles: int) -> None:
+def measure(frames: Frames, model: str, folder: Path, networks: Iterable[int], inside: int, shuffles: int) -> None:
     """Make what is missing, and count."""
-    of_twins, of_shuffles = ({name: Count() for name in NAMES} for _ in range(2))
+    of_networks, of_shuffles = ({name: Count() for name in NAMES} for _ in range(2))
     suite = frames.run.suite
-    for seed in twins:
+    for seed in networks:
         policy = load_policy(model, random_weights=True, weights_seed=seed)
-        count_outside(frames.answers(policy, ImageSwap(), folder / f"follow-{seed}.npz"), suite, of_twins)
+        count_outside(frames.answers(policy, ImageSwap(), folder / f"follow-{seed}.npz"), suite, of_networks)
         if seed < inside:
             found = frames.answers(policy, Interchange(), folder / f"interchange-{seed}.npz")
-            count_inside(found, suite, of_twins)
-        print(f"twin {seed}: {of_twins[NAMES[0]]}; {of_twins[NAMES[2]]}", flush=True)
+            count_inside(found, suite, of_networks)
+        print(f"network {seed}: {of_networks[NAMES[0]]}; {of_networks[NAMES[2]]}", flush=True)
     trained = load_policy(model)
     outside = frames.answers(trained, ImageSwap(), folder / "follow-trained.npz")
     within = frames.answers(trained, Interchange(), folder / "interchange-trained.npz")
@@ -137,7 +137,7 @@ def measure(frames: Frames, model: str, folder: Path, twins: Iterable[int], insi
         draw = np.random.default_rng(number)
         count_outside(shuffled(outside, draw), suite, of_shuffles)
         count_inside(shuffled(within, draw), suite, of_shuffles)
-    report("untrained networks", of_twins)
+    report("untrained networks", of_networks)
     report("the trained policy, labels shuffled by item", of_shuffles)
 
 
@@ -145,7 +145,7 @@ def main() -> None:
     """Draw the frames and measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--twins", type=int, default=50)
+    parser.add_argument("--networks", type=int, default=50)
     parser.add_argument("--inside", type=int, default=10)
     parser.add_argument("--items", type=int, default=12)
     parser.add_argument("--categories", default="color,shape,state,counting")
@@ -158,9 +158,8 @@ def main() -> None:
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
         questions = [replace(one, stored=None) for item in items for one in bench.replay_inputs(item)]
         frames = Frames(run, bench, questions)
-        measure(
-            frames, arguments.model, arguments.folder, range(arguments.twins), arguments.inside, arguments.shuffles
-        )
+        networks = range(arguments.networks)
+        measure(frames, arguments.model, arguments.folder, networks, arguments.inside, arguments.shuffles)
 
 
 if __name__ == "__main__":

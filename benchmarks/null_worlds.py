@@ -3,14 +3,14 @@
     python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda]
         [--worlds …] [--keep DIR]
 
-Probes: two sites of six features, 39 relabellings refitted; groups of two twins in both layouts. Exactness is a
+Probes: two sites of six features, 39 relabellings refitted; groups of two items in both layouts. Exactness is a
 matter of relabellings and folds, so a linear discriminant with the classes' prior, which names the larger class
 where it sees nothing, stands for the logistic probe; `--probe nested` fits that, at a hundred times the cost.
 *Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the answer in a
 direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The rival flips
 items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, against a
-random-features control and a twin that are as accurate. `--keep` keeps the draws of worlds, so that the same
-command resumes.
+random-features control and an untrained network that are as accurate. `--keep` keeps the draws of worlds, so
+that the same command resumes.
 """
 
 import argparse
@@ -126,7 +126,7 @@ def correlated(generator: np.random.Generator, sites: int, accuracy: float) -> N
 
 
 def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
-    """How often any of 19 sites is better than an equally accurate random-features control, and twin."""
+    """How often any of 19 sites exceeds an equally accurate random-features control, and untrained network."""
     groups, found = np.repeat(np.arange(75), 4), []
     for seed in range(draws):
         generator = np.random.default_rng(seed)
@@ -139,8 +139,8 @@ def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
                 better_than_best(here, there, groups, seed).min() < LEVEL,
             ]
         )
-    random_features, twin = np.mean(found, axis=0)
-    return float(random_features), float(twin)
+    random_features, untrained = np.mean(found, axis=0)
+    return float(random_features), float(untrained)
 
 
 def main() -> None:
@@ -157,11 +157,11 @@ def main() -> None:
     with threadpool_limits(1):
         accuracies = (0.5, 0.6, 0.8) if arguments.control_draws else ()
         controls = Table(
-            "accuracy", "random-features", "twin", title=f"false alarms, {arguments.control_draws} draws"
+            "accuracy", "random-features", "untrained", title=f"false alarms, {arguments.control_draws} draws"
         )
         for accuracy in accuracies:
-            random_features, twin = control_alarms(accuracy, arguments.control_draws)
-            controls.add_row(f"{accuracy:.1f}", f"{random_features:.1%}", f"{twin:.1%}")
+            random_features, untrained = control_alarms(accuracy, arguments.control_draws)
+            controls.add_row(f"{accuracy:.1f}", f"{random_features:.1%}", f"{untrained:.1%}")
         if accuracies:
             console.print(controls)
         names = tuple(arguments.worlds.split(";"))

@@ -10,6 +10,8 @@ DATA = ROOT / "docs" / "demo.json"
 README = ROOT / "README.md"
 PAGES = (ROOT / "docs" / "embedded.md",)
 TRAINED = "trained"
+PROBED = ("backbone % [95 %]", "action %", "retention [95 %]")
+"""Columns of what probes found: the cross-fitted scores of both streams and their ratio."""
 
 _BLOCK = re.compile(r"(<!-- from docs/demo.json: (?P<name>[a-z]+) -->\n).*?(<!-- end of it -->)", re.DOTALL)
 Row = Mapping[str, Any]
@@ -27,17 +29,14 @@ def blocks(page: str) -> list[str]:
 
 def trained_table(data: Mapping[str, Any]) -> str:
     """What the demo prints of the trained policy, a row per category."""
-    delta = _span(_of(data, TRAINED), "chance_margin")
-    heading = ("demo", f"SR % (Δ {delta})", "backbone %, family-wise p", "action %", "bounded retention [95 %]")
-    return _table(heading, [_cells(row, "n/a (no backbone signal)") for row in _of(data, TRAINED)])
+    rows = _of(data, TRAINED)
+    heading = ("demo", f"SR % (Δ {_span(rows, 'chance_margin')})", *PROBED)
+    return _table(heading, [_cells(row) for row in rows])
 
 
 def organisms_table(data: Mapping[str, Any]) -> str:
     """The verdicts on all organisms; those of untrained ones in a line each, since nothing is to be seen."""
-    heading = (
-        "policy", "category", "expected", "measured", "SR %", "backbone %, p", "action %",
-        "bounded retention [95 %]",
-    )  # fmt: skip
+    heading = ("policy", "category", "expected", "measured", "SR %", *PROBED)
     lines: list[tuple[str, ...]] = []
     for name in dict.fromkeys(row["organism"] for row in data["organisms"]):
         rows = _of(data, name)
@@ -48,7 +47,7 @@ def organisms_table(data: Mapping[str, Any]) -> str:
     true = sum(row["expected"] == row["measured"] for row in data["organisms"])
     margin = _span(data["organisms"], "chance_margin")
     note = (
-        f"{data['episodes']} episodes per category, Δ of {margin} points by items, {data['permutations']} "
+        f"{data['episodes']} episodes per category, Δ of {margin} points, {data['permutations']} "
         f"permutations: {true} of {len(data['organisms'])} verdicts are true."
     )
     return f"{_table(heading, lines)}\n\n{note}"
@@ -67,28 +66,35 @@ def _table(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (heading, ["---"] * len(heading), *lines))
 
 
-def _cells(row: Row, undefined: str) -> tuple[str, ...]:
+def _cells(row: Row) -> tuple[str, ...]:
+    low, high = map(_percent, row["backbone_ci"])
     return (
         row["category"].capitalize(),
         _percent(row["sr"]),
-        f"{_percent(row['backbone'])}, {row['p']:.3f}",
+        f"{_percent(row['backbone'])} [{low}, {high}], {_verdict([row])}",
         _percent(row["action"]),
-        _retention(row, undefined),
+        _retention(row),
     )
 
 
 def _with_verdict(row: Row) -> tuple[str, ...]:
-    category, *measures = _cells(row, "n/a")
+    category, *measures = _cells(row)
     return row["organism"], category, row["expected"], row["measured"], *measures
 
 
 def _joined(rows: Sequence[Row]) -> tuple[str, ...]:
     first = rows[0]
-    least = min(row["p"] for row in rows)
     return (
         first["organism"], f"the same {len(rows)}", first["expected"], first["measured"], _span(rows, "sr"),
-        f"{_span(rows, 'backbone')}, ≥ {least:.3f}", _span(rows, "action"), _retention(first, "n/a"),
+        f"{_span(rows, 'backbone')}, {_verdict(rows)}", _span(rows, "action"), _retention(first),
     )  # fmt: skip
+
+
+def _verdict(rows: Sequence[Row]) -> str:
+    """What was found in the backbone; unless it is shown, how accurate its best site could be at most."""
+    verdicts = {row["verdict"] for row in rows}
+    most = "" if verdicts == {"shown"} else f" (at most {_percent(max(row['at_most'] for row in rows))})"
+    return " or ".join(sorted(verdicts)) + most
 
 
 def _span(rows: Sequence[Row], name: str) -> str:
@@ -101,10 +107,11 @@ def _percent(share: float | None) -> str:
     return "n/a" if share is None else f"{100 * share:.1f}".removesuffix(".0")
 
 
-def _retention(row: Row, undefined: str) -> str:
+def _retention(row: Row) -> str:
+    """Retention with its interval; n/a where the backbone's signal is not shown."""
     if row["retention"] is None:
-        return undefined
+        return "n/a"
     limits = row["retention_ci"]
-    if not limits or None in limits:
-        return f"{row['retention']:.2f} [unbounded]"
+    if None in limits:
+        return f"{row['retention']:.2f} [no limits]"
     return f"{row['retention']:.2f} [{limits[0]:.2f}, {limits[1]:.2f}]".replace("-", "−")

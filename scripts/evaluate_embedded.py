@@ -11,20 +11,21 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import READER, TRAINED, verdict
+from probe_kit.demo.organisms import READER, TRAINED
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.columns.summary import verdict
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "traffic", "counting")
 RULES = ("disc", "released-on-tile")
 HEADING = (
-    "run", "rule", "category", "N", "SR % [95 %]", "original / swapped", "wrong", "oob or unreadable",
-    "Δ by items", "measured",
+    "run", "rule", "category", "N", "SR % [95 %]", "original / swapped", "wrong", "outside or unparsable",
+    "Δ", "measured",
 )  # fmt: skip
 
 

@@ -16,9 +16,10 @@ from docs_tables import DATA, PAGES, README, ROOT, filled
 from readme_picture import draw_picture
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress, verdict
+from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress
 from probe_kit.demo.pipeline import PERMUTATIONS, compare_organisms, run_demo
 from probe_kit.retention import RetentionRow
+from probe_kit.retention.columns.summary import verdict
 from probe_kit.retention.rows.row import MEAN
 
 SHOWN = {"report.html": "sample-report.html", "episode.gif": "episode.gif"}
@@ -81,16 +82,14 @@ def _finding(finding: Finding) -> dict[str, object]:
         "measured": finding.measured,
         "sr": row.success.sr,
         "chance_margin": row.success.chance_margin,
-        "backbone": row.backbone.accuracy,
-        "p": row.backbone.p_fwe,
-        "action": row.action.accuracy,
-        "retention": row.retention.bounded if row.retention.defined else None,
-        "retention_ci": _limits(row.retention.bounded_ci) if row.retention.defined else None,
+        "backbone": row.backbone.score,
+        "backbone_ci": row.backbone.ci,
+        "verdict": row.backbone.verdict,
+        "at_most": row.backbone.at_most,
+        "action": row.action.score,
+        "retention": row.retention.value if row.retention.defined else None,
+        "retention_ci": row.retention.ci if row.retention.defined else None,
     }
-
-
-def _limits(interval: tuple[float | None, float | None] | None) -> list[float | None]:
-    return [None, None] if interval is None else list(interval)
 
 
 if __name__ == "__main__":

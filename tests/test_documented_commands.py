@@ -135,7 +135,7 @@ LOOKED_FOR = {
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",
-    "join": "Make one with",
+    "stages": "Make one with",
     "from-csv": "questions.csv",
     "convert": "no such|not a folder|does not exist|holds no|missing",
 }
@@ -252,7 +252,7 @@ NOT_TYPED = {
     r"^python -m probe_kit.hooks.families.internvla.convert RUN OUT": "RUN is a training of InternVLA's",
     r"^export AWS_|s3://": "needs keys of an object store; tests/extract/test_remote.py has a server of its own",
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
-    r"suite convert vl-think --root BlindVLA|train runs/pi0 --twin|retention runs/pi0 runs/pi0-random":
+    r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|retention runs/pi0 runs/pi0-random":
         "of files that this repository may not pass on, and of runs on them (docs/paper.md)",
     r"suite convert act2answer --root": "of files that this repository may not pass on",
 }  # fmt: skip

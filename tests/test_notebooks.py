@@ -111,7 +111,7 @@ def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
 
 
 @pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
-def test_the_random_twin_is_called_one_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
+def test_the_untrained_network_is_marked_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
     run = open_run(made[0] / "work" / "runs" / "pi0-tiny-random")
     assert run.random_weights
     assert not any(row.retention.defined for row in retention_table([run]).rows)

@@ -56,9 +56,11 @@ def one_of(names: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(names: Collection[str], none: str | None = None) -> Callable[[str | Names], Names]:
-    """A parser for comma-separated `names`; none: a word for the empty selection."""
+    """A parser for comma-separated `names`; none: a word for the empty selection. An option's default is kept."""
 
     def parse(text: str | Names) -> Names:
+        if isinstance(text, Names):
+            return text
         if text == none:
             return Names()
         found = Names.parse(text)
