@@ -52,7 +52,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     run = tmp_path / "run"
     made = in_process(
         "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
-        "--categories", "color", "--max-steps", 2, "--out", run,
+        "--categories", "color", "--max-steps", 2, "--env-workers", 0, "--out", run,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     assert "RANDOM" in made.stderr
@@ -81,7 +81,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    shown = probe_kit("extract", "--model", "expert", "--suite", small_suite.folder, "--out", run, "--dry-run")
+    shown = in_process("extract", "--model", "expert", "--suite", small_suite.folder, "--out", run, "--dry-run")
     assert shown.returncode == 0
     assert "48 (24 items in both layouts)" in shown.stderr
     assert not run.exists()
@@ -127,7 +127,7 @@ def test_bad_input_is_a_clear_error_with_the_contracts_exit_code(
 def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(small_suite.folder, tmp_path / "suite"))
     next(copy.rglob("*.png")).write_bytes(b"not a picture")
-    answer = probe_kit("extract", "--model", "expert", "--suite", copy, "--out", tmp_path / "run")
+    answer = in_process("extract", "--model", "expert", "--suite", copy, "--out", tmp_path / "run")
     assert answer.returncode == 1
     assert "changed" in answer.stderr
     assert not (tmp_path / "run").exists()
@@ -152,7 +152,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     assert "run the same command to resume" in messages
     kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
     assert 1 <= len(kept) < 16
-    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    assert in_process(*command[3:]).returncode == 0
     now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
     assert len(now) == 16
     assert all(now[name] == stamp for name, stamp in kept.items())
@@ -207,7 +207,7 @@ def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
 ) -> None:
     made = in_process(
         "extract", "--model", "expert", "--suite", small_suite.folder, "--items", 2, "--max-steps", 1,
-        "--out", tmp_path / "runs" / "mine",
+        "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")

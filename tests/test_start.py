@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from probe_kit.suite import Suite
+
 INTERRUPTING = """
 import os, runpy, signal, sys
 
@@ -52,9 +54,12 @@ def test_before_a_command_begins_nothing_is_lost_and_nothing_is_traced(
     assert done.stderr == "interrupted before anything was begun\n"
 
 
-def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_kept(tmp_path: Path) -> None:
-    words = ["extract", "--model", "pi0-tiny", "--random-weights", "--items", "2", "--dry-run", "--out"]
-    done = interrupted("torch", "module", signal.SIGINT, *words, str(tmp_path / "run"))
+def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_kept(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    words = ["extract", "--model", "pi0-tiny", "--random-weights", "--items", "2", "--dry-run"]
+    words += ["--suite", str(small_suite.folder), "--out", str(tmp_path / "run")]
+    done = interrupted("torch", "module", signal.SIGINT, *words)
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "interrupted. Completed work is saved; run the same command to resume.\n"
 

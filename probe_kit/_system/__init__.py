@@ -1,1 +1,1 @@
-"""Processes, machines and optional libraries."""
+"""Files, machines and optional libraries."""

@@ -77,7 +77,12 @@ def _third_party(entry: EntryPoint) -> Family | None:
 
 
 def find_family(name: str, others: tuple[str, ...] = ()) -> Family:
-    """The family called `name`. `others` are further names to suggest if there is none."""
+    """The family called `name`. `others` are further names to suggest if there is none.
+
+    Entry points of third parties are looked through only for a name that is not ours.
+    """
+    if (ours := _own_families().get(name)) is not None:
+        return ours
     known = known_families()
     if name not in known:
         names = [*known, *others]

@@ -27,6 +27,7 @@ def settings(
         categories=("color",),
         items=items,
         scene=SceneSpec(max_steps=STEPS),
+        env_workers=0,
         **more,
     )
 

@@ -27,6 +27,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
         categories=("color",),
         items=2,
         scene=SceneSpec(max_steps=2),
+        env_workers=0,
         options={"tokenizer": "bytes"},
         tokens="all",
     )

@@ -28,6 +28,7 @@ def settings(
         categories=("color",),
         items=items,
         scene=SceneSpec(max_steps=1),
+        env_workers=0,
         **more,
     )
 

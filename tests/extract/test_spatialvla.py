@@ -28,6 +28,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
         categories=("color",),
         items=12,
         scene=SceneSpec(max_steps=1),
+        env_workers=0,
     )
 
 

@@ -54,6 +54,15 @@ def test_a_batch_gives_the_same_numbers_up_to_float_rounding(suite: Suite, plain
     assert run.episodes["outcome"].tolist() == one.episodes["outcome"].tolist()
 
 
+def test_a_simulating_process_starts_without_the_array_store_and_torch() -> None:
+    """Two are started for every run of some length; the array store alone would double their start."""
+    code = (
+        "import sys, probe_kit.extract.rollout.stage_process; "
+        "print([m for m in ('zarr', 'torch', 'pandas', 'xarray') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8").stdout == "[]\n"
+
+
 def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -> None:
     planned = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[0]
     stage = ProcessStage(SHORT, None)

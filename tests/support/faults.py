@@ -6,7 +6,7 @@ A change maps files of a run to their new content, None for a file that is gone,
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -36,15 +36,21 @@ class Stored:
     other: Path
     before: Mapping[str, str]
     audit: Audit
+    _files: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, run: Path, other: Path) -> "Stored":
         return cls(run, other, readings(run), verify_run(run, deep=True))
 
     def files(self, run: Path | None = None) -> dict[str, list[Path]]:
-        """By the kind of file, so that the few of one kind are drawn as often as the many of another."""
-        kinds: dict[str, list[Path]] = {}
+        """By the kind of file, so that the few of one kind are drawn as often as the many of another.
+
+        Listed once: every change is undone before the next draw.
+        """
         home = run or self.run
+        if home in self._files:
+            return self._files[home]
+        kinds = self._files[home] = {}
         for path in sorted(home.rglob("*")):
             if path.is_file():
                 parts = path.relative_to(home).parts

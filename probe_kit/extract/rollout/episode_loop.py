@@ -14,8 +14,8 @@ from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
+from probe_kit.extract.store.frame_ends import Ends
 from probe_kit.extract.store.seconds import Seconds
-from probe_kit.extract.store.thumbnails import Ends
 from probe_kit.extract.store.writer import EpisodeRecord
 from probe_kit.hooks.contract.observation import Observation
 

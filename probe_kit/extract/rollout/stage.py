@@ -24,7 +24,7 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.run_layout import CAPTURE_ONLY
-from probe_kit.extract.store.thumbnails import Ends, shrink
+from probe_kit.extract.store.frame_ends import Ends, shrink
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.items import Side
 

@@ -3,7 +3,7 @@
 from multiprocessing.connection import Connection
 from typing import Any
 
-from probe_kit._system.child_process import Child
+from probe_kit._execution.child_process import Child
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
 from probe_kit.extract.rollout.events import add_traceback

@@ -8,28 +8,16 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import FRAMES
 from probe_kit.extract.store.format.commits import read_pictures, redo_picture
+from probe_kit.extract.store.frame_ends import Ends
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 
-HEIGHT = 120
-"""Pixels; a pair of 4:3 frames is 320 wide and takes about 2 kB."""
 QUALITY = 85
-
-Ends = tuple[NDArray[np.uint8], ...]
-"""First and last frame, (h, w, 3) uint8 each; the first alone where nothing moved."""
-
-
-def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A rendered frame (H, W, 3) uint8 at thumbnail height."""
-    height, width, _ = frame.shape
-    size = (round(width * HEIGHT / height), HEIGHT)
-    return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
 
 
 def as_thumbnail(ends: Ends) -> bytes:

@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
-from multiprocessing.connection import Connection, wait
+from functools import partial
+from multiprocessing.connection import Connection
 from signal import SIGALRM
 
-from probe_kit._system.child_process import Child
+from probe_kit._execution.process_pool import Ended, ProcessPool
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Event
 from probe_kit.extract.settings import RunSettings
@@ -15,6 +15,7 @@ from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import tell_lost
 
 MORE = "more"
+_SERVICE = "probe_kit.extract.workers.processes:serve"
 
 
 def run_in_processes(
@@ -24,92 +25,49 @@ def run_in_processes(
 
     Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
     """
-    workers = [_Hand(slot, settings, run) for slot in range(settings.workers)]
-    try:
+    waiting: set[int] = set()
+    began: set[int] = set()
+    with ProcessPool(_SERVICE, (settings, run), settings.workers, partial(_environment, settings)) as pool:
         while not scheduler.finished:
-            for hand in workers:
-                hand.offer(scheduler)
-            ready = wait([hand.connection for hand in workers])
-            for hand in workers:
-                if hand.connection in ready:
-                    _receive(hand, scheduler, on_event)
-    finally:
-        for hand in workers:
-            hand.connection.close()  # all of them, so that they end side by side
-        for hand in workers:
-            hand.close()
+            for slot in sorted(waiting):
+                number = scheduler.take(slot)
+                if number is not None or scheduler.holds(slot):  # else there is none for now
+                    waiting.discard(slot)
+                    pool.send(slot, number)
+            for slot, message in pool.receive():
+                if isinstance(message, Ended):
+                    _give_back(slot, _why(message.code, slot in began, slot, settings), scheduler, on_event)
+                    waiting.discard(slot)
+                    began.discard(slot)
+                    pool.restart(slot)
+                elif message == MORE:
+                    waiting.add(slot)
+                    began.add(slot)
+                else:
+                    scheduler.record(slot, message)
+                    on_event(message)
 
 
-class _Hand:
-    """The driver's view of one worker process."""
-
-    def __init__(self, slot: int, settings: RunSettings, run: str) -> None:
-        self.slot, self._settings, self._run = slot, settings, run
-        self.limit = settings.inference_limit
-        self.start()
-
-    def start(self) -> None:
-        """Start the process; it loads the model by itself."""
-        self.waiting = self.began = False
-        self._child = Child("probe_kit.extract.workers.processes:serve", _environment(self.slot, self._settings))
-        self._child.connection.send((self._settings, self._run))
-
-    @property
-    def connection(self) -> Connection:
-        """What the worker says."""
-        return self._child.connection
-
-    def offer(self, scheduler: Scheduler) -> None:
-        """Answer a worker that asked for an episode, unless it has nothing else and there is none for now."""
-        if not self.waiting:
-            return
-        number = scheduler.take(self.slot)
-        if number is not None or scheduler.holds(self.slot):
-            self.waiting = False
-            with suppress(BrokenPipeError, ConnectionResetError):  # then the next `recv` finds it dead
-                self.connection.send(number)
-
-    def close(self) -> int:
-        """End the process; what it has played is written first."""
-        return self._child.close()
-
-
-def _receive(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
-    try:
-        message = hand.connection.recv()
-    except (EOFError, ConnectionResetError):
-        _replace(hand, scheduler, on_event)
-        return
-    if isinstance(message, ProbeKitError):
-        raise message
-    if message == MORE:
-        hand.waiting = hand.began = True
-    else:
-        scheduler.record(hand.slot, message)
-        on_event(message)
-
-
-def _replace(hand: _Hand, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
-    code = hand.close()
-    if not hand.began:
+def _why(code: int, began: bool, slot: int, settings: RunSettings) -> str:
+    """How a worker ended. Raises WorkerDiedError for one that never began."""
+    if not began:
         raise WorkerDiedError(
-            f"worker {hand.slot} ended with code {code} before its first episode; its last words are above. Try "
+            f"worker {slot} ended with code {code} before its first episode; its last words are above. Try "
             "fewer --workers, or none to see the error in this process"
         )
-    why = _why(code, hand.limit)
-    tell_lost(f"worker {hand.slot} {why}", len(scheduler.holds(hand.slot)))
-    for event in scheduler.lose(hand.slot, f"the worker playing it {why}"):
-        on_event(event)
-    hand.start()
-
-
-def _why(code: int, limit: float | None) -> str:
-    if limit is not None and code == -SIGALRM:
-        return f"was ended, because a call of its model took longer than --inference-limit {limit:g} s"
+    if settings.inference_limit is not None and code == -SIGALRM:
+        limit = f"{settings.inference_limit:g}"
+        return f"was ended, because a call of its model took longer than --inference-limit {limit} s"
     return f"ended with code {code}"
 
 
-def _environment(slot: int, settings: RunSettings) -> dict[str, str]:
+def _give_back(slot: int, why: str, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
+    tell_lost(f"worker {slot} {why}", len(scheduler.holds(slot)))
+    for event in scheduler.lose(slot, f"the worker playing it {why}"):
+        on_event(event)
+
+
+def _environment(settings: RunSettings, slot: int) -> dict[str, str]:
     """One GPU per worker where there are GPUs, and a fair share of the cores."""
     share = max(1, (os.cpu_count() or 1) // settings.workers)
     environment = {"OMP_NUM_THREADS": str(share)}

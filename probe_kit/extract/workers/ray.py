@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, Self
 
-from probe_kit._system.cluster import ray_cluster
+from probe_kit._execution.ray_cluster import answer_of, ray_cluster
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
@@ -131,11 +131,9 @@ class RayWorkers:
         slot = self._calls.pop(ready)
         lost = self._ray.exceptions.RayActorError, self._ray.exceptions.ObjectLostError
         try:
-            answer: str | list[Event] | ProbeKitError | None = self._ray.get(ready)
+            answer: str | list[Event] | None = answer_of(self._ray, ready)
         except lost as error:
             return self._replace(slot, scheduler, error)
-        if isinstance(answer, ProbeKitError):
-            raise answer
         if answer is None:  # it has begun
             self._calls[self._actors[slot].node.remote()] = slot
             return []

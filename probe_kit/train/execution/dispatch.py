@@ -1,14 +1,12 @@
 """Fits of many feature columns: in this process, in several, or on a Ray cluster."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from probe_kit.train.execution.executor import (
     Columns,
     ExecutionSettings,
     Key,
     Probed,
-    ProbeExecutor,
     Problems,
     probe_column,
 )
@@ -34,17 +32,11 @@ def probe_columns(
             yield key, probe_column(samples, problems, settings.device)
 
 
-def _side_by_side(columns: Columns, crew: ProbeExecutor) -> Iterator[tuple[Key, Probed]]:
-    waiting: dict[Any, Key] = {}
-    with crew:
+def _side_by_side(columns: Columns, executor: ProcessExecutor | RayExecutor) -> Iterator[tuple[Key, Probed]]:
+    with executor:
         for key, samples in columns:
-            waiting[crew.submit(samples)] = key
-            if len(waiting) > crew.size:  # one column ahead, so that memory holds no more than that
-                yield from _finished(crew, waiting)
-        while waiting:
-            yield from _finished(crew, waiting)
-
-
-def _finished(crew: ProbeExecutor, waiting: dict[Any, Key]) -> Iterator[tuple[Key, Probed]]:
-    for task in crew.first_of(list(waiting)):
-        yield waiting.pop(task), crew.result(task)
+            executor.submit(key, samples)
+            if executor.waiting > executor.size:  # one column ahead, so that memory holds no more than that
+                yield from executor.finished()
+        while executor.waiting:
+            yield from executor.finished()

@@ -1,9 +1,9 @@
-"""Base class of the executors that fit columns in parallel."""
+"""What executors share: settings, and the fit of one column."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
 
+from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.train.crossval.category_problem import CategoryProblem
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -15,30 +15,6 @@ Key = tuple[str, Site]
 Columns = Iterator[tuple[Key, Samples]]
 Problems = Mapping[str, CategoryProblem]
 Probed = dict[str, SiteProbe]
-
-
-class ProbeExecutor(Protocol):
-    """Who probes columns side by side. A context manager; a task is whatever `submit` returns.
-
-    size: columns that can be probed at once.
-    """
-
-    size: int
-
-    def __enter__(self) -> Self:
-        """Start the workers."""
-
-    def __exit__(self, *_: object) -> None:
-        """End them."""
-
-    def submit(self, samples: Samples) -> Any:
-        """A task that probes one column."""
-
-    def first_of(self, tasks: Sequence[Any]) -> list[Any]:
-        """Wait until at least one task is done; those that are."""
-
-    def result(self, task: Any) -> Probed:
-        """What a finished task found. Raises what went wrong in it."""
 
 
 @dataclass(frozen=True)
@@ -59,3 +35,14 @@ def probe_column(samples: Samples, problems: Problems, device: str | None = None
     """The probes of one column by category."""
     there = samples.to(device)
     return {category: problem.probe(there) for category, problem in problems.items()}
+
+
+def probe_with_one_thread(samples: Samples, problems: Problems) -> Probed | ProbeKitError:
+    """The probes of one column, with one BLAS thread; an error is returned, because Ray would wrap it."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    with threadpool_limits(1):
+        try:
+            return probe_column(samples, problems)
+        except ProbeKitError as error:
+            return error

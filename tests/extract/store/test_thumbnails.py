@@ -10,7 +10,8 @@ from PIL import Image
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, Run, extract_run
-from probe_kit.extract.store.thumbnails import HEIGHT, read_thumbnail
+from probe_kit.extract.store.frame_ends import HEIGHT
+from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.suite import build_suite
 from tests.support.episode_tables import without_seconds
 

@@ -63,14 +63,14 @@ def test_what_a_process_raises_keeps_its_class() -> None:
 
 
 def test_a_process_that_dies_is_named_with_a_way_out() -> None:
-    crew = ProcessExecutor({"color": PROBLEM}, 1)
-    samples = next(columns([]))[1]
+    executor = ProcessExecutor({"color": PROBLEM}, 1)
 
     def probe() -> None:
-        crew.first_of([crew.submit(samples)])
+        executor.submit(*next(columns([])))
+        list(executor.finished())
 
-    with crew:
-        os.kill(crew._children[0].pid, signal.SIGKILL)
+    with executor:
+        os.kill(executor.pool.pid(0), signal.SIGKILL)
         with pytest.raises(WorkerDiedError, match=r"code -9.*fewer --jobs"):
             probe()
 
@@ -111,11 +111,16 @@ def test_a_task_that_ray_repeated_in_vain_says_how_to_go_on(name: str, monkeypat
     kinds = dict.fromkeys(
         ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError"), OtherError
     )
-    crew = RayExecutor({}, "auto")
-    there = SimpleNamespace(get=get, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
-    monkeypatch.setattr(crew, "_ray", there, raising=False)
+
+    def wait(tasks: list[str], num_returns: int) -> tuple[list[str], list[str]]:
+        return tasks[:num_returns], tasks[num_returns:]
+
+    executor = RayExecutor({}, "auto")
+    there = SimpleNamespace(get=get, wait=wait, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
+    monkeypatch.setattr(executor, "_ray", there, raising=False)
+    monkeypatch.setattr(executor, "_tasks", {"a task": ("mean", Site("backbone", 0))})
     with pytest.raises(WorkerDiedError, match=r"its node is gone\. The same command continues"):
-        crew.result("a task")
+        list(executor.finished())
 
 
 def test_ray_is_imported_for_ray_only() -> None:

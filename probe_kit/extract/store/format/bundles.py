@@ -16,10 +16,10 @@ from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit.errors import RunDamagedError, RunNotFoundError
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import INTERVENTIONS, PROBES
 from probe_kit.extract.store.format.hashes import HASH, Sum, as_record, digest_of, expect, is_sum, read_record
-from probe_kit.extract.store.format.root import read_root
+from probe_kit.extract.store.format.root import find_root
 from probe_kit.extract.store.locations.location import Location
 
 BUNDLES = (PROBES, INTERVENTIONS)
@@ -250,10 +250,8 @@ def _identity(location: Location) -> str | None:
 
     Bundles may also lie where there is no run, beside arrays in memory.
     """
-    try:
-        return read_root(location).identity
-    except RunNotFoundError:
-        return None
+    root = find_root(location)
+    return None if root is None else root.identity
 
 
 def _advice(folder: str) -> str:

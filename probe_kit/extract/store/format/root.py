@@ -163,13 +163,19 @@ def read_root(location: Location) -> Root:
 
     Raises RunNotFoundError if there is no run, RunDamagedError if `run.json` was changed or has another schema.
     """
+    root = find_root(location)
+    if root is None:
+        raise RunNotFoundError(f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}")
+    return root
+
+
+def find_root(location: Location) -> Root | None:
+    """The root of the run that lies at `location`, None if there is no run. Raises RunDamagedError."""
     name = f"{location}/{RUN_FILE}"
     try:
         raw = location.read(RUN_FILE)
     except FileNotFoundError:
-        raise RunNotFoundError(
-            f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}"
-        ) from None
+        return None
     card = _read_card(raw, name)
     expect(card, _PARTS, name, RESTORE)
     if sha256_json(card["settings"]) != card["settings_sha256"]:

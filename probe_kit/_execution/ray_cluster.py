@@ -1,4 +1,4 @@
-"""Start and stop of Ray, in one place (extra `ray`)."""
+"""Connection to a Ray cluster, and answers of what runs there (extra `ray`)."""
 
 import socket
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from probe_kit._system.optional_dependencies import require
-from probe_kit.errors import UsageError
+from probe_kit.errors import ProbeKitError, UsageError
 
 AUTO = "auto"
 """The cluster this process belongs to, or else a new one on this machine."""
@@ -39,6 +39,17 @@ def ray_cluster(address: str, log_to_driver: bool) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def answer_of(ray: Any, call: Any) -> Any:
+    """What a finished call returned. Raises an error of ours that it returned, and Ray's own of a lost worker.
+
+    What runs on a cluster returns errors of ours instead of raising them: Ray would wrap them.
+    """
+    answer = ray.get(call)
+    if isinstance(answer, ProbeKitError):
+        raise answer
+    return answer
 
 
 def _knock(address: str) -> None:

@@ -1,0 +1,78 @@
+"""A pool of child processes that run one service."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from typing import Any, Self
+
+from probe_kit._execution.child_process import Child
+from probe_kit.errors import ProbeKitError
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What a pool receives from a process that died. code: its exit code."""
+
+    code: int
+
+
+class ProcessPool:
+    """Processes of one service, numbered from 0. A context manager.
+
+    service: `module:name`, see `Child`. setup: the first message to each. environment: by number, variables of the
+    process beyond those of this one.
+    """
+
+    def __init__(
+        self, service: str, setup: object, size: int, environment: Callable[[int], Mapping[str, str]] | None = None
+    ) -> None:
+        self._service, self._setup, self._size, self._environment = service, setup, size, environment
+        self._children: dict[int, Child] = {}
+
+    def __enter__(self) -> Self:
+        for slot in range(self._size):
+            self._spawn(slot)
+        for slot in range(self._size):  # when all are starting: a setup of some size waits for its reader
+            self.send(slot, self._setup)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for child in self._children.values():
+            child.connection.close()  # all of them, so that they end side by side
+        for child in self._children.values():
+            child.close()
+
+    def restart(self, slot: int) -> None:
+        """Start process number `slot` again, which ended."""
+        self._spawn(slot)
+        self.send(slot, self._setup)
+
+    def _spawn(self, slot: int) -> None:
+        self._children[slot] = Child(self._service, self._environment and self._environment(slot))
+
+    def pid(self, slot: int) -> int:
+        """The process id."""
+        return self._children[slot].pid
+
+    def send(self, slot: int, message: object) -> None:
+        """Send a message; `receive` finds out if the process is dead."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self._children[slot].connection.send(message)
+
+    def receive(self) -> Iterator[tuple[int, Any]]:
+        """Wait until a process sends something; number and message of all that did, `Ended` of one that died.
+
+        Raises the ProbeKitError that a process sends.
+        """
+        ready = wait([child.connection for child in self._children.values()])
+        for slot, child in self._children.copy().items():
+            if child.connection not in ready:
+                continue
+            try:
+                message = child.connection.recv()
+            except (EOFError, ConnectionResetError):
+                message = Ended(child.close())
+            if isinstance(message, ProbeKitError):
+                raise message
+            yield slot, message

@@ -1,0 +1,26 @@
+"""Results that are stored beside arrays in memory, where there is no run."""
+
+from pathlib import Path
+
+import pytest
+
+from probe_kit.extract.run_layout import INTERVENTIONS
+from probe_kit.extract.store.format import root
+from probe_kit.extract.store.format.bundles import read_bundles, write_bundle
+from probe_kit.extract.store.locations.locate import locate
+
+KEY = "0123456789ab"
+
+
+def test_results_beside_arrays_are_read_without_a_search_for_runs_around_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search lists the folder above, which may hold thousands of others."""
+    location = locate(tmp_path / "arrays")
+    write_bundle(location, INTERVENTIONS, KEY, {"settings": {"kind": "mine"}})
+
+    def search(address: str) -> str:
+        raise AssertionError(f"looked for runs near {address}")
+
+    monkeypatch.setattr(root, "what_to_open", search)
+    assert read_bundles(location, INTERVENTIONS)[KEY].head["settings"] == {"kind": "mine"}
