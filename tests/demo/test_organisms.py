@@ -25,7 +25,7 @@ from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
-from probe_kit.retention.report.category_summary import verdict
+from probe_kit.retention.columns.summary import verdict
 from probe_kit.retention.rows.parts import BackbonePart, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 
@@ -54,8 +54,8 @@ def row(sr: float, p: float | None, **controls: bool) -> RetentionRow:
         (0.9, 0.005, "acted on"),
         (0.64, 0.005, "encoded, not acted on"),
         (0.02, 0.005, "encoded, not acted on"),
-        (0.5, 0.2, "absent"),
-        (0.5, None, "absent"),
+        (0.5, 0.2, "not shown"),
+        (0.5, None, "not shown"),
         (0.9, 0.2, "acted on, not found"),
     ],
 )
@@ -65,10 +65,15 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
     assert verdict(row(sr, p)) == expected
 
 
+def test_absent_is_said_only_where_the_best_site_is_below_the_bound() -> None:
+    one = row(0.5, 0.2)
+    assert verdict(replace(one, backbone=replace(one.backbone, verdict="absent"))) == "absent"
+
+
 @pytest.mark.parametrize("control", ["random-features", "untrained"])
-def test_what_is_no_better_than_a_control_is_absent(control: str) -> None:
+def test_what_does_not_exceed_a_control_is_not_shown(control: str) -> None:
     """Color of the untrained network had p = 0.005 against chance, and knew nothing."""
-    assert verdict(row(0.5, 0.005, **{control: False})) == "absent"
+    assert verdict(row(0.5, 0.005, **{control: False})) == "not shown"
     assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, not acted on"
 
 

@@ -41,7 +41,7 @@ def every_form(table: RetentionTable) -> dict[str, str]:
     cells = " | ".join(cell.text for cell in html.body[0])
     return {
         "console": console(table).split("Retention, view")[1],
-        "markdown": table.to_markdown().split("**Retention,")[1],
+        "markdown": table.to_markdown().split("**Retention (")[1],
         "latex": table.to_latex().split(r"\caption{Retention")[1],
         "page": f"{headings(html)}\n{cells}",
     }

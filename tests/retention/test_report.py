@@ -8,7 +8,7 @@ from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.glossary import glossary
+from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report import report_html, write_report
@@ -70,17 +71,17 @@ def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> No
 def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL, "shape": NOISE}, "pi0-tiny")])
     opening = page[page.index('<section id="summary">') : page.index('<div class="headlines">')]
-    assert "In plain words: pi0-tiny" in opening
+    assert "Summary: pi0-tiny" in opening
     color, shape = re.findall(r"<li>(.*?)</li>", opening, re.DOTALL)
-    assert "Color: the answer can be read in the policy" in color
-    assert "Shape: the answer cannot be read in its backbone" in shape
+    assert "Color (100 items): the backbone holds the answer (90 %, " in color
+    assert "Shape (100 items): the backbone does not hold it (at most " in shape
 
 
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": NOISE}, "pi0-tiny", random_weights=True)])
     assert '<span class="badge random">random weights</span>' in page
     assert "RANDOM WEIGHTS" in page
-    assert "nobody trained" in page
+    assert "the model is untrained" in page
 
 
 def test_names_and_instructions_cannot_become_markup(tmp_path: Path, outcome_table: Any) -> None:
@@ -189,7 +190,7 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
     assert 0.75 < score < 0.775, "two of 90 % and one that guesses, without the luck of its best site"
     assert [headline.value for headline in summary.headlines[:2]] == ["60.0 %", f"{100 * score:.1f} %"]
     assert "120 of 200 episodes" in dict(summary.by_category)["color"]
-    assert "not above chance" in dict(summary.by_category)["shape"]
+    assert "not shown to beat chance" in dict(summary.by_category)["shape"]
 
 
 def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
@@ -227,7 +228,7 @@ def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: Pro
     marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
     assert len(marked) > 4
     assert all("every control" in reading for reading in marked)
-    assert "every control" in glossary()["n/a"]
+    assert "every control" in glossary("acts")["n/a"]
 
 
 def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:
@@ -245,7 +246,7 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
 
 
 def test_the_glossary_has_a_sentence_for_every_word() -> None:
-    assert all(meaning.endswith(".") for meaning in glossary().values())
+    assert all(meaning.endswith(".") for modes in get_args(Modes) for meaning in glossary(modes).values())
 
 
 # -- episodes --------------------------------------------------------------------------------------------------

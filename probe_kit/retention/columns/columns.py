@@ -162,7 +162,7 @@ DIFFERENCE_P = Column(
 )
 _MODELS = (
     "Of a difference between groups of models: exact p of exchanging the models' labels, the model as the unit. "
-    "In brackets the least p that so few models allow, and Welch's 95 % interval over models. All other numbers of "
+    "In brackets the least p that so few models allow, and Welch's 95 % interval over models. Other numbers of "
     "the row are of these models on other items."
 )
 SR_MODELS = Column(

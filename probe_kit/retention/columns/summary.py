@@ -248,19 +248,13 @@ def summary_table(
 
 
 def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:
-    return (
-        "",
-        *(
-            difference_interval(value, limits if intervals else None)
-            for value, limits in (
-                (row.backbone, row.backbone_ci),
-                (row.action, row.action_ci),
-                (row.sr, row.sr_ci),
-            )
-        ),
-        ratio_difference(row.retention, row.retention_ci if intervals else None),
-        _difference_p(row),
+    sr, backbone, action = (
+        difference_interval(value, limits if intervals else None)
+        for value, limits in ((row.sr, row.sr_ci), (row.backbone, row.backbone_ci), (row.action, row.action_ci))
     )
+    answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
+    ratio = ratio_difference(row.retention, row.retention_ci if intervals else None)
+    return answered, backbone, action, acted, ratio, _difference_p(row)
 
 
 def _difference_p(row: Difference) -> str:

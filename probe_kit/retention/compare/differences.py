@@ -20,6 +20,7 @@ from probe_kit.retention.estimators.stream_scores import (
     limits,
 )
 from probe_kit.retention.rows.build import RowWithEstimates
+from probe_kit.retention.rows.parts import Mode
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
@@ -66,7 +67,7 @@ class Difference:
     once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
     `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
     where a side is a group of several. call: the captured inference that both were probed at, None without
-    probes or where they differ. In a row of category `mean`, numbers are averages over the `categories` that
+    probes or where they differ. mode: what the models of both did. In a row of category `mean`, numbers are averages over the `categories` that
     both groups have.
     """
 
@@ -90,6 +91,7 @@ class Difference:
     p_holm: float | None = None
     run: str | None = None
     minus_run: str | None = None
+    mode: Mode = "acts"
     categories: tuple[str, ...] = ()
 
 
@@ -134,7 +136,8 @@ def _compare_sides(here: Side, there: Side) -> list[Difference]:
         mine, theirs, shared = _behaviour(mine), _behaviour(theirs), [None]
     outcomes = _outcomes(here.drawn), _outcomes(there.drawn)
     found = [row for view in shared for row in _compare((here, there), view, mine[view], theirs[view], outcomes)]
-    return [replace(row, call=call, run=here.run, minus_run=there.run) for row in found]
+    mode = here.drawn[0].row.run.mode
+    return [replace(row, call=call, run=here.run, minus_run=there.run, mode=mode) for row in found]
 
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]

@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 from rich.console import Console
 
-from probe_kit.retention import RetentionRow, RetentionTable, retention_table
+from probe_kit.retention import Difference, RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, all_columns, averaged_fields, share
 from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.formats.html import html_tables
@@ -55,7 +55,7 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
 ) -> None:
     """The worked example of CONTRIBUTING: the field is in `SuccessRate`, the column is declared."""
     new = share("success.layout_mean", "layout mean %", "Mean of the success rates of both layouts.")
-    for text in (*every_form(table).values(), *glossary()):
+    for text in (*every_form(table).values(), *glossary("both")):
         assert "layout mean" not in text
     first, *others = TABLES["Success rate"]
     group = ColumnGroup(first.title, (*first.columns, new))
@@ -64,7 +64,7 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
     for form, text in every_form(again).items():
         assert "layout mean" in text, form
     assert again.means[0].success.layout_mean == again.rows[0].success.layout_mean == 0.6, "means average it too"
-    assert glossary()["layout mean %"] == new.help
+    assert glossary("both")["layout mean %"] == new.help
     assert json.loads(again.to_json())[0]["success"]["layout_mean"] == 0.6
     assert again.to_frame()["success.layout_mean"].tolist() == [0.6, 0.6]
     assert again.success["layout_mean"].tolist() == [0.6, 0.6]
@@ -72,7 +72,10 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
 
 @pytest.mark.parametrize("column", all_columns(), ids=lambda column: column.heading)
 def test_a_column_names_a_field_of_a_row_and_explains_itself(column: Column) -> None:
-    if column.key != "difference.p":
+    if column.key.startswith("difference."):
+        assert column.key.removeprefix("difference.") in get_type_hints(Difference)
+        assert column.difference is not None
+    else:
         assert field_of(column.key) is not None
     assert column.help.endswith(".")
     assert len(column.help) > 20

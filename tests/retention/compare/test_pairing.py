@@ -246,6 +246,15 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
         "VLM runs and policy runs are not compared with each other here; --vlm-vla does that.",
     )
     assert retention_table(mixed, vlm_vla=True).unpaired == ()
+    assert [row.mode for row in table.differences] == ["answers"] * 3 + ["acts"] * 3
+    (header, _, *lines) = table.to_markdown().splitlines()[2:]
+    columns = [cell.strip() for cell in header.split("|")]
+    cells = {line.split("|")[2].strip(): line.split("|") for line in lines if line.startswith("| Mean")}
+    answered, acted = (cells[f"{name}-0 − {name}-1"] for name in ("reader", "policy"))
+    assert "[" in answered[columns.index("VLM %")]
+    assert "[" not in answered[columns.index("success %")]
+    assert "[" in acted[columns.index("success %")]
+    assert "[" not in acted[columns.index("VLM %")]
     accuracy = [(r.episodes["outcome"] == "correct").mean() for r in readers]
     gain = next(row.sr for row in table.differences if row.category == "mean")
     right = [row.success.sr for row in table.means if row.run.mode == "answers"]
