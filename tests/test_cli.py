@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._terminal import console
 from probe_kit.cli import app
 from probe_kit.suite import Suite
 
@@ -46,6 +47,15 @@ def in_process(*arguments: object, cwd: Path | None = None) -> subprocess.Comple
     with contextlib.chdir(cwd or Path.cwd()):
         result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     return subprocess.CompletedProcess(arguments, result.exit_code, result.stdout, result.stderr)
+
+
+def test_every_model_is_one_line_at_eighty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console.out, "_width", 80)
+    listed = in_process("models").stdout.splitlines()
+    assert max(map(len, listed)) <= 80
+    rows = json.loads(in_process("models", "--json").stdout)
+    assert len(listed) == len(rows) + 2, "a heading and a line below"
+    assert all(line.startswith(row["model"]) for line, row in zip(listed[1:], rows, strict=False))
 
 
 def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
 from probe_kit._terminal.console import marked, out, print_json
 from probe_kit._terminal.options import AsJson
@@ -16,7 +17,7 @@ def models(
     run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the models with their checkpoints, streams, options and missing requirements."""
+    """List the models, one per line. With NAME: its checkpoint, streams, options and missing requirements."""
     if run is not None:
         from probe_kit.extract import open_run
 
@@ -25,6 +26,9 @@ def models(
     rows = _model_rows(name)
     if as_json:
         print_json(rows)
+        return
+    if name is None:
+        out.print(_listed(rows))
         return
     for row in rows:
         out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
@@ -46,6 +50,23 @@ def models(
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
             out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
+
+
+def _listed(rows: list[dict[str, Any]]) -> Text:
+    """A line per model, cut at the width of the console."""
+    lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
+    lines = [("model", "does", "ready", "what it is"), *lines]
+    widths = [max(len(line[column]) for line in lines) for column in range(3)]
+    shown = [
+        "  ".join([*(f"{cell:{width}}" for cell, width in zip(line, widths, strict=False)), line[3]])
+        for line in lines
+    ]
+    cut = [line if len(line) <= out.width else f"{line[: out.width - 1]}…" for line in shown]
+    return Text("\n".join([*cut, "A page per model: probe-kit models NAME"]))
+
+
+def _in_a_word(ready: str) -> str:
+    return "download" if ready.startswith("needs download") else "no" if ready.startswith("needs") else ready[:7]
 
 
 def _ready(family: "Family") -> str:
