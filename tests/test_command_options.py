@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from probe_kit._terminal.options import Format
+from probe_kit._terminal.options import Format, read_categories
 from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
 from probe_kit.env.scoring.rules import RULES
@@ -164,6 +164,10 @@ def test_options_that_are_not_given_have_the_default_of_the_protocol_the_model_o
 def test_a_scene_value_of_zero_is_given_and_therefore_checked() -> None:
     with pytest.raises(Exception, match="max_steps"):
         ExtractSettings.from_options(model="expert", max_steps=0)
+
+
+def test_categories_are_read_by_title_in_any_case() -> None:
+    assert read_categories("Color, Living World,public-info") == ("color", "living-world", "public-info")
 
 
 def test_sizes_are_read_as_width_by_height_and_shown_as_typed() -> None:

@@ -37,8 +37,15 @@ class Names(tuple[str, ...]):
         return ",".join(self)
 
 
+def read_categories(text: str | Names) -> Names:
+    """Categories by slug or title, in any case: `Living World` is `living-world`."""
+    return Names("-".join(name.lower().split()) for name in Names.parse(text))
+
+
 LISTED: Any = {"parser": Names.parse, "metavar": "A,B,…"}
 """Keywords of `typer.Option` for comma-separated names."""
+NAMED: Any = LISTED | {"parser": read_categories}
+"""The same for categories."""
 
 
 def choices(names: Collection[object]) -> str:
@@ -93,7 +100,8 @@ SuiteFolder = Annotated[
     Path | None, typer.Option("--suite", help="Suite folder. Default: the embedded suite.", metavar="FOLDER")
 ]
 Categories = Annotated[
-    Names | None, typer.Option("--categories", **LISTED, help="Categories, comma-separated. Default: all.")
+    Names | None,
+    typer.Option("--categories", **NAMED, help="Categories, comma-separated. Default: all."),
 ]
 Items = Annotated[int | None, typer.Option("--items", help="Number of items per category. Default: all.")]
 Wording = Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from probe_kit._terminal.options import LISTED, Names, choices, some_of, speed_option
+from probe_kit._terminal.options import LISTED, NAMED, Names, choices, some_of, speed_option
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import BASELINES, Incomplete, Target
 
@@ -19,7 +19,7 @@ Categories = Annotated[
     Names | None,
     typer.Option(
         "--categories",
-        **LISTED,
+        **NAMED,
         help="Categories, comma-separated. all: pool every episode. Default: each category of the run.",
     ),
 ]

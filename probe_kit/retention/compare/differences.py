@@ -67,8 +67,8 @@ class Difference:
     once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
     `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
     where a side is a group of several. call: the captured inference that both were probed at, None without
-    probes or where they differ. mode: what the models of both did. In a row of category `mean`, numbers are averages over the `categories` that
-    both groups have.
+    probes or where they differ. mode: what the models of both did. In a row of category `mean`, numbers are
+    averages over the `categories` that both groups have.
     """
 
     group: str
