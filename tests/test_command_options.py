@@ -28,7 +28,7 @@ from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.retention.behaviour.vlm_answers import SCORES
-from probe_kit.retention.choices import AnswerScore, TableFormat
+from probe_kit.retention.choices import AnswerScore, Section, TableFormat
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
@@ -65,6 +65,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--format"): get_args(get_args(Format)[0]),
     ("export", "--format"): WRITERS,
     ("retention", "--format"): get_args(TableFormat),
+    ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
     ("stages", "--score"): SCORES,

@@ -7,7 +7,6 @@ from math import ceil
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -123,8 +122,8 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
     """Held-out accuracy by layer for every category, as a matplotlib figure (`figure.savefig(…)`).
 
     Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
-    for the best of every layer, `last`, or one by number. Bars: 95 % intervals over groups, of the peak only
-    where there are several lines. Filled markers are above chance against the best site of their stream
+    for the best of every layer, `last`, or one by number. Bars: each layer's 95 % interval,
+    where the stream runs once. Filled markers are above chance against the best site of their stream
     (family-wise p < 0.05), and above random-features and untrained where those were run. Grey: chance, and the
     band that holds 95 % of the accuracies under relabelling. view: the first probed one by default. Raises
     UnknownSiteError for a view that was not probed, UsageError for an iteration.
@@ -216,21 +215,14 @@ def _finish(axes: "Axes", layers: int, title: str) -> None:
 def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
     line = PARTS[curve.part]
     if len(curve.lines) == 1:
-        draw_line(axes, curve.lines[0], line, curve.label, sidestep)
+        draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=curve.iterations == 1)
     else:
         colours = _colours()
         for number, one in enumerate(curve.lines):
             shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
-            draw_line(axes, one, shade, f"iteration {one.iteration}", sidestep, bars=_peak_layers(curve, one))
+            draw_line(axes, one, shade, f"iteration {one.iteration}", sidestep, bars=False)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep)
-
-
-def _peak_layers(curve: StreamCurve, line: LayerLine) -> NDArray[np.bool_]:
-    """(L,) the layers at which the line is the best of its stream; the first one if it ties with itself."""
-    found = np.isin(line.layers, [layer for layer, step in curve.peaks if step == line.iteration])
-    first = curve.peaks[0] if curve.peaks else None
-    return found & (line.layers == first[0]) if first is not None and first[1] == line.iteration else found & False
 
 
 def draw_line(
@@ -239,22 +231,19 @@ def draw_line(
     style: Line,
     name: str,
     sidestep: float = 0.0,
-    bars: NDArray[np.bool_] | None = None,
+    bars: bool = True,
 ) -> None:
-    """One line; filled markers where it is significant, intervals at the layers `bars` or everywhere."""
+    """One line; filled markers where it is significant. bars: each layer's own 95 % interval.
+
+    A layer that was chosen, such as the best iteration's, has no interval of its own.
+    """
     layers, accuracy = line.layers + sidestep, 100 * line.accuracy
-    shown = np.ones(layers.size, bool) if bars is None else bars
-    arms = np.array([accuracy - 100 * line.low, 100 * line.high - accuracy]).clip(min=0)
-    axes.errorbar(
-        layers[shown],
-        accuracy[shown],
-        yerr=arms[:, shown],
-        fmt="none",
-        ecolor=style.colour,
-        elinewidth=0.8,
-        alpha=0.7,
-    )
-    size = 4.5 if bars is None else 3.2
+    if bars:
+        arms = np.array([accuracy - 100 * line.low, 100 * line.high - accuracy]).clip(min=0)
+        axes.errorbar(
+            layers, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7
+        )  # fmt: skip
+    size = 4.5 if bars else 3.2
     axes.plot(
         layers, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, ms=size, mfc="white",
         label=name,

@@ -5,8 +5,6 @@ from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -51,7 +49,7 @@ def curves_side_by_side(
 ) -> "Figure":
     """Layer curves of several runs: a panel per category and part of the model, a line per run.
 
-    Of iterative streams the best of the iterations at each layer counts; bars are 95 % intervals at best layers.
+    Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says whether two runs differ.
     Along the lower side layers, or depth as a fraction where runs differ in their number. names: of the runs, in
     order. view: one that some of them were probed in. Raises UsageError if none was.
     """
@@ -102,8 +100,7 @@ def _draw_panel(axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: 
     for place, (at, curve) in enumerate(curves):
         line = _at_depths(curve.lines[0], curve) if len(depths) > 1 else curve.lines[0]
         step = _SIDESTEP * (place - (len(curves) - 1) / 2) * (1 if len(depths) == 1 else 1 / max(depths))
-        peaks = np.isin(curve.layers, [layer for layer, _ in curve.peaks[:1]])
-        draw_line(axes, line, series(at), names[at], step, bars=peaks)
+        draw_line(axes, line, series(at), names[at], step, bars=False)
     plain(axes)
     accuracy_axis(axes)
     if len(depths) > 1:
@@ -174,7 +171,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             "probes",
             "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
             f"on one scale; of several iterations the best of every layer. {ONLY_FILLED}. "
-            "Bars are 95 % intervals at each line's best layer; the table says whether two runs differ.",
+            "The table says whether two runs differ.",
             None, partial(curves_side_by_side, known, called, view, source.table.iterations),
         )  # fmt: skip
         if sum(has_maps(one, view) for one in known) > 1:
