@@ -4,8 +4,8 @@
 
 A draw has 24 items in both layouts and four neighbouring sites of twelve features, correlated 0.9. Choice of C,
 folds and fits are those of `probe-kit train`, repeated for 99 permutations: one to two seconds per draw. Worlds
-with shared pictures or missing episodes are those of `null_worlds.py`. `--keep` lets the same command go on where
-it was stopped.
+with shared pictures or missing episodes are those of `null_worlds.py`. With `--keep` the same command
+resumes.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=2000)
     parser.add_argument("--first-seed", type=int, default=0, help="other seeds are other data")
-    parser.add_argument("--keep", type=Path, help="a folder that keeps draws, to go on after a stop")
+    parser.add_argument("--keep", type=Path, help="a folder that keeps draws, to resume")
     options = parser.parse_args()
     seeds = range(options.first_seed, options.first_seed + options.draws)
     with threadpool_limits(1):

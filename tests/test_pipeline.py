@@ -43,6 +43,9 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
     assert (others["p_fwe"] >= 0.05).all()
     (row,) = (row for row in retention_table([planted_run]).rows if row.category == "shape")
     assert row.retention.defined
+    assert (row.backbone.verdict, row.backbone.score, row.backbone.peak) == ("shown", 1.0, 1.0)
+    assert row.backbone.ci is not None
+    assert row.backbone.ci[1] == 1.0
     assert row.backbone.layer == PLANTED.layer
     assert row.run.random_weights
 

@@ -132,12 +132,12 @@ def probed(
     folder: Path,
     permutations: int,
     stage: NamedProgress,
-    twin: Run | None = None,
+    untrained: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
     """The organism's run on `suite`, in `folder`, and its probes, compared with random-features.
 
     What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
-    total, …) for a stage of this name. twin: a run to hold it against too.
+    total, …) for a stage of this name. untrained: run of an untrained network, as a control.
     """
     run = extract_run(
         settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
@@ -149,7 +149,7 @@ def probed(
         permutations=permutations,
         controls=("random-features",),
         suite=suite.folder,
-        untrained=twin,
+        untrained=untrained,
         progress=progress,
     )
     progress = stage(f"exchanging pictures, {organism.name}")
@@ -168,10 +168,10 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
 
     Arguments as of `probed`.
     """
-    twin, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
+    control, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
     runs = [(READER, answered(READER, suite, folder, stage))]
     runs += [
-        (one, twin if one == UNTRAINED_NETWORK else probed(one, suite, folder, permutations, stage, twin)[0])
+        (one, control if one == UNTRAINED_NETWORK else probed(one, suite, folder, permutations, stage, control)[0])
         for one in ORGANISMS
     ]
     return findings(runs)

@@ -105,7 +105,7 @@ def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
     acted = extract_run(acting, tmp_path / "run").episodes
     for column in ("episode_id", "scene_seed", "first_frame_sha256", "visible_left"):
         assert acted[column].tolist() == asked.episodes[column].tolist(), column
-    assert acted["first_frame_sha256"].nunique() == 2, "twins share their pictures, exchanged"
+    assert acted["first_frame_sha256"].nunique() == 2, "items of a pair share their pictures, exchanged"
 
 
 def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, asked: Run, tmp_path: Path) -> None:

@@ -79,11 +79,11 @@ def test_success_rates_are_not_there_in_any_table(capture_run: Run, recorded_run
         nothing = ("sr", "ci", "regime", "share_outside", "normalised_score")
         assert [row["success"][name] for name in nothing] == [None] * 5
         assert row["controls"]["probe_minus_sr"] is None
-        assert row["backbone"]["accuracy"] is not None
+        assert row["backbone"]["score"] is not None
     acting = [row for row in json.loads(table.to_json()) if not row["run"]["capture_only"]]
     assert all(row["success"]["sr"] is not None for row in acting)
     screen = StringIO()
-    Console(file=screen, width=240).print(table.to_rich())
+    Console(file=screen, width=240).print(table.to_rich("all"))
     for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
         assert "n/a" in text
         assert "captured" in text
@@ -96,12 +96,12 @@ def test_success_rates_are_not_there_in_any_table(capture_run: Run, recorded_run
 def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(
     capture_run: Run, recorded_run: Run
 ) -> None:
-    both = retention({"capture_run": [capture_run], "acting": [recorded_run]})
+    both = retention_table({"capture_run": [capture_run], "acting": [recorded_run]})
     assert both.differences == []  # the acting run was not probed, and the other has no success rate
-    rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", (), 0))
+    rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", ()))
     same = group_differences({"one": rows, "other": rows})
     assert {row.category for row in same} == {"color", "mean"}
-    assert all(row.sr is None and row.paired and row.backbone_accuracy == 0 for row in same)
+    assert all(row.sr is None and row.paired and row.backbone == 0 for row in same)
 
 
 def test_questions_about_acting_are_refused(capture_run: Run) -> None:
@@ -154,6 +154,6 @@ def test_options_that_mean_nothing_without_acting_are_refused(settings: ExtractS
 
 
 def test_a_report_of_a_capture_only_run_alone_draws_probes_and_no_behaviour(capture_run: Run) -> None:
-    subjects = [exhibit.subject for exhibit in gallery([capture_run], retention([capture_run]))]
+    subjects = [exhibit.subject for exhibit in collect_figures([capture_run], retention_table([capture_run]))]
     assert "probes" in subjects
     assert "behaviour" not in subjects

@@ -53,7 +53,9 @@ def table(request: pytest.FixtureRequest, probed_run: ProbedRun) -> RetentionTab
     """A run of the world against an equal one, and a group of two good ones."""
     world = WORLDS[request.param]
     runs = {name: [probed_run(world, name)] for name in ("one", "again")}
-    return retention_table({**runs, "other": [probed_run(dict.fromkeys(world, GOOD), f"other{at}") for at in "ab"]})
+    return retention_table(
+        {**runs, "other": [probed_run(dict.fromkeys(world, GOOD), f"other{at}") for at in "ab"]}
+    )
 
 
 # -- every interval that there is ----------------------------------------------------------------------------
@@ -276,7 +278,9 @@ def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
     curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
     expert: float,
 ) -> None:  # fmt: skip
-    found = measure_retention(curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]]))
+    found = measure_retention(
+        curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]])
+    )
     assert found is not None
     if items == 3:
         assert found.streams is None

@@ -155,9 +155,12 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
             if any(part in f".{name}" for part in FLOATS)
             and "defined" not in str(name)
             and "exceeds" not in str(name)
+            and not str(name).endswith((".n", ".n_minus"))
         ]
         assert floats
         assert {str(frame[name].dtype) for name in floats if name not in TEXTS} == {"float64"}
+    assert {str(frame[name].dtype) for name in frame if str(name).endswith((".n", ".n_minus"))} == {"Int64"}
+    assert {"sr_models.ci_low", "retention_models.ci_high"} <= set(frame), "also where no models are compared"
     frame = table.to_frame()
     undefined = frame[~frame["retention.defined"]]
     assert len(undefined) == 2 + 4, "two categories without signal, and the run without probes"
@@ -169,7 +172,22 @@ def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: Prob
     assert raw[1] == pytest.approx(0.08 / 0.05), "json keeps the raw ratio"
 
 
-FLOATS = (".sr", "margin", "accuracy", ".score", ".peak", "at_most", "ci_", "_ci_", "retention.", "share_", "depth", "minus", "chance", "p_fwe")
+FLOATS = (
+    ".sr",
+    "margin",
+    "accuracy",
+    ".score",
+    ".peak",
+    "at_most",
+    "ci_",
+    "_ci_",
+    "retention.",
+    "share_",
+    "depth",
+    "minus",
+    "chance",
+    "p_fwe",
+)
 TEXTS = ("retention.note", "answers.score", "minus", "minus_run")
 
 

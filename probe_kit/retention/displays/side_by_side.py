@@ -49,9 +49,10 @@ def curves_side_by_side(
 ) -> "Figure":
     """Layer curves of several runs: a panel per category and part of the model, a line per run.
 
-    Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says whether two runs differ.
-    Along the lower side layers, or depth as a fraction where runs differ in their number. names: of the runs, in
-    order. view: one that some of them were probed in. Raises UsageError if none was.
+    Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says
+    whether two runs differ. Along the lower side layers, or depth as a fraction where runs differ in their
+    number. names: of the runs, in order. view: one that some of them were probed in. Raises UsageError if none
+    was.
     """
     known = [(at, one) for at, one in enumerate(results) if view in one.settings.views]
     panels_of = [

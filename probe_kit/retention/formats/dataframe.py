@@ -84,9 +84,8 @@ def _flat(part: Any, before: str = "") -> _Flat:
         inner = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
         if inner is not None:
             flat |= _flat(value, f"{name}.") if value is not None else _empty(inner, f"{name}.")
-        elif one.name == "ci" or one.name.endswith("_ci"):
-            low, high = value or (None, None)
-            flat |= {f"{name}_low": ("float64", low), f"{name}_high": ("float64", high)}
+        elif _is_interval(one.name):
+            flat |= _limits(name, value)
         elif isinstance(value, dict):
             flat |= {f"{name}.{key}": _named(number) for key, number in value.items()}
         elif isinstance(value, tuple):
@@ -97,8 +96,20 @@ def _flat(part: Any, before: str = "") -> _Flat:
 
 
 def _empty(kind: Any, before: str) -> _Flat:
-    hints = get_type_hints(kind)
-    return {f"{before}{one.name}": (_dtype(hints[one.name]), None) for one in fields(kind)}
+    hints, flat = get_type_hints(kind), _Flat()
+    for one in fields(kind):
+        name = f"{before}{one.name}"
+        flat |= _limits(name, None) if _is_interval(one.name) else {name: (_dtype(hints[one.name]), None)}
+    return flat
+
+
+def _is_interval(name: str) -> bool:
+    return name == "ci" or name.endswith("_ci")
+
+
+def _limits(name: str, value: Any) -> _Flat:
+    low, high = value or (None, None)
+    return {f"{name}_low": ("float64", low), f"{name}_high": ("float64", high)}
 
 
 def _named(value: Any) -> tuple[str, Any]:

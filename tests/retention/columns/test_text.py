@@ -21,7 +21,9 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
             BaselineScore("instruction", "color", 0.51, (0.45, 0.57), 0.4, 0.5, 200),
         ),
         tuple(
-            UntrainedScore("color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "pi0 (random weights)")
+            UntrainedScore(
+                "color", "mean", site, site, True, 0.9, 0.6, gain, (gain - 0.1, gain + 0.1), "pi0 (random weights)"
+            )
             for site, gain in zip(sites, (0.3, 0.2), strict=True)
         ),
     )

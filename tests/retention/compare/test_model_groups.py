@@ -1,4 +1,4 @@
-"""Groups of models: the model is the unit, and the least p that so few allow stands beside the p."""
+"""Groups of models: the model is the unit, and the least p that so few allow follows the p."""
 
 from collections.abc import Callable
 from io import StringIO

@@ -67,7 +67,7 @@ def oracle(gains: pd.Series, groups: pd.Series) -> tuple[float, float, float, fl
 def mover(mine: pd.DataFrame, theirs: pd.DataFrame) -> tuple[float, float]:
     """Limits of a difference from those of its parts and their correlation over groups (Zou and Donner).
 
-    The variance of the difference is at least that of runs that agree in all groups, of which a share may be unseen.
+    Its variance is at least that of runs that agree in all groups, as some groups may be unseen.
     """
     found, rests, variances = [], [], []
     for table in (mine, theirs):

@@ -1,4 +1,4 @@
-"""Retention of one category: the ratio of two cross-fitted scores, checked against formulas written out by hand."""
+"""Retention of one category: the ratio of two cross-fitted scores, checked against formulas by hand."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -70,9 +70,7 @@ def test_its_limits_are_fiellers(curve_of: CurveOf, episodes: pd.DataFrame) -> N
     (top, bottom), V = streams.scores.above, streams.scores.covariance
     square = stats.t.ppf(0.975, min(100 - 1, 50)) ** 2
     limits = np.sort(
-        np.roots(
-            [bottom**2 - square * V[1, 1], -2 * (top * bottom - square * V[0, 1]), top**2 - square * V[0, 0]]
-        )
+        np.roots([bottom**2 - square * V[1, 1], -2 * (top * bottom - square * V[0, 1]), top**2 - square * V[0, 0]])
     )
     assert (found.interval.low, found.interval.high) == pytest.approx(tuple(limits))
 
@@ -107,7 +105,9 @@ def test_the_order_of_sites_changes_no_number(curve_of: CurveOf, episodes: pd.Da
     for seed in range(5):
         other, of_other = measured(some_sites(curve, np.random.default_rng(seed).permutation(len(curve.sites))))
         assert other.value == pytest.approx(found.value, rel=1e-12)
-        assert (other.interval.low, other.interval.high) == pytest.approx((found.interval.low, found.interval.high))
+        assert (other.interval.low, other.interval.high) == pytest.approx(
+            (found.interval.low, found.interval.high)
+        )
         assert other.published == pytest.approx(found.published)
         assert of_other.at_most == pytest.approx(streams.at_most)
 

@@ -138,7 +138,9 @@ def test_groups_of_two_suites_are_not_the_same(outcome_table: Outcomes) -> None:
 # -- scores of one run ---------------------------------------------------------------------------------------
 
 
-def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(scored: Callable[..., StreamScores]) -> None:
+def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(
+    scored: Callable[..., StreamScores],
+) -> None:
     found = scored([0.5, 0.9], [[0.5, 0.75]])
     assert found.names == ("action", "backbone")
     assert (found.accuracy("backbone"), found.peak("backbone")) == (pytest.approx(0.9), pytest.approx(0.9))
@@ -147,7 +149,10 @@ def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(scored: C
     assert high is not None
     V = found.scores.covariance[1, 1]
     count = min(0.9 * 0.1 / V, 120) * (stats.t.ppf(0.975, 119) / stats.t.ppf(0.975, 50)) ** 2
-    wanted = stats.beta.ppf(0.025, 0.9 * count, 0.1 * count + 1), stats.beta.ppf(0.975, 0.9 * count + 1, 0.1 * count)
+    wanted = (
+        stats.beta.ppf(0.025, 0.9 * count, 0.1 * count + 1),
+        stats.beta.ppf(0.975, 0.9 * count + 1, 0.1 * count),
+    )
     assert (low, high) == pytest.approx(wanted)
 
 

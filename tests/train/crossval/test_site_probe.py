@@ -65,7 +65,7 @@ def test_inner_folds_stay_inside_the_outer_training_side_and_keep_groups_whole()
 
 
 def test_leaking_groups_on_purpose_inflates_accuracy() -> None:
-    """Twins that agree in features and label: split across folds, memory passes for knowledge."""
+    """Pairs that agree in features and label: split across folds, memory passes for knowledge."""
     generator = np.random.default_rng(1)
     pair = np.repeat(np.arange(40), 2)
     labels = (generator.random(40) < 0.5)[pair]

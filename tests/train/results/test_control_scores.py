@@ -72,7 +72,9 @@ def test_controls_of_former_versions_are_read_under_the_names_of_today() -> None
     excess = ControlComparison("random-features", "color", "mean", "backbone.01.residual", 0.6, 0.2)
     other = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.5, 0.01)
     today = Controls(
-        (baseline("random-features"), baseline("pixels")), (untrained("backbone.01.residual", True),), (excess, other)
+        (baseline("random-features"), baseline("pixels")),
+        (untrained("backbone.01.residual", True),),
+        (excess, other),
     )
     former = json.dumps(today.to_json())
     for now, before in (

@@ -139,7 +139,7 @@ def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkey
 
 
 @pytest.mark.parametrize("seed", [0, 11, 39])
-def test_steps_that_nobody_looked_back_at_never_go_in_circles(seed: int) -> None:
+def test_steps_that_are_not_looked_back_at_never_go_in_circles(seed: int) -> None:
     """One enormous sample: guessed wrong it has no curvature, and a whole step is far too long."""
     features = np.random.default_rng(0).standard_normal((1200, 400))
     features[0] *= 1e4

@@ -1,6 +1,7 @@
 """What an untrained conjunction of pictures and words gets for free on the embedded suite, by category.
 
-    python benchmarks/suite_binding.py [--versions 1,2] [--items 150] [--seeds 0] [--width 96] [--categories …]
+    python benchmarks/suite_random_features.py [--versions 1,2] [--items 150] [--seeds 0] [--width 96]
+        [--categories …]
 
 Accuracy in % of the control `random-features`: of its five random layers the best one, and their mean, on the
 control's own nested folds. No model is asked. Several seeds: other drawings of the same version, averaged.
