@@ -15,6 +15,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from tests.retention.asked_runs import SaidRun, acted, asked
+from tests.retention.paired_limits import mover
 
 
 def by_chance(seed: int, share: float) -> dict[str, np.ndarray]:
@@ -105,17 +106,8 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
         ]
         ps.append(sum(one >= abs(sum(values)) for one in sums) / len(sums))
         assert gap.p == pytest.approx(ps[-1])
-        draw = np.random.default_rng(7)
-        own = np.array(list(gains.values())) / 4
-        means = own[draw.integers(0, len(own), (4000, len(own)))].mean(axis=1)
-        low, high = np.percentile(means, [2.5, 97.5])
-        unlike = len(own) - max(np.unique(own, return_counts=True)[1])  # what else there may be, see `reach`
-        share = 1 - min(1, 0.05 * unlike) ** (1 / len(own))
-        low, high = (
-            min(low, own.mean() - share * (own.mean() + 1)),
-            max(high, own.mean() + share * (1 - own.mean())),
-        )
-        assert gap.difference_ci == (pytest.approx(low, abs=0.04), pytest.approx(high, abs=0.04))
+        tables = [run.loc[here.index].reset_index() for run in (reader, policy)]
+        assert gap.difference_ci == pytest.approx(mover(*tables))
         assert (gap.paired, gap.same_frames) == (True, True)
     smaller, larger = sorted(ps)
     corrected = {smaller: min(1, 2 * smaller), larger: min(1, max(2 * smaller, larger))}
