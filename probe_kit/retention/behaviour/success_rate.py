@@ -160,6 +160,8 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     margin = chance_margin(independent_items(episodes))
     name, reason = regime(sr, margin, share_wrong, share_outside, "parse" in episodes)
     interval = success_share(episodes).interval()
+    if name == Regime.KNOWLEDGE and interval.low <= 0.5:
+        name, reason = Regime.NO_RELIABLE_KNOWLEDGE, f"{reason}, but its 95 % interval includes one half"
     original, swapped = (_rate(correct[episodes["layout"] == layout]) for layout in ("original", "swapped"))
     placed = episodes["side_placed"][episodes["outcome"] != "oob"]
     return SuccessRate(

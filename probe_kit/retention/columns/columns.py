@@ -473,7 +473,8 @@ _SCORE = (
 )
 _VERDICT = (
     "Shown: above chance, family-wise, and above every control that was run. Absent: not shown, and the best site "
-    "can be at most as accurate as stated, below 65 %. Not shown: everything else, with what it could be at most."
+    "can be at most as accurate as stated, below 65 % by default. Not shown: everything else, with what it could "
+    "be at most."
 )
 _EXCEEDS = (
     "The controls that the best site is shown to exceed, paired by question: chance; random-features, an "

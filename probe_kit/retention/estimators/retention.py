@@ -17,6 +17,7 @@ from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Strea
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.mover import NO_LIMITS
 from probe_kit.statistics.estimates.retention import Ratio, retention
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -27,6 +28,10 @@ Iterations = Literal["all", "best", "last"] | int
 Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
 curve draws a line for each of `all`, and one line for the `best` of every layer.
 """
+
+
+NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
+"""In place of retention where no score is defined."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +113,7 @@ def measure_retention(
     streams = curve_scores(curve, iterations, suite)
     if streams is None:
         published = _ratio(action.accuracy - CHANCE, backbone.accuracy - CHANCE)
-        note = "n/a (too few groups of items)"
-        return Retention(backbone, action, nan, NO_LIMITS, published, False, note, None)
+        return Retention(backbone, action, nan, NO_LIMITS, published, False, NO_SCORES, None)
     found: Ratio = retention(streams.scores)
     return Retention(
         backbone=backbone,
@@ -128,12 +132,18 @@ def published_ratio(streams: StreamScores) -> float:
     return _ratio(streams.peak(ACTION) - CHANCE, streams.peak(BACKBONE) - CHANCE)
 
 
-def missing_signal(exceeds: Exceeds, at_most: Mapping[str, float]) -> str:
+def missing_signal(exceeds: Exceeds, at_most: Mapping[str, float], absent_below: float = ABSENT_BELOW) -> str:
     """Why there is nothing to retain; empty where the backbone's signal is shown."""
     if exceeds["chance"] is None:
         return "n/a (no permutations)"
     if not exceeds["chance"]:
-        return f"n/a (backbone not shown, could be up to {100 * at_most[BACKBONE]:.0f} %)"
+        most = f"{100 * at_most[BACKBONE]:.0f} %"
+        absent = at_most[BACKBONE] < absent_below
+        return (
+            f"n/a (backbone absent, at most {most})"
+            if absent
+            else f"n/a (backbone not shown, could be up to {most})"
+        )
     equals = [name for name in (RANDOM_FEATURES, UNTRAINED) if exceeds[name] is False]
     return f"n/a (backbone not shown to beat {' and '.join(equals)})" if equals else ""
 

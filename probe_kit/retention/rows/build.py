@@ -19,6 +19,7 @@ from probe_kit.retention.behaviour.success_rate import (
 )
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import (
+    NO_SCORES,
     Iterations,
     Peak,
     best_site,
@@ -262,14 +263,14 @@ class _ProbedCategory:
         if len(self.peaks) < 2:
             return RetentionPart(note="n/a (one stream only)")
         if self.streams is None:
-            return RetentionPart(note="n/a (too few groups of items)")
+            return RetentionPart(note=NO_SCORES)
         found, exceeds = retention(self.streams.scores), self.exceeds(self.peaks["backbone"])
         return RetentionPart(
             value=_number(found.value),
             ci=limits(found.interval),
             published=_number(published_ratio(self.streams)),
             defined=has_signal(exceeds),
-            note=missing_signal(exceeds, self.streams.at_most),
+            note=missing_signal(exceeds, self.streams.at_most, self.settings.absent_below),
         )
 
     def controls_of(self, success: SuccessRate) -> ControlScores:

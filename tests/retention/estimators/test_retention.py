@@ -12,7 +12,7 @@ from scipy import stats
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import best_site, measure_retention
-from probe_kit.retention.estimators.retention import Retention, curve_scores
+from probe_kit.retention.estimators.retention import NO_SCORES, Retention, curve_scores
 from probe_kit.retention.estimators.stream_scores import StreamScores
 from probe_kit.train import ProbeCurve
 
@@ -166,7 +166,7 @@ def test_without_backbone_signal_retention_is_not_defined_but_kept(
     found, streams = measured(curve)
     assert not found.defined
     assert found.published == pytest.approx(0.08 / 0.06)
-    assert found.note == f"n/a (backbone not shown, could be up to {100 * streams.at_most['backbone']:.0f} %)"
+    assert found.note == f"n/a (backbone absent, at most {100 * streams.at_most['backbone']:.0f} %)"
 
 
 def test_what_a_stream_could_be_at_most_is_the_largest_of_its_sites_own_limits(
@@ -217,7 +217,7 @@ def test_a_backbone_exactly_at_chance_has_no_ratio(curve_of: CurveOf, episodes: 
 def test_three_groups_have_a_published_ratio_and_no_score(curve_of: CurveOf, outcome_table: Outcomes) -> None:
     found = measure_retention(curve_of(outcome_table(6, 0, 0), [1.0], [[1.0]]))
     assert found is not None
-    assert (found.streams, found.defined, found.note) == (None, False, "n/a (too few groups of items)")
+    assert (found.streams, found.defined, found.note) == (None, False, NO_SCORES)
     assert isnan(found.value)
     assert not found.interval.bounded
     assert found.published == 1
