@@ -9,6 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -214,9 +216,8 @@ RUNS = {
     "docs/spatialvla.md": ("RUN_SPATIALVLA", "RUN_OPENVLA", "RUN_PI0"),
     "docs/success-rate.md": ("RUN",),
 }
-"""Runs that a page takes for granted, made of the embedded policy."""
+"""Runs that a page takes for granted, made of the embedded policy; all of a page are different runs."""
 
-SHORT = " --categories color --items 12 --max-steps 12"
 STAND_INS = {
     "README.md": {
         r"--model pi0 --checkpoint FOLDER": "--model pi0-tiny --items 12 --max-steps 12",
@@ -315,22 +316,31 @@ class Terminal:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with its probes; the cache in which its suite was drawn is not the pages'."""
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+    """By number, runs with their probes, each of other settings, because a table refuses a copy of a run.
+
+    Each is made once, when it is first asked for; the cache in which their suite was drawn is not the pages'.
+    """
     terminal = Terminal(tmp_path_factory.mktemp("made"))
-    terminal.type(f"probe-kit extract --model pi0-tiny{SHORT} --out RUN")
-    terminal.type("probe-kit train RUN --permutations 20")
-    return terminal.folder / "RUN"
+
+    @cache
+    def make(number: int) -> Path:
+        length = f"--categories color --items 12 --max-steps {12 - number}"
+        terminal.type(f"probe-kit extract --model pi0-tiny {length} --out RUN-{number}")
+        terminal.type(f"probe-kit train RUN-{number} --permutations 20")
+        return terminal.folder / f"RUN-{number}"
+
+    return make
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TO_TYPE)
 def test_the_commands_of_a_page_run_in_their_order_with_an_empty_cache(
-    page: str, made: Path, tmp_path: Path
+    page: str, made: Callable[[int], Path], tmp_path: Path
 ) -> None:
     terminal = Terminal(tmp_path)
-    for name in RUNS.get(page, ()):
-        shutil.copytree(made, tmp_path / name)
+    for number, name in enumerate(RUNS.get(page, ())):
+        shutil.copytree(made(number), tmp_path / name)
     if page == "docs/suite.md":
         _write_questions(tmp_path)
     for command in TO_TYPE[page]:

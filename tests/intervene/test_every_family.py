@@ -113,17 +113,17 @@ def asked_of(
             **COMMON, sites=("backbone.00", last, late), roles=("all", "image", "language", role)
         ),
         "direction": lambda: Interchange(
-            **COMMON, sites=("backbone.01",), roles=("image",), direction="mean-difference", controls=1
+            **COMMON, sites=("backbone.01",), roles=("all",), direction="mean-difference", controls=1
         ),
         "kv": lambda: Interchange(**COMMON, sites=("kv.*",), roles=("all", "image")),
         "per-step": lambda: Interchange(**COMMON | {"items": 2}, sites=("backbone.00", last), readout="per-step"),
         "tiles": lambda: Interchange(**COMMON, sites=("backbone.00",), roles=("image.left", "image.right")),
-        "steer": lambda: Steering(**COMMON, sites=("backbone.01",), role="image", coefficients=(2.0,), controls=1),
-        "erase": lambda: ConceptErasure(**COMMON, sites=("backbone.01",), controls=1),
+        "steer": lambda: Steering(**COMMON, sites=("backbone.01",), role="all", coefficients=(2.0,), controls=1),
+        "erase": lambda: ConceptErasure(**COMMON, sites=("backbone.01",), roles=("all",), controls=1),
         "attention": lambda: AttentionReadout(**COMMON | {"items": 2}),
         "attention-shadow": lambda: AttentionReadout(**COMMON | {"items": 1}, readout="per-step"),
         "closed-loop": lambda: ClosedLoop(
-            **COMMON | {"items": 2}, targets=("backbone.00|all", "backbone.01|image")
+            **COMMON | {"items": 2}, targets=tuple(dict.fromkeys(("backbone.01|all", f"{last}|all")))
         ),
     }[kind]()
 

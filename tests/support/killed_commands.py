@@ -17,9 +17,10 @@ from random import Random
 from uuid import uuid4
 
 from probe_kit.extract import verify_run
-from probe_kit.extract.run_layout import CERTIFICATES, COMMITS, INTERVENTIONS, PROBES
+from probe_kit.extract.run_layout import CERTIFICATES, COMMITS
 from probe_kit.extract.run_layout import TIMES as TIMES_OF_EPISODES
 from probe_kit.extract.store.format.bundles import HEAD, PARTIAL
+from probe_kit.extract.store.format.bundles import TIMES as TIMES_OF_RESULTS
 
 LONGEST_S = 900
 """Seconds that one command may take."""
@@ -28,7 +29,7 @@ ORPHANS_END_S = 30
 _TICK_S = 0.02
 _MARK = "PROBE_KIT_TEST_MARK"
 _TIMES = ("created", "asked", "blake2b")
-"""What the heads of stored results say of the clock, and the hash over it."""
+"""What a result's record of times says of the clock, and the hash over it."""
 _UNFINISHED = (".tmp", ".partial", ".unfinished", ".writing")
 
 
@@ -225,18 +226,16 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def run_files(run: Path) -> dict[str, bytes]:
-    """Every object of a run: without certificates of processes and seconds of episodes, and results without the
-    times in their heads.
-    """
+    """Every object of a run, without certificates of processes, seconds of episodes and the clock of results."""
     return {
-        key: _timeless(content) if key.startswith((PROBES, INTERVENTIONS)) and key.endswith(HEAD) else content
+        key: _timeless(content) if key.endswith(f"/{TIMES_OF_RESULTS}") else content
         for key, content in files_of(run).items()
         if not key.startswith((f"{CERTIFICATES}/", f"{TIMES_OF_EPISODES}/"))
     }
 
 
-def _timeless(head: bytes) -> bytes:
-    return json.dumps({name: value for name, value in json.loads(head).items() if name not in _TIMES}).encode()
+def _timeless(record: bytes) -> bytes:
+    return json.dumps({name: value for name, value in json.loads(record).items() if name not in _TIMES}).encode()
 
 
 def committed(*runs: Path) -> set[str]:

@@ -22,6 +22,11 @@ RANK = 5
 FEWEST = 4
 """Episodes of either answer that a position must have in training; with fewer it is left as it is."""
 _TINY = 1e-10
+NO_DIRECTION = (
+    "the class means of left and right are equal, as before a layer combines picture and instruction; choose "
+    "later --sites or other --roles (to patch whole tokens only: --direction none)"
+)
+"""What is true where directions of an answer are asked for and none exists."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class Eraser:
     """x becomes x − Σ_k removed_k (read_k · (x − mean)), at every position of its own.
 
     means: (T, D). removed, read: (T, K, D) or, the same for all positions, (1, K, D). fitted: (T,) positions at
-    which there was enough to learn from; the others are left as they are.
+    which there was enough to learn from and a direction to find; the others are left as they are.
     In float64: rounding to fewer digits leaves traces of the answer in a plane that is otherwise empty, where
     ordinary least squares find it.
     """
@@ -104,8 +109,8 @@ class Eraser:
 def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) -> Eraser:
     """What erases the answer from such tokens. left: (N,) the answer.
 
-    Raises UsageError if no position has episodes enough of either answer, or if there are fewer directions than
-    the method's name says.
+    Raises UsageError if no position has episodes enough of either answer, or a direction, or if there are fewer
+    directions than the method's name says.
     """
     _check(tokens, left)
     centred, means = tokens.centred()
@@ -116,10 +121,13 @@ def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) ->
     elif method.way == "inlp":
         removed = read = _inlp(centred, tokens.present, left, usable, method.rank)
     else:
-        removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank)
-    fitted = usable if len(removed) == usable.size else slice(None)
-    _check_more(method, int((np.linalg.norm(removed[fitted], axis=-1) > 0).sum(axis=1).min()))
-    return Eraser(means, removed, read, usable)
+        size = float(np.abs(tokens.values[tokens.present]).max())
+        removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank, size)
+    there = (np.linalg.norm(removed, axis=-1) > 0).sum(axis=1)
+    if not there.any():
+        raise UsageError(f"no direction for {method}: {NO_DIRECTION}")
+    _check_more(method, int(there[there > 0].min()))
+    return Eraser(means, removed, read, usable & (there > 0))
 
 
 def fit_control(
@@ -132,7 +140,7 @@ def fit_control(
     """
     _check(tokens, left)
     centred, means = tokens.centred()
-    usable = tokens.usable(left)
+    usable = own.fitted
     if method.way == "leace":
         answer = _answer(tokens, left)
         label = np.where(tokens.present, draw.normal(size=len(left))[:, None], 0.0)
@@ -187,6 +195,8 @@ def leace_direction(centred: Array, label: Array, shrinkage: float | None = None
     shrunk = (1 - amount) * variances + amount * variances.sum() / width
     kept = variances > _TINY * max(variances.max(initial=0.0), _TINY)
     read = axes[kept].T @ ((axes[kept] @ along) / shrunk[kept])
+    if np.linalg.norm(along) <= _TINY * np.sqrt(variances.sum() * (label @ label) / count):
+        return np.zeros(width), np.zeros(width)
     strength = float(along @ read)
     return (along, read / strength) if strength > 0 else (np.zeros(width), np.zeros(width))
 
@@ -204,7 +214,7 @@ def _check_more(method: Method, there: int) -> None:
     if method.rank > there:
         raise UsageError(
             f"{method} asks for {method.rank} directions, and these tokens have {there} to find; expected "
-            f"{method.way}:{max(there, 1)} or fewer"
+            f"{method.way}:{there} or fewer"
         )
 
 
@@ -244,6 +254,8 @@ def _inlp(
             past = found[position, :number]
             rest = (values - (values @ past.T) @ past) / scale
             weights = LogisticRegression(C=1.0, max_iter=200).fit(rest, left[rows]).coef_
+            if np.linalg.norm(weights) <= _TINY:
+                break
             found[position, number] = _basis(weights, past=past)[0]
     return found
 
@@ -257,10 +269,13 @@ def _differences(centred: Array, present: NDArray[np.bool_], left: NDArray[np.bo
     return np.asarray(sums[0] - sums[1])
 
 
-def _shared(differences: Array, rank: int) -> Array:
-    """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token."""
+def _shared(differences: Array, rank: int, size: float) -> Array:
+    """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token.
+
+    size: of the largest number whose differences these are.
+    """
     _, values, axes = np.linalg.svd(differences, full_matrices=False)
-    chosen = axes[: min(rank, int((values > _TINY * max(values[0], _TINY)).sum()))]
+    chosen = axes[: min(rank, int((values > _TINY * max(values[0], size)).sum()))]
     return np.asarray(chosen[None])
 
 

@@ -18,12 +18,15 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.intervene.edits.linear_erasure import NO_DIRECTION
 from probe_kit.statistics.folds import grouped_folds
 
 Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
 DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
 FOLDS = 5
+_ROUNDING = 1e-6
+"""Share of a number's size below which a difference of stored float32 means is rounding."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ def view_of(role: str) -> str:
 def fit_directions(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> PooledDirections:
     """Of every category of the run, from what is pooled over the tokens of `role` at `site`.
 
-    Raises UsageError for an unknown direction, UnknownSiteError for a site or view that is not stored.
+    Raises UsageError for an unknown direction and for equal class means, UnknownSiteError for a site or view that
+    is not stored.
     """
     if direction not in DIRECTIONS:
         raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
@@ -87,8 +91,10 @@ def fit_directions(run: Run, site: Site, role: str, direction: str, controls: in
         for number, fold in enumerate(folds):
             fold_of |= {str(name): number for name in episodes["episode_id"].to_numpy()[rows[fold.test]]}
             training, labels = features[rows[fold.train]], left[fold.train].astype(bool)
-            unit = _direction(training, labels, direction)
             difference = training[labels].mean(axis=0) - training[~labels].mean(axis=0)
+            if (np.abs(difference) <= _ROUNDING * np.abs(training).max(axis=0)).all():
+                raise UsageError(f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}")
+            unit = _direction(training, labels, direction)
             widths.append(abs(float(difference @ unit)) / 2)
             of_fold[direction].append(unit)
             draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role, number))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens, fit_control, fit_eraser
@@ -90,12 +91,15 @@ def fit_by_fold(
 ) -> Fits:
     """An eraser called `method` and its controls, for every fold of the groups of one category.
 
-    Raises UsageError where no position has episodes enough to learn from.
+    Raises UsageError, which names category, site and role, where there is nothing to learn from: see `fit_eraser`.
     """
     groups = min(FOLDS, np.unique(own.groups).size)
     folds = grouped_folds(own.left.astype(int), own.groups, groups, derive_seed("erase", seed, category))
     draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role))
-    return [(fold, _fitted(own, fold, method, controls, draw)) for fold in folds]
+    try:
+        return [(fold, _fitted(own, fold, method, controls, draw)) for fold in folds]
+    except UsageError as error:
+        raise UsageError(f"{category}, {site}, role {role}: {error}") from error
 
 
 def by_episode(own: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:

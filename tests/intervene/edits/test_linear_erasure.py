@@ -32,6 +32,16 @@ def drawn(episodes: int = 120, gap: float = 2.0, seed: int = 0) -> tuple[PaddedT
     return PaddedTokens(values, np.ones((episodes, POSITIONS), bool)), left
 
 
+def balanced(tokens: PaddedTokens, left: NDArray[np.bool_], positions: list[int]) -> PaddedTokens:
+    """At these positions every value occurs as often with either answer, as before the first layer of a suite
+    that asks of every picture both ways: class means differ by rounding alone.
+    """
+    values = tokens.values.copy()
+    for position in positions:
+        values[left, position] = values[np.flatnonzero(~left)[::-1], position]
+    return PaddedTokens(values, tokens.present)
+
+
 def test_after_leace_no_linear_probe_reads_anything_in_what_it_was_fitted_on() -> None:
     """Of any position, and of their mean: least squares explain nothing, logistic regression gives the prior."""
     tokens, left = drawn()
@@ -173,6 +183,29 @@ def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, there: int
     tokens, left = drawn()
     with pytest.raises(UsageError, match=f"asks for .* have {there} to find; expected .*:{there} or fewer"):
         fit_eraser(tokens, left, Method.of(name))
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_rounding_is_no_direction(method: Method, offset: float) -> None:
+    tokens, left = drawn()
+    tokens = PaddedTokens(tokens.values + offset, tokens.present)
+    with pytest.raises(UsageError, match=r"no direction.*later --sites"):
+        fit_eraser(balanced(tokens, left, [0, 1, 2]), left, method)
+
+
+@pytest.mark.parametrize("method", [Method.of(name) for name in ("leace", "inlp:3")], ids=str)
+def test_a_position_that_says_nothing_of_the_answer_is_left_as_it_is(method: Method) -> None:
+    """By the eraser and by its control, which would otherwise take away more than the eraser."""
+    tokens, left = drawn()
+    tokens = balanced(tokens, left, [1])
+    tokens.values[:, 1, :6] = 7.0  # as a token that is the same in every instruction
+    own = fit_eraser(tokens, left, method)
+    for eraser in (own, fit_control(tokens, left, method, own, np.random.default_rng(0))):
+        assert eraser.fitted.tolist() == [True, False, True]
+        erased = eraser(tokens.values)
+        np.testing.assert_array_equal(erased[:, 1], tokens.values[:, 1])
+        assert (erased[:, [0, 2]] != tokens.values[:, [0, 2]]).any()
 
 
 @pytest.mark.parametrize(("way", "most"), [("mean-difference", 1), ("inlp", 2)])

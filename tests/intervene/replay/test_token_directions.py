@@ -52,6 +52,18 @@ def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
             assert abs(float(control @ direction)) < 1e-9
 
 
+@pytest.mark.parametrize("method", ["mean-difference:1", "leace", "inlp:2"])
+def test_a_place_without_a_direction_is_refused_by_category_site_and_role(method: str) -> None:
+    """Before a layer combines them, each picture of a balanced suite has either answer equally often."""
+    values = np.random.default_rng(0).normal(size=(GROUPS, POSITIONS, WIDTH)) + 1e3
+    own = marked(np.zeros(WIDTH))
+    same = TokenFeatures(
+        own.episodes, own.groups, own.left, PaddedTokens(np.repeat(values, 4, axis=0), own.tokens.present)
+    )
+    with pytest.raises(UsageError, match=f"color, {SITE}, role image: no direction for {method}"):
+        fit_by_fold(same, SITE, "image", Method.of(method), 1, 0, "color")
+
+
 def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
     own, method = marked(np.eye(WIDTH)[3]), Method.of("mean-difference:2")
     before = by_episode(own, fit_by_fold(own, SITE, "image", method, 1, 0, "color"))

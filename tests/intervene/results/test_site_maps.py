@@ -161,6 +161,14 @@ def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
         fit_directions(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
 
 
+@pytest.mark.parametrize("direction", ["mean-difference", "probe"])
+@pytest.mark.parametrize("role", ["all", "image", "language"])
+def test_the_networks_input_has_no_direction(copy: Run, direction: str, role: str) -> None:
+    """The suite asks of every picture both ways; the first layer combines it with the words."""
+    with pytest.raises(UsageError, match=f"color, .*00.*, role {role}: no direction for {direction}"):
+        fit_directions(copy, Site("backbone", 0), role, direction, 1, seed=0)
+
+
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
     episode, category = str(copy.episodes["episode_id"][0]), str(copy.episodes["category"][0])
     mean, probe = (
