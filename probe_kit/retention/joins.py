@@ -22,7 +22,7 @@ class Joins:
 
 
 def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
-    """Known, encoded, used of every pair of a VLM run and a policy run.
+    """Answered, encoded, acted on of every pair of a VLM run and a policy run.
 
     runs: those that the table is made of, as it reads them; probes and outcome rule are the table's. Tests are
     corrected over all pairs.

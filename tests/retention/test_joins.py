@@ -1,4 +1,4 @@
-"""Known, encoded, used as a figure and in the report."""
+"""Answered, encoded, acted on as a figure and in the report."""
 
 from pathlib import Path
 
@@ -30,7 +30,12 @@ def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
     assert axes is not None
     assert [patch.get_width() for patch in axes.patches] == [25.0] * 4  # type: ignore[attr-defined]
     labels = [text.get_text() for legend in axes.figure.legends for text in legend.get_texts()]  # type: ignore[union-attr]
-    assert labels == ["known, used", "not known, used", "known, not used", "not known, not used"]
+    assert labels == [
+        "answered, acted on",
+        "not answered, acted on",
+        "answered, not acted on",
+        "not answered, not acted on",
+    ]
 
 
 def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Known, encoded, used on a console and in the report."""
+"""Answered, encoded, acted on on a console and in the report."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 Columns = Sequence[tuple[str, Callable[[CategoryCounts], str]]]
 _LEGEND = (
-    "known: answered right; encoded: the probe's held-out decision right; used: acted right; each in both layouts "
-    "of an item, which a coin manages in 25 %"
+    "answered: answered right; encoded: the probe's held-out decision right; acted on: acted right; each in "
+    "both layouts of an item, which a coin manages in 25 %"
 )
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
@@ -25,12 +25,12 @@ def rich_known_used(joined: KnownUsedTable) -> "Group":
     from rich.console import Group
     from rich.text import Text
 
-    title = f"Known, encoded, used: {joined.asked} (by {joined.score}) · {joined.acted}"
-    seen = f"probes in view {joined.view}" if joined.view else "no probes: known and used only"
+    title = f"Answered, encoded, acted on: {joined.asked} (by {joined.score}) · {joined.acted}"
+    seen = f"probes in view {joined.view}" if joined.view else "no probes: answered and acted on only"
     rows = joined.rows
     tables = [
-        _table(title, f"{_LEGEND}; {seen}", rows, [("Items", _SHARES), ("Known but not used", _LOST)]),
-        _table("Which of them: known · encoded · used (expected of coins)", "", rows, [("", _codes(rows))]),
+        _table(title, f"{_LEGEND}; {seen}", rows, [("Items", _SHARES), ("Answered but not acted on", _LOST)]),
+        _table("Which of them: VLM · probe · action right (expected of coins)", "", rows, [("", _codes(rows))]),
         _table("Equally many?", _TESTS, rows, [("", _tests())]),
         _table("Single episodes (nothing is tested)", "", rows, [("", _episodes(rows))]),
     ]
@@ -39,12 +39,12 @@ def rich_known_used(joined: KnownUsedTable) -> "Group":
 
 def known_used_tables(joined: KnownUsedTable) -> list[TextTable]:
     """The same counts and tests as tables of text, for pages."""
-    seen = f"probes in view {joined.view}" if joined.view else "no probes: known and used only"
-    title = f"Known, encoded, used: {joined.asked} (by {joined.score}) · {joined.acted}"
+    seen = f"probes in view {joined.view}" if joined.view else "no probes: answered and acted on only"
+    title = f"Answered, encoded, acted on: {joined.asked} (by {joined.score}) · {joined.acted}"
     rows = joined.rows
     return [
         _plain(title, f"{_LEGEND}; {seen}", rows, [*_SHARES, *_LOST]),
-        _plain("Which of them: known · encoded · used (expected of coins)", _CODES, rows, _codes(rows)),
+        _plain("Which of them: VLM · probe · action right (expected of coins)", _CODES, rows, _codes(rows)),
         _plain("Equally many?", _TESTS, rows, _tests()),
     ]
 
@@ -71,9 +71,15 @@ _SHARES: Columns = [
     ("signal", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
 ]
 _LOST: Columns = [
-    ("known and encoded", lambda row: "–" if row.known_and_encoded is None else str(row.known_and_encoded)),
-    ("of these not used % [95 %]", lambda row: with_limits(percent(row.not_used_share), row.not_used_ci, percent)),
-    ("known with used, p", lambda row: number(row.p_linked, 4)),
+    (
+        "answered and encoded",
+        lambda row: "–" if row.answered_and_encoded is None else str(row.answered_and_encoded),
+    ),
+    (
+        "of these not acted on % [95 %]",
+        lambda row: with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci, percent),
+    ),
+    ("answered with acted on, p", lambda row: number(row.p_linked, 4)),
 ]
 
 
@@ -99,8 +105,8 @@ def _episodes_of(code: str) -> Callable[[CategoryCounts], str]:
 
 
 def _spelt(code: str) -> str:
-    """`101` as K e U: a capital for what is right, a small letter for what is not."""
-    letters = zip("KEU", code, strict=True)
+    """`101` as V p A: a capital for what is right, a small letter for what is not."""
+    letters = zip("VPA", code, strict=True)
     return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
 
 

@@ -1,7 +1,7 @@
-"""Known, encoded, used: what a reader answers, what a probe reads, and what the policy does, question by question.
+"""Answered, encoded, acted on: what a VLM answers, a probe reads and a policy does, question by question.
 
-known: the reader answers right. encoded: the probe's held-out decision is right, where probes beat chance,
-random-features and untrained. used: the action follows. The unit is the item, right in both layouts. A fixed
+answered: the VLM answers right. encoded: the probe's held-out decision is right, where probes beat chance,
+random-features and untrained. acted on: the cube ends right. The unit is the item, right in both layouts. A fixed
 side is right in exactly one layout, so a bias never counts. Guessing is right in both for 25 % of items.
 """
 
@@ -67,12 +67,12 @@ class CategoryCounts:
     """One category, or all of them (`all`).
 
     answered_correctly, encoded, acted_correctly: items right in both layouts. counts: items by these three, such
-    as `101` for known, not encoded, used; without probes `1-1`. guessed: as many as coins would give. episodes:
-    the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance and every
-    control that was run, without which encoded means nothing; None without probes, or over categories that differ
-    in it. not_used: of the items known and encoded those the action does not follow, with the exact 95 % interval
-    of their share. p_linked: whether known and used go together among encoded items: Fisher's exact test, over
-    categories a permutation within them.
+    as `101` for answered, not encoded, acted on; without probes `1-1`. guessed: as many as coins would give.
+    episodes: the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance
+    and every control that was run, without which encoded means nothing; None without probes, or over categories
+    that differ in it. not_acted_on: of the items answered right and encoded those the action does not follow,
+    with the exact 95 % interval of their share. p_linked: whether answered and acted on go together among
+    encoded items: Fisher's exact test, over categories a permutation within them.
     """
 
     category: str
@@ -86,10 +86,10 @@ class CategoryCounts:
     episodes: Mapping[str, int]
     has_signal: bool | None
     comparisons: tuple[Comparison, ...]
-    known_and_encoded: int | None = None
-    not_used: int | None = None
-    not_used_share: float | None = None
-    not_used_ci: tuple[float, float] | None = None
+    answered_and_encoded: int | None = None
+    not_acted_on: int | None = None
+    share_not_acted_on: float | None = None
+    share_not_acted_on_ci: tuple[float, float] | None = None
     p_linked: float | None = None
 
 
@@ -112,7 +112,7 @@ class KnownUsedTable:
         return asdict(self)
 
     def to_frame(self) -> "pd.DataFrame":
-        """A row per category and code of known, encoded, used: counts of items and episodes, and coins' share."""
+        """A row per category and code of the three: counts of items and episodes, and coins' share."""
         import pandas as pd
 
         return pd.DataFrame(
@@ -358,17 +358,17 @@ def _comparisons(known: Bools, encoded: Bools | None, used: Bools, groups: NDArr
 
 
 def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
-    """What becomes of items that are known and encoded."""
+    """What becomes of items that are answered right and encoded."""
     if encoded is None:
         return {}
     known, _, used = sets
     both = known & encoded
     lost, count = int((both & ~used).sum()), int(both.sum())
     return {
-        "known_and_encoded": count,
-        "not_used": lost,
-        "not_used_share": lost / count if count else None,
-        "not_used_ci": clopper_pearson(lost, count),
+        "answered_and_encoded": count,
+        "not_acted_on": lost,
+        "share_not_acted_on": lost / count if count else None,
+        "share_not_acted_on_ci": clopper_pearson(lost, count),
         "p_linked": fisher_p(known[encoded], used[encoded]) if encoded.any() else None,
     }
 

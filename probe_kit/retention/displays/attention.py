@@ -1,4 +1,4 @@
-"""What is weighed: by block, how much attention the acting stream pays to the pictures, the words and itself."""
+"""Attention by block: how much attention the acting stream pays to the pictures, the words and itself."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -64,13 +64,13 @@ class AttentionDisplay(Panelled):
         return cls._of(found, category, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, weighed: AttentionShares, category: str, certificate: ProvenanceLine) -> Self:
+    def _of(cls, recorded: AttentionShares, category: str, certificate: ProvenanceLine) -> Self:
         left_out = {ALL, "special", *TILE_ROLES}
-        blocks = np.unique(weighed.frame(("block",))["block"].to_numpy(np.int64))
-        roles = tuple(role for role in weighed.shares() if role not in left_out)
+        blocks = np.unique(recorded.frame(("block",))["block"].to_numpy(np.int64))
+        roles = tuple(role for role in recorded.shares() if role not in left_out)
 
         def shares(*by: Axis) -> Percent:
-            frame = weighed.frame(("block", *by))
+            frame = recorded.frame(("block", *by))
             table = frame.pivot_table(index=["role", "block"], columns=list(by) or None, values="share")
             return 100 * np.stack([table.loc[role].loc[blocks].to_numpy(float) for role in roles])
 
@@ -111,8 +111,8 @@ class AttentionDisplay(Panelled):
 def attention_curve(run: RunReader) -> "Figure":
     """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
     displays = [
-        AttentionDisplay._of(weighed, category, ProvenanceLine.of_run(run))
-        for category, weighed in stored_attention(run).items()
+        AttentionDisplay._of(recorded, category, ProvenanceLine.of_run(run))
+        for category, recorded in stored_attention(run).items()
     ]
     if not displays:
         AttentionDisplay.from_run(run, "any")

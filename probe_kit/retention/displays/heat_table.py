@@ -41,7 +41,7 @@ class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
-    ruled: what the title says of the outcome rule.
+    rule_words: what the title says of the outcome rule.
     """
 
     rows: tuple[str, ...]
@@ -54,18 +54,18 @@ class HeatTableDisplay(Display):
     notes: ClassVar[Mapping[Modes, str]] = {}
     scale: ClassVar[float] = 100.0
     digits: ClassVar[int] = 1
-    ruled: str = ""
+    rule_words: str = ""
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def _ruled(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
+    def _of_behaviour(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
         """Of success rates, which belong to an outcome rule."""
         rows = once_per_category(table.all_rows)
         found = cls._of(rows, cell)
         modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
         found.title = cls.title.replace(RATE["acts"], RATE[modes])
         found.note = cls.notes.get(modes, cls.note)
-        found.ruled = f", {rule_name(acted)}" if acted else ""
+        found.rule_words = f", {rule_name(acted)}" if acted else ""
         return found
 
     @classmethod
@@ -98,9 +98,9 @@ class HeatTableDisplay(Display):
                 self._draw_cell(axes, column, number, cell)
         self._draw_names(axes)
         if figure is None:
-            axes.set_title(self.title + self.ruled, fontsize=10, loc="left", pad=34)
+            axes.set_title(self.title + self.rule_words, fontsize=10, loc="left", pad=34)
         else:
-            figure.suptitle(self.title + self.ruled, x=0.01, ha="left", fontsize=10)
+            figure.suptitle(self.title + self.rule_words, x=0.01, ha="left", fontsize=10)
             self._draw_key(figure)
         caption(figure, *self.certificates)
         self.ax_ = axes
@@ -153,7 +153,9 @@ class SuccessTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE))
+        return cls._of_behaviour(
+            table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE)
+        )
 
 
 class SideTableDisplay(HeatTableDisplay):
@@ -171,7 +173,7 @@ class SideTableDisplay(HeatTableDisplay):
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
         """From the retention table of any runs. Raises UsageError if it is empty."""
-        return cls._ruled(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
+        return cls._of_behaviour(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
 
 
 class RetentionTableDisplay(HeatTableDisplay):

@@ -108,18 +108,18 @@ class KnowledgeActionDisplay(Display):
 
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
-    prefix = stream == "backbone"
-    accuracy = row.backbone.score if prefix else row.action.score
+    in_backbone = stream == "backbone"
+    accuracy = row.backbone.score if in_backbone else row.action.score
     if accuracy is None or row.success.sr is None or row.success.ci is None:
         return None
     return GapPoint(
         model=model_name(row),
         category=row.category,
         accuracy=accuracy,
-        accuracy_ci=row.backbone.ci if prefix else row.action.ci,
+        accuracy_ci=row.backbone.ci if in_backbone else row.action.ci,
         sr=row.success.sr,
         sr_ci=row.success.ci,
-        significant=row.backbone.has_signal if prefix else row.action.has_signal,
+        significant=row.backbone.has_signal if in_backbone else row.action.has_signal,
     )
 
 

@@ -1,4 +1,4 @@
-"""Known, encoded, used: what becomes of the items of each category, as one bar of shares."""
+"""Answered, encoded, acted on: what becomes of the items of each category, as one bar of shares."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
     "1-0": (VERMILION, "///"),
     "0-0": ("#D9D9D9", ""),
 }
-"""Colour and hatch of what is known, encoded, used: used first, then what is not."""
+"""Colour and hatch of what is answered, encoded, acted on: acted on first, then what is not."""
 _LEAST = 6.0  # percent of a bar that has room for a number
 
 
@@ -50,8 +50,8 @@ _LEAST = 6.0  # percent of a bar that has room for a number
 class KnownUsedDisplay(Display):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
-    counts: items by category and code, such as `101` for known, not encoded, used (`1-1` without probes). title:
-    who was asked and who acted.
+    counts: items by category and code, such as `101` for answered, not encoded, acted on (`1-1` without probes).
+    title: who was asked and who acted.
     """
 
     title: str
@@ -91,8 +91,8 @@ class KnownUsedDisplay(Display):
 
 
 def words_of(code: str) -> str:
-    """`101` as "known, not encoded, used"."""
-    parts = zip(("known", "encoded", "used"), code, strict=True)
+    """`101` as "answered, not encoded, acted on"."""
+    parts = zip(("answered", "encoded", "acted on"), code, strict=True)
     return ", ".join(name if mark == "1" else f"not {name}" for name, mark in parts if mark != "-")
 
 
@@ -125,9 +125,9 @@ def known_used_figures(joins: Sequence[KnownUsedTable]) -> Iterator[ReportFigure
     """A figure per pair of a VLM run and a policy run."""
     for number, joined in enumerate(joins, 1):
         yield ReportFigure(
-            f"known-used-{number}", "Known, encoded, used", "join",
-            "Every question once: does the reader know the answer, does a probe read it in the policy, and does "
-            "the action follow, each in both layouts. Red is lost: known and encoded, not used.",
+            f"known-used-{number}", "Answered, encoded, acted on", "join",
+            "Every question once: does the VLM answer right, does a probe read it in the policy, and does "
+            "the action follow, each in both layouts. Red is lost: answered and encoded, not acted on.",
             None, partial(_known_used, joined),
         )  # fmt: skip
 

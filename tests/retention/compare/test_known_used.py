@@ -123,8 +123,8 @@ def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRu
             assert one.p_groups == pytest.approx(flip)
             assert one.p == max(one.p_mcnemar, one.p_groups)
         lost = expected["kept"].count(False)
-        assert (row.known_and_encoded, row.not_used) == (len(expected["kept"]), lost)
-        assert row.not_used_ci == pytest.approx(interval(lost, len(expected["kept"])), abs=1e-6)
+        assert (row.answered_and_encoded, row.not_acted_on) == (len(expected["kept"]), lost)
+        assert row.share_not_acted_on_ci == pytest.approx(interval(lost, len(expected["kept"])), abs=1e-6)
         if row.category != "all":
             assert row.p_linked == pytest.approx(expected["linked"])
     singles = [one.p for row in found.rows[:2] for one in row.comparisons]
@@ -209,7 +209,8 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     console = Console(width=150, record=True, file=StringIO())
     console.print(rich_known_used(found))
     text = console.export_text()
-    for words in ("Known, encoded, used", "K E u", "of these not used", "Single episodes", "answered − acted"):
+    titles = ("Answered, encoded, acted on", "of these not acted on", "Single episodes", "answered − acted")
+    for words in (*titles, "V P a"):
         assert words in text
     frame = found.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}
