@@ -1,6 +1,6 @@
 """A site with many samples: all training sets in shared products against every training set on its own.
 
-    python benchmarks/joint_probes.py [--episodes 300] [--tokens 271] [--width 2048] [--relabellings 0]
+    python benchmarks/joint_probes.py [--episodes 300] [--tokens 271] [--width 2048] [--permutations 0]
 
 Both solve the same problems to the same certified optimum. On its own, one inner training set is timed on the
 whole grid of C and one outer one at the C that was chosen; both are scaled to all. Processor time, one thread, so
@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--tokens", type=int, default=271, help="per episode; 1 is a pooled view")
     parser.add_argument("--width", type=int, default=2048)
-    parser.add_argument("--relabellings", type=int, default=0)
+    parser.add_argument("--permutations", type=int, default=0)
     parser.add_argument("--signal", type=float, default=0.3, help="0: none, and C is small")
     parser.add_argument("--part", choices=("together", "alone", "both"), default="both")
     parser.add_argument("--strength", type=float, default=10.0, help="C of the outer fold with --part alone")
@@ -152,7 +152,7 @@ def main() -> None:
     samples = samples_of(arguments.episodes, arguments.tokens, arguments.width, arguments.signal)
     real = np.tile([True, False], arguments.episodes // 2)
     items = np.repeat(np.arange(arguments.episodes // 2), 2)
-    labels = np.column_stack([real, flip_items(real, items, arguments.relabellings, seed=0)])
+    labels = np.column_stack([real, flip_items(real, items, arguments.permutations, seed=0)])
     folds = nested_folds(real, items, seed=0)
     console.print(
         f"{arguments.episodes} × {arguments.tokens} samples × {arguments.width}, {labels.shape[1]} columns"

@@ -3,14 +3,14 @@
     python benchmarks/null_worlds.py [--draws 2000] [--control-draws 2000] [--rival-draws 500] [--probe lda]
         [--worlds …] [--keep DIR]
 
-Probes: two sites of six features, 39 relabellings refitted; groups of two items in both layouts. Exactness is a
-matter of relabellings and folds, so a linear discriminant with the classes' prior, which names the larger class
-where it sees nothing, stands for the logistic probe; `--probe nested` fits that, at a hundred times the cost.
-*Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the answer in a
-direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The rival flips
-items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, against a
-random-features control and an untrained network that are as accurate. `--keep` keeps the draws of worlds, so
-that the same command resumes.
+Probes: two sites of six features, 39 label permutations refitted; groups of two items in both layouts. Exactness
+is a matter of label permutations and folds, so a linear discriminant with the classes' prior, which names the
+larger class where it sees nothing, stands for the logistic probe; `--probe nested` fits that, at a hundred times
+the cost. *Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the
+answer in a direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The
+rival flips items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9,
+against a random-features control and an untrained network that are as accurate. `--keep` keeps the draws of
+worlds, so that the same command resumes.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import OUTER_FOLDS, nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
 
-SITES, WIDTH, RELABELLINGS = 2, 6, 39
+SITES, WIDTH, PERMUTATIONS = 2, 6, 39
 LEVEL = 0.05
 OTHER = 10**9
 """Apart from the seeds of the data."""
@@ -81,7 +81,7 @@ def discriminant(
 
 
 def p_values(world: World, seed: int, by_item: bool = False, nested: bool = False) -> tuple[float, float]:
-    """p of the first site alone, and the family-wise p of the best; by_item: with the relabellings of before."""
+    """p of the first site alone, and the family-wise p of the best; by_item: with those of before."""
     generator = np.random.default_rng(seed)
     groups = np.repeat(np.arange(world.groups), 4)
     pattern = np.tile([True, False, False, True], world.groups)
@@ -97,16 +97,16 @@ def p_values(world: World, seed: int, by_item: bool = False, nested: bool = Fals
         layers.append((features + world.mirrored * sign * own[groups])[kept])
     labels, groups = labels[kept], groups[kept]
     if by_item:
-        relabelled = flip_items(labels, items, RELABELLINGS, seed + OTHER)
+        permuted = flip_items(labels, items, PERMUTATIONS, seed + OTHER)
     else:
-        relabelled = flip_groups(labels, groups, RELABELLINGS, seed + OTHER)
+        permuted = flip_groups(labels, groups, PERMUTATIONS, seed + OTHER)
     if nested:
         folds = nested_folds(labels, groups, seed + OTHER)
-        probes = [probe_site(Samples.pooled(layer), labels, relabelled, folds) for layer in layers]
+        probes = [probe_site(Samples.pooled(layer), labels, permuted, folds) for layer in layers]
         accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
         null = np.stack([probe.null for probe in probes])
     else:
-        columns = np.column_stack([labels, relabelled])
+        columns = np.column_stack([labels, permuted])
         outer = grouped_folds(labels, groups, OUTER_FOLDS, seed + OTHER)
         scores = np.stack([correctness(discriminant(x, columns, outer), columns).mean(axis=0) for x in layers])
         accuracy, null = scores[:, 0], scores[:, 1:]

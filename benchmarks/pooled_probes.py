@@ -1,6 +1,6 @@
 """A pooled site at full size: how much of the machine's own matrix rate its probes reach.
 
-    python benchmarks/pooled_probes.py [--episodes 3440] [--width 2048] [--relabellings 200] [--folds 1]
+    python benchmarks/pooled_probes.py [--episodes 3440] [--width 2048] [--permutations 200] [--folds 1]
 
 One inner training set on the whole grid of C and one outer set at the C that was chosen are timed (`--folds`: as
 many of each as outer folds), in processor time and on one thread, and scaled to the 20 and 5 of a site. Work is
@@ -88,14 +88,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=3440)
     parser.add_argument("--width", type=int, default=2048)
-    parser.add_argument("--relabellings", type=int, default=200)
+    parser.add_argument("--permutations", type=int, default=200)
     parser.add_argument("--folds", type=int, default=1)
     parser.add_argument("--sites", type=int, default=1, help="of the model, for the scaled time")
     asked = parser.parse_args()
     console = Console(width=115, highlight=False)
     samples = Samples.pooled(features(asked.episodes, asked.width))
     real, items = labels_of(asked.episodes)
-    labels = np.column_stack([real, flip_items(real, items, asked.relabellings, seed=0)])
+    labels = np.column_stack([real, flip_items(real, items, asked.permutations, seed=0)])
     folds = nested_folds(real, items, seed=0)
     spent, done = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}, {"inner": Work(), "outer": Work()}
     fit, turn, work, setting = Projection.fit.__func__, Projection.__call__, Work(), Work()  # type: ignore[attr-defined]

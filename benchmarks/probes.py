@@ -55,11 +55,11 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def probe_kit_seconds(samples: Samples, permutations: int, device: str | None = None) -> float:
-    """One site, everything included: folds, C grid, relabellings, and the way to the device."""
+    """One site, everything included: folds, C grid, label permutations, and the way to the device."""
     labels, items = labels_of(len(samples.counts))
-    relabellings = flip_items(labels, items, permutations, seed=0)
+    permuted_labels = flip_items(labels, items, permutations, seed=0)
     folds = nested_folds(labels, items, seed=0)
-    return seconds(lambda: probe_site(samples.to(device), labels, relabellings, folds))
+    return seconds(lambda: probe_site(samples.to(device), labels, permuted_labels, folds))
 
 
 def scikit_learn_seconds(samples: Matrix, columns: NDArray[np.bool_], tolerance: float) -> float:
@@ -85,7 +85,7 @@ def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
     samples_of_site = Samples.pooled(features(n_episodes))
     ours = probe_kit_seconds(samples_of_site, permutations)
     table = Table("", "ms per problem", "s per site", "times slower")
-    table.title = f"N = {n_episodes}, D = {WIDTH}, {permutations} relabellings: {problems:,} problems per site"
+    table.title = f"N = {n_episodes}, D = {WIDTH}, {permutations} permutations: {problems:,} problems per site"
     table.add_row("probe_kit", f"{1e3 * ours / problems:.3f}", f"{ours:.1f}", "1")
     if device is not None:
         probe_kit_seconds(samples_of_site, 0, device)  # the first use of a device is slow
@@ -106,8 +106,8 @@ def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
 
 
 def costs(cases: dict[str, Samples], device: str | None) -> Table:
-    """What one more site and one more relabelling cost."""
-    table = Table("", "s per site without relabellings", "ms per relabelling and site")
+    """What one more site and one more label permutation cost."""
+    table = Table("", "s per site without label permutations", "ms per label permutation and site")
     table.title = f"probe_kit, {device or 'numpy'}"
     for name, samples in cases.items():
         fixed, more = (probe_kit_seconds(samples, permutations, device) for permutations in (0, 20))

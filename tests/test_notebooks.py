@@ -32,7 +32,7 @@ SHORT = {
     '["color", "state"]': '["color"]',
     '"kv.*"': '"kv.02"',
 }
-"""Episodes that end after one inference, few relabellings, one category, and one block of the memory."""
+"""Episodes that end after one inference, few label permutations, one category, and one block of the memory."""
 
 
 def shortened(source: str) -> str:

@@ -19,7 +19,7 @@ SHORT = {
 def test_the_python_example_runs(
     changes: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In the default suite with one inference per episode and few relabellings."""
+    """In the default suite with one inference per episode and few label permutations."""
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     for long, short in changes.items():
         assert long in example

@@ -1,9 +1,9 @@
 """Label permutations of whole groups, and the p-values that they give.
 
-A relabelling treats a group of items as a whole, because items that share a picture share features: flipped one
-by one, they would look more independent than they are. It keeps the number of episodes of each class, because a
-probe that names the larger class is no signal. Under "the answer is not encoded" every such relabelling is as
-likely as the real labels, which makes the p-values exact.
+A label permutation treats a group of items as a whole, because items that share a picture share features:
+flipped one by one, they would look more independent than they are. It keeps the number of episodes of each
+class, because a probe that names the larger class is no signal. Under "the answer is not encoded" every such
+label permutation is as likely as the real labels, which makes the p-values exact.
 """
 
 from itertools import groupby
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
-    """`count` relabellings (E, count) in which the labels of a random half of the items are all flipped.
+    """`count` label permutations (E, count) in which the labels of a random half of the items are all flipped.
 
     labels: (E,). items: (E,) item of every episode. Right for the correct side, which a suite draws freely.
     """
@@ -24,15 +24,15 @@ def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: in
 
 
 ENUMERATED_BELOW = 12
-"""With fewer groups every relabelling there is is made, 1,023 at most where all groups are balanced."""
+"""With fewer groups every label permutation there is is made, 1,023 at most where all groups are balanced."""
 
 
 def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
-    """About `count` relabellings (E, P) that flip all labels of some groups and keep the size of both classes.
+    """About `count` permutations (E, P) that flip all labels of some groups and keep the size of both classes.
 
     labels: (E,). groups: (E,) group of every episode. A group with as many episodes of either class is flipped or
     not, freely; the others exchange their signs among those with the same surplus. Right for the correct side,
-    which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all relabellings but the real
+    which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all permutations but the real
     one, in an order drawn from `seed`, and none that only mirrors another: a probe of mirrored labels is as
     accurate.
     """
@@ -79,7 +79,7 @@ def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
 def exchange_groups(
     labels: NDArray[np.bool_], groups: ArrayLike, items: ArrayLike, layouts: ArrayLike, count: int, seed: int
 ) -> NDArray[np.bool_]:
-    """`count` relabellings (E, count) in which groups exchange their labels, layout by layout.
+    """`count` label permutations (E, count) in which groups exchange their labels, layout by layout.
 
     labels, groups, items, layouts: (E,). Only groups whose items are present in the same layouts are exchanged.
     Keeps the share of every class, and so any side preference: right for the chosen side.
@@ -112,9 +112,9 @@ def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tup
     return found
 
 
-def smallest_p(relabellings: int) -> float:
-    """The smallest p-value that so many relabellings can give; 1 without any."""
-    return 1 / (1 + relabellings)
+def smallest_p(permutations: int) -> float:
+    """The smallest p-value that so many label permutations can give; 1 without any."""
+    return 1 / (1 + permutations)
 
 
 def pointwise_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -135,7 +135,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     if not probes.views:
         return f"{state}; {fitted}"
     parts = [f"{state}; views {', '.join(probes.views)}", f"target {probes.target}"]
-    parts += [f"{probes.permutations} relabellings"]
+    parts += [f"{probes.permutations} label permutations"]
     parts += [f"{probes.token_permutations} for tokens"] * (probes.token_permutations > 0)
     parts += [f"seed {probes.seed}"]
     parts += [f"captured inference {probes.call}"] * (probes.call > 0)

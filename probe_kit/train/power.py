@@ -32,9 +32,10 @@ _NUMBERS = 200_000
 class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
-    chance: against relabellings. random_features, untrained: against a control that is right half of the time;
-    it takes more if the control is better than that. absent: share of experiments in which a stream without any
-    signal is called absent. spread: standard error of the four, the largest, measured over `SEEDS` seeds.
+    chance: against label permutations. random_features, untrained: against a control that is right half of the
+    time; it takes more if the control is better than that. absent: share of experiments in which a stream
+    without any signal is called absent. spread: standard error of the four, the largest, measured over `SEEDS`
+    seeds.
     """
 
     items: int

@@ -54,7 +54,7 @@ def train_probes(
 
     categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
     `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'. permutations:
-    relabellings behind the p-values, of which token views, many times as dear, take the first
+    label permutations behind the p-values, of which token views, many times as dear, take the first
     `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
     out. folds: `concepts` also keeps items about the same two concepts together. incomplete: `drop` leaves out
     items of which an episode is missing. controls: baselines that never see the model, of `position`,

@@ -101,7 +101,7 @@ CHANGES: list[tuple[str, str, Edit]] = [
     ("failed/*.json", "the same", same),
     ("failed/*.json", "another episode", part("episode_id", "another")),
     (PROBES, "the same", same),
-    (PROBES, "more relabellings", settings(permutations=2000)),
+    (PROBES, "more label permutations", settings(permutations=2000)),
     (PROBES, "another format", settings(format=1)),
     (PROBES, "no files", without("files")),
     (PROBES, "another's file", lambda head: head["files"].update({"scores.csv": ["../x", 1, "0" * 64]})),

@@ -422,7 +422,7 @@ def stored_probes(run: Path) -> list[Path]:
         lambda head: head.pop("blake2b"),
         lambda head: head.update(stamp=""),
     ],
-    ids=["more relabellings", "another format", "a file less", "no hash", "no stamp"],
+    ids=["more label permutations", "another format", "a file less", "no hash", "no stamp"],
 )
 @pytest.mark.parametrize("which", [0, 1])
 def test_changed_settings_of_probes_are_found(run: Path, change: Edit, which: int) -> None:

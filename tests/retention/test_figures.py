@@ -166,7 +166,7 @@ def test_layers_are_whole_numbers_and_the_backbone_stands_beside_the_action(resu
         ticks = [tick for tick in axes.get_xticks() if axes.get_xlim()[0] <= tick <= axes.get_xlim()[1]]
         assert ticks == list(range(last + 1))
         band = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
-        assert len(band) == 1, "the band of relabelled probes"
+        assert len(band) == 1, "the band of probes of permuted labels"
 
 
 def test_every_site_that_ties_at_the_peak_is_marked(results: ProbeResults) -> None:

@@ -261,7 +261,7 @@ def test_an_untrained_network_that_is_beaten_alike_in_every_group_has_an_interva
         assert score.ci[1] - score.ci[0] > 1e-3
 
 
-def test_a_band_of_few_relabellings_is_not_drawn(probed_run: ProbedRun) -> None:
+def test_a_band_of_few_permuted_labels_is_not_drawn(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": GOOD}))
     assert LayerCurveDisplay.from_results(results, "color").null_band is not None
     few = {place: replace(curve, null=curve.null[:, :5]) for place, curve in results.curves.items()}

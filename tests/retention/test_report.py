@@ -202,7 +202,7 @@ def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_b
 
 
 def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: ProbedRun) -> None:
-    """Categories that were not probed lack no signal, and neither do those that nothing was relabelled for."""
+    """Categories that were not probed lack no signal, and neither do those that nothing was permuted for."""
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
     results = load_results(run)
     only = replace(results.settings, categories=("color",), seed=1)

@@ -67,7 +67,7 @@ def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: Pro
 
 
 MIXTURES = {
-    "permutations": (50, "relabellings 99 (one) against 50 (other)"),
+    "permutations": (50, "label permutations 99 (one) against 50 (other)"),
     "seed": (3, "seeds 0 (one) against 3 (other)"),
     "target": ("chosen", "targets correct (one) against chosen (other)"),
 }

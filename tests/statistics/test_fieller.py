@@ -24,7 +24,7 @@ def test_a_denominator_that_may_be_zero_leaves_the_ratio_unbounded() -> None:
     interval = fieller_interval(1.0, 0.2, np.diag([0.04, 0.04]), 1.96)
     assert interval == Interval(-inf, inf)
     assert not interval.bounded
-    assert str(interval) == "[unbounded]"
+    assert str(interval) == "[no limits]"
 
 
 def test_intervals_cover_the_true_ratio_nineteen_times_in_twenty() -> None:

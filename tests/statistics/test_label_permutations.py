@@ -39,20 +39,20 @@ def test_missing_episodes_leave_the_classes_as_large_as_they_are() -> None:
     kept = np.random.default_rng(0).random(400) < np.where(LABELS, 1.0, 0.6)
     for count in (400, 40):  # groups of four: drawn, and with 10 groups enumerated
         labels, groups = LABELS[:count][kept[:count]], (ITEMS // 2)[:count][kept[:count]]
-        relabelled = flip_groups(labels, groups, 50, seed=0)
-        assert relabelled.shape[1] >= 7
-        assert (relabelled.sum(axis=0) == labels.sum()).all()
-        assert (relabelled != labels[:, None]).any()
+        permuted = flip_groups(labels, groups, 50, seed=0)
+        assert permuted.shape[1] >= 7
+        assert (permuted.sum(axis=0) == labels.sum()).all()
+        assert (permuted != labels[:, None]).any()
 
 
 def test_few_groups_are_enumerated_without_the_real_labels_and_without_mirror_images() -> None:
     labels, groups = LABELS[:24], np.repeat(np.arange(6), 4)
-    relabelled = flip_groups(labels, groups, 7, seed=0)
-    assert relabelled.shape == (24, 2**5 - 1)
-    seen = {tuple(column) for column in relabelled.T}
+    permuted = flip_groups(labels, groups, 7, seed=0)
+    assert permuted.shape == (24, 2**5 - 1)
+    seen = {tuple(column) for column in permuted.T}
     assert len(seen) == 31
     assert tuple(labels) not in seen
-    assert not seen & {tuple(~column) for column in relabelled.T}
+    assert not seen & {tuple(~column) for column in permuted.T}
     assert smallest_p(31) == 1 / 32
     assert flip_groups(labels, groups, 0, seed=0).shape == (24, 0)
 
@@ -71,7 +71,7 @@ def test_items_with_one_episode_exchange_only_among_themselves() -> None:
     assert (exchanged == labels[:, None]).all()
 
 
-def test_the_same_seed_gives_the_same_relabellings() -> None:
+def test_the_same_seed_gives_the_same_permuted_labels() -> None:
     assert (flip_items(LABELS, ITEMS, 5, seed=3) == flip_items(LABELS, ITEMS, 5, seed=3)).all()
 
 
@@ -85,6 +85,6 @@ def test_family_wise_p_compares_with_the_best_site() -> None:
     assert max_statistic_p(np.array([0.65, 0.55]), null).tolist() == [2 / 4, 3 / 4]
 
 
-def test_p_is_missing_without_relabellings() -> None:
+def test_p_is_missing_without_permuted_labels() -> None:
     assert np.isnan(pointwise_p(np.array([0.9]), np.empty((1, 0)))).all()
     assert np.isnan(max_statistic_p(np.array([0.9]), np.empty((1, 0)))).all()

@@ -13,11 +13,11 @@ ITEMS = np.repeat(np.arange(20), 2)
 LABELS = np.tile([True, False], 20)
 
 
-def p_values(seed: int, sites: int, relabellings: int) -> tuple[np.ndarray, np.ndarray]:
+def p_values(seed: int, sites: int, permuted_labels: int) -> tuple[np.ndarray, np.ndarray]:
     """Per-site and family-wise p of `sites` correlated sites of noise."""
     generator = np.random.default_rng(seed)
     shared = generator.standard_normal((40, 6))
-    columns = flip_groups(LABELS, ITEMS, relabellings, seed)
+    columns = flip_groups(LABELS, ITEMS, permuted_labels, seed)
     folds = nested_folds(LABELS, ITEMS, seed)
     probes = [
         probe_site(Samples.pooled(shared + generator.standard_normal((40, 6))), LABELS, columns, folds)

@@ -118,7 +118,7 @@ def with_tokens(run: ArrayRun, strength: float) -> ArrayRun:
     return run
 
 
-def test_token_views_are_probed_beside_pooled_ones_with_fewer_relabellings(planted_run: PlantedRun) -> None:
+def test_token_views_are_probed_beside_pooled_ones_with_fewer_permuted_labels(planted_run: PlantedRun) -> None:
     run = with_tokens(planted_run(), strength=2.0)
     results = train_probes(run, views=("mean", "tokens"), permutations=6, token_permutations=4)
     mean, tokens = results.curves["color", "mean"], results.curves["color", "tokens"]
@@ -128,7 +128,7 @@ def test_token_views_are_probed_beside_pooled_ones_with_fewer_relabellings(plant
     assert (tokens.fold_of == mean.fold_of).all()
 
 
-def test_the_number_of_token_relabellings_matters_only_for_token_views(planted_run: PlantedRun) -> None:
+def test_the_number_of_token_permuted_labels_matters_only_for_token_views(planted_run: PlantedRun) -> None:
     run = with_tokens(planted_run(), strength=2.0)
     pooled = [train_probes(run, permutations=3, token_permutations=count).key for count in (1, 2)]
     tokens = [train_probes(run, views=("tokens",), permutations=3, token_permutations=n).key for n in (1, 2)]
@@ -146,7 +146,7 @@ def test_selectivity_is_the_accuracy_above_random_labels_of_items(planted_run: P
 
 def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun, device: str) -> None:
     pytest.importorskip("torch").set_num_threads(1)
-    run = planted_run({PLANTED: 2.0}, n_items=24)  # of fewer groups every relabelling would be made
+    run = planted_run({PLANTED: 2.0}, n_items=24)  # of fewer groups every label permutation would be made
     by_torch = train_probes(run, permutations=2, device=device)
     shutil.rmtree(run.path)
     by_numpy = train_probes(run, permutations=2)

@@ -11,8 +11,8 @@ from probe_kit.train.settings import ProbeSettings
 _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
     "targets": lambda settings: settings.target,
     "views": lambda settings: ", ".join(settings.views),
-    "relabellings": lambda settings: str(settings.permutations),
-    "relabellings of token views": lambda settings: str(settings.token_permutations),
+    "label permutations": lambda settings: str(settings.permutations),
+    "label permutations of token views": lambda settings: str(settings.token_permutations),
     "captured inferences": lambda settings: str(settings.call),
     "seeds": lambda settings: str(settings.seed),
     "categories": lambda settings: ", ".join(settings.categories),

@@ -459,7 +459,7 @@ PROBE_MINUS_SR = share(
     ),
 )
 _P = (
-    "Probability that the best layer of a stream looks this good when the answers are relabelled at random. It "
+    "Probability that the best layer of a stream looks this good when the labels are permuted at random. It "
     "allows for having looked at all layers (family-wise)."
 )
 _PEAK = "Accuracy of the site that is best on all questions, scored on them too; too high by having been chosen."

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-_RELABELLED = "best relabelled probe, 95 %"
+_PERMUTED = "best permuted probe, 95 %"
 
 
 @dataclass
@@ -58,7 +58,7 @@ class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run; the
-    dotted line is what the best site of relabelled data stays below in 95 %. Upright lines: when the events of the
+    dotted line is what the best site of permuted labels stays below in 95 %. Upright lines: when the events of the
     trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
     """
 
@@ -106,7 +106,7 @@ class CallCurveDisplay(Display):
         for line in self.lines:
             _draw(axes, line.calls, line)
             style = PARTS[line.part]
-            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_RELABELLED)
+            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_PERMUTED)
             clear = line.significant
             axes.plot(
                 line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
@@ -231,7 +231,7 @@ def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> 
         yield ReportFigure(
             f"{name}-calls{view_suffix(view, views)}", in_view("Over the episode", view, views), "probes",
             f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
-            "dotted: what the best site of relabelled data stays below. An answer that is not there at "
+            "dotted: what the best site of permuted labels stays below. An answer that is not there at "
             "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
             position, partial(call_curves, calls, view, events),
         )  # fmt: skip

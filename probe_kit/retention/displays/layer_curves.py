@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
-_ENOUGH = 20  # relabellings, fewer than which have no 95 % band
+_ENOUGH = 20  # label permutations, fewer than which have no 95 % band
 _PEAK = "best of its stream (all, where several tie)"
 
 
@@ -54,7 +54,7 @@ class LayerCurveDisplay(Display):
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above
     random-features and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the
-    accuracies under relabelling; None below 20 relabellings.
+    accuracies under label permutation; None below 20 label permutations.
     """
 
     category: str
@@ -114,7 +114,7 @@ class LayerCurveDisplay(Display):
     def _draw_ground(self, axes: "Axes") -> None:
         if self.null_band is not None:
             low, high = self.null_band
-            axes.axhspan(100 * low, 100 * high, color="0.92", lw=0, label="95 % of relabelled probes")
+            axes.axhspan(100 * low, 100 * high, color="0.92", lw=0, label="95 % of probes of permuted labels")
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
 
 
@@ -125,7 +125,7 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
     for the best of every layer, `last`, or one by number. Bars: each layer's 95 % interval,
     where the stream runs once. Filled markers are above chance against the best site of their stream
     (family-wise p < 0.05), and above random-features and untrained where those were run. Grey: chance, and the
-    band that holds 95 % of the accuracies under relabelling. view: the first probed one by default. Raises
+    band that holds 95 % of the accuracies under label permutation. view: the first probed one by default. Raises
     UnknownSiteError for a view that was not probed, UsageError for an iteration.
     """
     view, names = known_view(results, view), results.settings.categories
@@ -292,7 +292,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "probes",
                 "How often a linear probe names the side of the correct picture in episodes it has not seen, "
                 f"layer by layer; the part that makes the action has a line per iteration. {ONLY_FILLED}, against "
-                "the best layer of relabelled data. The grey band is what no knowledge looks like; a caret "
+                "the best layer of permuted labels. The grey band is what no knowledge looks like; a caret "
                 "marks the best layer, or all that tie.",
                 one.position, partial(layer_curve, one.results, view, source.table.iterations),
             )  # fmt: skip

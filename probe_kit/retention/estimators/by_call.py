@@ -18,7 +18,7 @@ from probe_kit.train.results.probe_results import ProbeResults
 Shares = NDArray[np.float64]
 EventCalls = Mapping[str, Mapping[str, int]]
 """Per event, by episode id, the captured inference before it."""
-_ENOUGH = 20  # relabellings, fewer than which have no 95 % point
+_ENOUGH = 20  # label permutations, fewer than which have no 95 % point
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class CallLine:
 
     accuracy: of a site chosen on half of the groups of items and scored on the other half; low, high: its 95 %
     interval, NaN with too few groups. significant: above chance against all sites of the
-    stream, and above the controls that were run. null: what the best site of relabelled data stays below in 95 %,
-    NaN with few relabellings. episodes: how many got that far. part: of the model, see `Stream.part`.
+    stream, and above the controls that were run. null: what the best site of permuted labels stays below in 95 %,
+    NaN with few label permutations. episodes: how many got that far. part: of the model, see `Stream.part`.
     """
 
     stream: str

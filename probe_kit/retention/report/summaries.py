@@ -233,7 +233,7 @@ def _ties_words(ties: int | None) -> str:
 
 def _clear_words(p: float | None, exceeds: Exceeds) -> str:
     if p is None:
-        return "not tested, for lack of relabellings"
+        return "not tested, for lack of label permutations"
     controls = {
         "random-features": "an untrained conjunction of pictures and words",
         "untrained": "the untrained network",

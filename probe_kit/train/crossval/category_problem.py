@@ -33,10 +33,10 @@ MOST_OF_ONE_SIDE = 0.75
 
 @dataclass(frozen=True)
 class CategoryProblem:
-    """What all sites of a category share: which episodes, their labels, folds and relabellings.
+    """What all sites of a category share: which episodes, their labels, folds and label permutations.
 
-    rows: (E,) positions in the run's episode table. labels: (E,). relabellings: (E, P). token_permutations: how
-    many of them are fitted where every token is a sample.
+    rows: (E,) positions in the run's episode table. labels: (E,). permuted_labels: (E, P).
+    token_permutations: how many of them are fitted where every token is a sample.
     """
 
     rows: NDArray[np.intp]
@@ -45,17 +45,17 @@ class CategoryProblem:
     groups: NDArray[np.str_]
     episodes: NDArray[np.str_]
     folds: list[NestedFold]
-    relabellings: NDArray[np.bool_]
+    permuted_labels: NDArray[np.bool_]
     token_permutations: int
 
     def probe(self, samples: Samples) -> SiteProbe:
         """Probe one site; `samples` are those of all the run's episodes."""
-        drawn = self.relabellings if samples.pools else self.relabellings[:, : self.token_permutations]
+        drawn = self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
         return self.fit(samples.of(self.rows), drawn)
 
-    def fit(self, samples: Samples, relabellings: NDArray[np.bool_]) -> SiteProbe:
-        """Probe the samples of this category's episodes, and again for every column of (E, P) relabellings."""
-        return probe_site(samples, self.labels, relabellings, self.folds)
+    def fit(self, samples: Samples, permuted_labels: NDArray[np.bool_]) -> SiteProbe:
+        """Probe the samples of this category's episodes, and again for every column of (E, P) permuted labels."""
+        return probe_site(samples, self.labels, permuted_labels, self.folds)
 
     def accuracy(self, probe: SiteProbe) -> Share:
         """Held-out accuracy of a probe, balanced between the sides, groups of items as the unit."""
@@ -89,8 +89,8 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
             seen = f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
             raise TooFewGroupsError(f"category {category!r}: {seen}, too few for folds") from error
         raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
-    relabellings = _relabel(table, labels, groups, category, settings, folds)
-    _check_power(relabellings.shape[1], category, settings)
+    permuted_labels = _permute_labels(table, labels, groups, category, settings, folds)
+    _check_power(permuted_labels.shape[1], category, settings)
     return CategoryProblem(
         rows=rows,
         labels=labels,
@@ -98,7 +98,7 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
         groups=groups,
         episodes=table["episode_id"].to_numpy(dtype=str),
         folds=folds,
-        relabellings=relabellings,
+        permuted_labels=permuted_labels,
         token_permutations=settings.token_permutations,
     )
 
@@ -135,17 +135,17 @@ def _reached(episodes: int, call: int) -> str:
     return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
 
 
-def _check_power(relabellings: int, category: str, settings: ProbeSettings) -> None:
+def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
     """Warn where the groups allow no result to be significant."""
-    if relabellings < settings.permutations and (least := smallest_p(relabellings)) >= SIGNIFICANCE:
+    if count < settings.permutations and (least := smallest_p(count)) >= SIGNIFICANCE:
         warnings.warn(
-            f"category {category!r}: its groups allow {relabellings} relabellings, the smallest possible p is "
+            f"category {category!r}: its groups allow {count} label permutations, the smallest possible p is "
             f"{least:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
             stacklevel=4,
         )
 
 
-def _relabel(
+def _permute_labels(
     table: "pd.DataFrame",
     labels: NDArray[np.bool_],
     groups: NDArray[np.str_],
@@ -153,7 +153,7 @@ def _relabel(
     settings: ProbeSettings,
     folds: list[NestedFold],
 ) -> NDArray[np.bool_]:
-    """(E, P) relabellings, without those that leave a training fold with a single class: they have no probe."""
+    """(E, P) permuted labels, without those that leave a training fold with a single class: they have no probe."""
     seed = derive_seed("relabelling", settings.seed, category)
     count = max(settings.permutations, settings.token_permutations)
     if settings.target == "chosen":

@@ -48,7 +48,7 @@ class SiteProbe:
     strengths: (F,) the C chosen in each outer fold.
     weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe, on raw features.
     spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
-    null: (P,) accuracies under the relabellings.
+    null: (P,) accuracies under the label permutations.
     """
 
     decisions: Matrix
@@ -62,15 +62,15 @@ class SiteProbe:
 def probe_site(
     samples: Samples,
     labels: NDArray[np.bool_],
-    relabellings: NDArray[np.bool_],
+    permuted_labels: NDArray[np.bool_],
     folds: list[NestedFold],
 ) -> SiteProbe:
-    """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) relabellings.
+    """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) label permutations.
 
     Raises ProbeNotConvergedError, and NonFiniteActivationError for NaN or infinity.
     """
     check_non_finite(samples)
-    columns = np.column_stack([labels, relabellings])
+    columns = np.column_stack([labels, permuted_labels])
     fitted = cross_validate(samples, columns, folds)
     decisions = _out_of_fold(fitted, folds)
     return SiteProbe(

@@ -16,7 +16,7 @@ RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
 class BaselineScore:
     """Held-out accuracy of the same nested probe on features that never saw the model.
 
-    95 % interval over groups; p by the relabellings of the category's probes (None without any).
+    95 % interval over groups; p by the label permutations of the category's probes (None without any).
     """
 
     name: str

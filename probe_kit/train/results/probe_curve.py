@@ -15,11 +15,11 @@ from probe_kit.train.crossval.metrics import correctness
 
 @dataclass(frozen=True)
 class ProbeCurve:
-    """All sites of one category in one view, on the same episodes (E), folds (F) and relabellings (P).
+    """All sites of one category in one view, on the same episodes (E), folds (F) and label permutations (P).
 
     sites: S of them. labels: (E,) bool. episodes, items, groups: (E,) identities. fold_of: (E,) outer fold.
     parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
-    decisions: (S, E) out-of-fold. strengths: (S, F) chosen C. null: (S, P) accuracies under relabelling.
+    decisions: (S, E) out-of-fold. strengths: (S, F) chosen C. null: (S, P) accuracies under label permutation.
     """
 
     sites: tuple[Site, ...]

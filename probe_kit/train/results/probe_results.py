@@ -66,10 +66,10 @@ class ProbeResults:
         `accuracy` with its 95 % interval over groups (`ci_low`, `ci_high`), `p` of the site alone, `p_fwe`
         against the best site of the stream, `depth` the layer as a fraction, `C` and `fold_accuracy` per outer
         fold. `control_accuracy` is the mean accuracy of the same probe on random labels that are consistent
-        within a group, `selectivity` the accuracy above it; NaN without relabellings. `smallest_p`: no p-value
-        can be lower with so many relabellings. `exceeds_random_features`, `exceeds_untrained`: whether the site
-        is better than that control, missing where it was not run; `signal`: than chance, family-wise, and
-        every control that was run.
+        within a group, `selectivity` the accuracy above it; NaN without label permutations. `smallest_p`: no
+        p-value can be lower with so many label permutations. `exceeds_random_features`, `exceeds_untrained`:
+        whether the site is better than that control, missing where it was not run; `signal`: than chance,
+        family-wise, and every control that was run.
         """
         import pandas as pd
 

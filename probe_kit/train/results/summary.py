@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 
 def results_text(settings: ProbeSettings, label: str) -> str:
-    """One line: what was probed, with how many relabellings, and the key."""
+    """One line: what was probed, with how many label permutations, and the key."""
     random = ", RANDOM WEIGHTS" if settings.random_weights else ""
     return (
         f"<ProbeResults {settings.key} of {label}{random}: {', '.join(settings.categories)}; "
         f"views {', '.join(settings.views)}; target {settings.target}; call {settings.call}; "
-        f"{settings.permutations} relabellings>"
+        f"{settings.permutations} label permutations>"
     )
 
 
@@ -29,7 +29,7 @@ def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") ->
     )
     columns = ("category", "view", "stream", *SITE_HEADINGS, "n")
     note = (
-        f"{settings.permutations} relabellings, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
+        f"{settings.permutations} label permutations, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
         "results.scores has every site"
     )
     return rows_html(title, columns, [_cells(row) for _, row in best_sites(scores).iterrows()], note)

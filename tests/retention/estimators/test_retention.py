@@ -199,7 +199,7 @@ def test_a_control_that_is_not_beaten_is_named(curve_of: CurveOf, episodes: pd.D
         assert (found.defined, found.note) == (False, f"n/a (backbone not shown to beat {words})")
 
 
-def test_without_relabellings_retention_is_not_defined(curve_of: CurveOf, episodes: pd.DataFrame) -> None:
+def test_without_permuted_labels_retention_is_not_defined(curve_of: CurveOf, episodes: pd.DataFrame) -> None:
     curve = curve_of(episodes, [0.9], [[0.8]])
     found = measure_retention(replace(curve, null=np.empty((2, 0))))
     assert found is not None

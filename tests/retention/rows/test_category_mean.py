@@ -51,7 +51,7 @@ def test_the_mean_of_one_category_is_that_category(probed_run: Callable[..., Arr
         assert getattr(mean, part).ci == pytest.approx(getattr(row, part).ci), part
 
 
-def test_selectivity_is_the_peak_above_the_relabelled_probes(table: RetentionTable) -> None:
+def test_selectivity_is_the_peak_above_the_permuted_probes(table: RetentionTable) -> None:
     row = json.loads(table.to_json())[0]
     assert row["backbone"]["selectivity"] == pytest.approx(0.9 - 0.5)  # the fixture's null is centred on one half
     assert row["action"]["selectivity"] == pytest.approx(0.7 - 0.5)

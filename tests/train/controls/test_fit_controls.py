@@ -116,7 +116,7 @@ FAILURES = {
     "an unknown category": {"categories": ("smell",)},
     "an unknown target": {"target": "wished"},
     "no process": {"jobs": 0},
-    "negative relabellings": {"permutations": -1},
+    "negative label permutations": {"permutations": -1},
 }
 
 

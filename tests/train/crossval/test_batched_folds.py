@@ -23,8 +23,8 @@ def study(groups: int, width: int, columns: int, seed: int) -> tuple[np.ndarray,
     features = draw.normal(size=(items.size, width)) * 10 ** draw.uniform(-2, 2, width)
     features[:, 0] += 3 * np.where(labels, 1, -1) * np.abs(features[:, 0]).mean()
     features[:, -1] = 2.5 if width > 2 else features[:, -1]
-    relabelled = labels[:, None] ^ (draw.random((groups, columns - 1)) < 0.5)[items]
-    return features, np.column_stack([labels, relabelled]), nested_folds(labels, items, seed=seed)
+    permuted = labels[:, None] ^ (draw.random((groups, columns - 1)) < 0.5)[items]
+    return features, np.column_stack([labels, permuted]), nested_folds(labels, items, seed=seed)
 
 
 def one_after_another(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[FittedFold]:

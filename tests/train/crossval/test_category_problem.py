@@ -18,9 +18,9 @@ def settings(target: Target = "correct") -> ProbeSettings:
     )
 
 
-def test_relabelling_the_correct_side_flips_whole_groups(planted_run: PlantedRun) -> None:
+def test_permutation_the_correct_side_flips_whole_groups(planted_run: PlantedRun) -> None:
     problem = category_problem(planted_run().episodes, "color", settings())
-    flipped = (problem.relabellings != problem.labels[:, None]).reshape(20, 4, 30)
+    flipped = (problem.permuted_labels != problem.labels[:, None]).reshape(20, 4, 30)
     assert (flipped == flipped[:, :1]).all()
 
 
@@ -70,14 +70,14 @@ def test_a_category_that_is_nearly_all_of_one_side_is_refused(planted_run: Plant
 
 
 def test_so_few_groups_that_nothing_can_be_significant_are_said(planted_run: PlantedRun) -> None:
-    with pytest.warns(UserWarning, match=r"15 relabellings, the smallest possible p is 0\.062"):
+    with pytest.warns(UserWarning, match=r"15 label permutations, the smallest possible p is 0\.062"):
         category_problem(planted_run(n_items=10).episodes, "color", settings())
 
 
-def test_relabelling_the_chosen_side_keeps_its_share(planted_run: PlantedRun) -> None:
+def test_permutation_the_chosen_side_keeps_its_share(planted_run: PlantedRun) -> None:
     problem = category_problem(planted_run().episodes, "color", settings("chosen"))
     assert problem.labels.size < 80
-    np.testing.assert_array_equal(problem.relabellings.mean(axis=0), problem.labels.mean())
+    np.testing.assert_array_equal(problem.permuted_labels.mean(axis=0), problem.labels.mean())
 
 
 def test_no_group_is_split_between_outer_or_inner_folds(planted_run: PlantedRun) -> None:

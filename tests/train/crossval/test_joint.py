@@ -192,7 +192,7 @@ def test_fewer_samples_than_features_are_left_to_axes_of_their_own() -> None:
     assert_same(cross_validate(samples, LABELS[:, None], FOLDS), alone(samples, LABELS[:, None]))
 
 
-def test_relabellings_are_solved_in_parts_that_fit_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_permuted_labels_are_solved_in_parts_that_fit_into_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = tokens(NOISE + 0.2 * SIGNS)
     site = JointSite.of(samples, FOLDS)
     many = np.column_stack([LABELS, flip_items(LABELS, ITEMS, 6, seed=1)])
@@ -218,7 +218,7 @@ def test_c_is_solved_in_parts_where_one_column_of_labels_does_not_fit(monkeypatc
     assert sizes == [60, 60, 20, 5] * 3  # C by threes, then the outer folds, for every column of labels
 
 
-def test_59_relabellings_of_many_tokens_stay_within_the_stated_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_59_permuted_labels_of_many_tokens_stay_within_the_stated_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Features, their turned copy, COLUMN_MEMORY and blocks; held at once they would be many times as much."""
     counts = np.full(60, 150)
     features = np.random.default_rng(1).standard_normal((9000, 8), dtype=np.float32)

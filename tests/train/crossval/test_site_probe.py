@@ -47,14 +47,14 @@ def test_nested_cross_validation_equals_the_same_loops_over_scikit_learn() -> No
     assert probe.strengths.tolist() == chosen
 
 
-def test_relabelled_columns_are_probed_like_real_labels() -> None:
+def test_permuted_columns_are_probed_like_real_labels() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
-    relabelled = flip_items(LABELS, ITEMS, 3, seed=0)
+    permuted = flip_items(LABELS, ITEMS, 3, seed=0)
     samples = Samples.pooled(FEATURES)
-    null = probe_site(samples, LABELS, relabelled, folds).null
+    null = probe_site(samples, LABELS, permuted, folds).null
     for draw in range(3):
-        alone = probe_site(samples, relabelled[:, draw], NONE, folds).decisions
-        assert null[draw] == ((alone > 0) == relabelled[:, draw]).mean()
+        alone = probe_site(samples, permuted[:, draw], NONE, folds).decisions
+        assert null[draw] == ((alone > 0) == permuted[:, draw]).mean()
 
 
 def test_inner_folds_stay_inside_the_outer_training_side_and_keep_groups_whole() -> None:
@@ -168,9 +168,9 @@ def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Sam
 def test_torch_gives_the_numbers_of_numpy(samples: Samples) -> None:
     pytest.importorskip("torch").set_num_threads(1)
     folds = nested_folds(LABELS, ITEMS, seed=0)
-    relabelled = flip_items(LABELS, ITEMS, 5, seed=0)
-    numpy_probe = probe_site(samples, LABELS, relabelled, folds)
-    torch_probe = probe_site(samples.to("cpu"), LABELS, relabelled, folds)
+    permuted = flip_items(LABELS, ITEMS, 5, seed=0)
+    numpy_probe = probe_site(samples, LABELS, permuted, folds)
+    torch_probe = probe_site(samples.to("cpu"), LABELS, permuted, folds)
     scale = np.abs(numpy_probe.decisions).max()
     np.testing.assert_allclose(torch_probe.decisions, numpy_probe.decisions, rtol=0, atol=1e-9 * scale)
     np.testing.assert_array_equal(torch_probe.strengths, numpy_probe.strengths)

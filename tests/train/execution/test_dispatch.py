@@ -29,7 +29,7 @@ PROBLEM = CategoryProblem(
     groups=ITEMS.astype(str),
     episodes=np.arange(20).astype(str),
     folds=nested_folds(LABELS, ITEMS, 0),
-    relabellings=flip_items(LABELS, ITEMS, 3, 0),
+    permuted_labels=flip_items(LABELS, ITEMS, 3, 0),
     token_permutations=0,
 )
 
