@@ -234,5 +234,5 @@ def test_a_category_that_ended_before_an_inference_is_still_one_of_the_run(early
 def test_a_twin_whose_episodes_ended_at_other_times_is_not_said_to_be_of_another_suite(
     early: Run, run: Run
 ) -> None:
-    with pytest.raises(UsageError, match="captured inference 1: leave --call or --twin out"):
-        train_probes(run, ["color"], permutations=0, call=1, controls=(), twin=early, incomplete="drop")
+    with pytest.raises(UsageError, match="captured inference 1: leave --call or --untrained out"):
+        train_probes(run, ["color"], permutations=0, call=1, controls=(), untrained=early, incomplete="drop")

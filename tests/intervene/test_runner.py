@@ -76,13 +76,13 @@ def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Ru
     looked = alone.look(planned)
     alone.close()
     assert isinstance(looked, Seen)
-    np.testing.assert_array_equal(original.exchanged.image, looked.observation.image)
+    np.testing.assert_array_equal(original.swapped.image, looked.observation.image)
     assert looked.facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
-    np.testing.assert_array_equal(original.exchanged.image, swapped.seen.image)
-    np.testing.assert_array_equal(swapped.exchanged.image, original.seen.image)
-    assert (original.seen.image != original.exchanged.image).any()
-    np.testing.assert_array_equal(original.seen.state, original.exchanged.state)
-    assert original.seen.instruction == original.exchanged.instruction
+    np.testing.assert_array_equal(original.swapped.image, swapped.seen.image)
+    np.testing.assert_array_equal(swapped.swapped.image, original.seen.image)
+    assert (original.seen.image != original.swapped.image).any()
+    np.testing.assert_array_equal(original.seen.state, original.swapped.state)
+    assert original.seen.instruction == original.swapped.instruction
     assert original.seed != swapped.seed
 
 
@@ -199,11 +199,11 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
 def test_tables_show_it_beside_the_success_rate(copy: Run, effects: InterventionResult) -> None:
     table = retention_table([copy])
     assert {row.category: row.image_swap.follow_rate for row in table.rows} == {
-        row.category: row.follow_rate for row in effects.rows
+        row.category: row.follow_rate for row in effects.effects
     }
     assert all(row.image_swap.used in ("does not follow", "inconclusive") for row in table.rows)
     for text in (table.to_markdown(), table.to_latex()):
-        assert "ollows / against" in text
+        assert "ollow / reversal" in text
     assert json.loads(table.to_json())[0]["image_swap"]["used"] == table.rows[0].image_swap.used
 
 

@@ -45,7 +45,6 @@ def test_what_names_no_run_or_two_keys_is_refused(chosen: list[str], message: st
 @pytest.mark.parametrize(
     "options",
     [
-        ["nowhere", "--format", "sheet"],
         ["nowhere", "--iterations", "first"],
         ["nowhere", "--epsilons", "wide"],
         ["nowhere", "--html", "."],

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
-from probe_kit.retention import layer_curve, retention_table
+from probe_kit.retention import RetentionTable, layer_curve, retention_table
+from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.displays import (
     FinalPositionsDisplay,
     IterationMapDisplay,
@@ -189,8 +190,11 @@ def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) 
     success = SuccessTableDisplay.from_table(table)
     assert success.columns == ("color", "shape", "mean")
     assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
-    assert [cell.bold for cell in success.cells[0]] == [True, True, False], "0.6 is above 0.5 + Δ = 0.569"
-    row = table.rows[0]
+    assert [cell.bold for cell in success.cells[0]] == [False] * 3, "above 0.5 + Δ = 0.569; the interval holds 0.5"
+    row, other = table.rows
+    known = replace(row, success=replace(row.success, regime=Regime.KNOWLEDGE))
+    bold = SuccessTableDisplay.from_table(RetentionTable([known, other], table.means)).cells[0]
+    assert [cell.bold for cell in bold] == [True, False, False]
     assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
     assert color.values == (row.retention.value, row.retention.published)

@@ -147,7 +147,7 @@ def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: Pro
     success = made.body[0][1]
     assert success.sort == table.rows[0].success.sr == 0.6
     assert success.text.startswith("60.0 [")
-    assert success.strong
+    assert not success.strong, "its interval holds one half"
     assert [row[0].text for row in made.foot] == ["mean"]
 
 
@@ -158,7 +158,7 @@ def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probe
     color, shape = (row[position] for row in made.body)
     assert color.heat is not None
     assert (shape.text, shape.sort, shape.heat) == ("n/a", None, None)
-    assert shape.note.startswith("n/a (backbone not shown, could be up to ")
+    assert shape.note.startswith("n/a (backbone absent, at most ")
 
 
 def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
@@ -184,7 +184,7 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
     words = " ".join(summary.sentences)
     assert "60.0 % of episodes" in words
     assert "in the backbone in 2 of 3 categories (all but shape)" in words
-    assert "1 left out: backbone not shown, could be up to " in words
+    assert "1 left out: backbone absent, at most " in words
     score = table.means[0].backbone.score
     assert score is not None
     assert 0.75 < score < 0.775, "two of 90 % and one that guesses, without the luck of its best site"

@@ -43,7 +43,7 @@ def test_a_new_display_is_one_file(
     before = [figure.name for figure in collect_figures([run], table)]
     folder = tmp_path / "more"
     folder.mkdir()
-    (folder / "episode_lengths.py").write_text(EXAMPLE)
+    (folder / "episode_lengths.py").write_text(EXAMPLE, encoding="utf-8")
     monkeypatch.setattr(displays, "__path__", [*displays.__path__, str(folder)])
     invalidate_caches()
     figures = collect_figures([run], table)

@@ -87,7 +87,7 @@ def test_an_undefined_ratio_stays_in_the_machine_readable_output(table: Retentio
     assert row["retention"]["published"] == pytest.approx(0.08 / 0.05)
     assert row["retention"]["defined"] is False
     most = 100 * row["backbone"]["at_most"]
-    assert row["retention"]["note"] == f"n/a (backbone not shown, could be up to {most:.0f} %)"
+    assert row["retention"]["note"] == f"n/a (backbone absent, at most {most:.0f} %)"
 
 
 def test_json_rows_have_the_keys_of_the_contract(table: RetentionTable) -> None:

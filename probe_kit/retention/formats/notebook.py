@@ -56,7 +56,7 @@ def _table(table: HtmlTable) -> str:
     )
     body = "".join(_row(cells, numeric) for cells in table.body)
     foot = "".join(_row(cells, numeric, bold=True) for cells in table.foot)
-    title = f'<div style="margin-top:.6em"><b>{escape(table.title)}</b></div>'
+    title = f'<div style="margin-top:.6em"><b>{_safe(table.title)}</b></div>'
     return f"{title}<table><thead><tr>{head}</tr></thead><tbody>{body}{foot}</tbody></table>"
 
 

@@ -23,7 +23,7 @@ def test_undefined_retention_says_why(table: RetentionTable) -> None:
     most = table.rows[1].backbone.at_most
     assert most is not None
     assert table.to_markdown().count("| n/a | – |") == 1
-    assert f"n/a (backbone not shown, could be up to {100 * most:.0f} %): counting." in table.to_markdown()
+    assert f"n/a (backbone absent, at most {100 * most:.0f} %): counting." in table.to_markdown()
 
 
 def test_rows_have_as_many_cells_as_the_heading(table: RetentionTable) -> None:

@@ -214,7 +214,7 @@ def test_every_title_marks_random_weights(probed_run: ProbedRun) -> None:
 
 def test_the_caption_says_why_retention_is_missing(probed_run: ProbedRun) -> None:
     text = printed(retention_table([probed_run({"color": SIGNAL, "counting": NONE})]))
-    assert "n/a (backbone not shown, could be up to" in " ".join(text.split())
+    assert "n/a (backbone absent, at most" in " ".join(text.split())
     assert "published ratios without counting" in " ".join(text.split())
 
 
