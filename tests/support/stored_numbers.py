@@ -34,7 +34,7 @@ def numbers_of(run: Run) -> dict[str, str]:
         results = load_results(run, own.key)
         curves = [results.curves[place] for place in sorted(results.curves)]
         found[f"decisions of probes {own.key}"] = [curve.decisions for curve in curves]
-        found[f"permuted accuracies of probes {own.key}"] = [curve.null for curve in curves]
+        found[f"relabelled accuracies of probes {own.key}"] = [curve.null for curve in curves]
         places = sorted(results.directions, key=str)
         found[f"directions of probes {own.key}"] = [
             array for place in places for array in vars(results.directions[place]).values()
