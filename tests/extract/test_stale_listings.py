@@ -106,7 +106,7 @@ def readings(run: Run) -> tuple[Callable[[], Any], ...]:
 
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
-@pytest.mark.parametrize("lag", [1, 4, 10, 40])
+@pytest.mark.parametrize("lag", [1, 40, *(pytest.param(lag, marks=pytest.mark.slow) for lag in (4, 10))])
 def test_reading_with_stale_listings_gives_the_same_or_an_error_by_name(
     lag: int, kept: Run, bad_server: BadServer
 ) -> None:
