@@ -165,7 +165,7 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
     peaks = best_sites(results.scores).sort_values(["category", "stream"], kind="stable")
     for view in results.settings.views:
         best = [row for _, row in peaks[peaks["view"] == view].iterrows()]
-        headings = (*SITE_HEADINGS, "beats", "n")
+        headings = (*SITE_HEADINGS, "exceeds", "n")
         table = ResponsiveTable(
             title=f"Best site per stream, view {view}{mark}",
             caption="+: as many other sites tie with it",
@@ -180,11 +180,11 @@ def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
 def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
     from probe_kit.train.results.summary import site_cells
 
-    return tuple(map(Cell, (*site_cells(row), _beats(row), str(row["n"]))))
+    return tuple(map(Cell, (*site_cells(row), _exceeded(row), str(row["n"]))))
 
 
-def _beats(best: "pd.Series[Any]") -> str:
-    """What a site is better than, of what was tried."""
+def _exceeded(best: "pd.Series[Any]") -> str:
+    """The controls that a site is shown to exceed, and those that it is not shown to exceed."""
     from pandas import isna
 
     from probe_kit.statistics.significance import SIGNIFICANCE
@@ -195,5 +195,8 @@ def _beats(best: "pd.Series[Any]") -> str:
         "random-features": best["exceeds_random_features"],
         "untrained": best["exceeds_untrained"],
     }
-    found = [name if better else f"not {name}" for name, better in tried.items() if not isna(better)]
-    return ", ".join(found) or "–"
+    tested = {name: bool(better) for name, better in tried.items() if not isna(better)}
+    shown, missed = (
+        ", ".join(name for name, better in tested.items() if better == want) for want in (True, False)
+    )
+    return "; ".join(filter(None, [shown, f"not shown: {missed}" if missed else ""])) or "–"

@@ -24,7 +24,9 @@ from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 
-CategoryVerdict = Verdict | Literal["known", "unknown", "acted on", "encoded, not acted on", "not shown"]
+CategoryVerdict = (
+    Verdict | Literal["known", "unknown", "encoded", "acted on", "encoded, not acted on", "not shown"]
+)
 """A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
@@ -52,6 +54,8 @@ def verdict(row: RetentionRow) -> CategoryVerdict:
     nothing: CategoryVerdict = "absent" if row.backbone.verdict == "absent" else "not shown"
     if row.image_swap.used is not None:
         return nothing if row.image_swap.used == "absent" else cast("Verdict", row.image_swap.used)
+    if row.success.sr is None:
+        return "encoded" if row.backbone.has_signal else nothing
     if _knows(row):
         return "acted on" if row.backbone.has_signal else "acted on, not found"
     return "encoded, not acted on" if row.backbone.has_signal else nothing
@@ -97,7 +101,7 @@ class CategorySummary:
     @property
     def conclusion(self) -> str:
         """What follows, and what to do next."""
-        return _CONCLUSIONS[verdict(self.row)]
+        return (_UNACTED if self.row.success.sr is None else _CONCLUSIONS)[verdict(self.row)]
 
 
 HEADINGS = ("VLM %", "backbone %", "action %", "success %", "retention", "verdict")
@@ -115,9 +119,17 @@ _CONCLUSIONS: dict[CategoryVerdict, str] = {
     "acts against": "The action goes against the pictures; there are no probes.",
     "does not follow": "The action does not follow the pictures; there are no probes.",
     "inconclusive": "Whether it is used remains open: more items would tell.",
+    "encoded": "Shown in the backbone.",
     "acted on": "Whether what is read is used was not tested: run `probe-kit intervene`.",
     "encoded, not acted on": "Shown in the backbone, not acted on. To test its use, run `probe-kit intervene`.",
 }
+
+
+_UNACTED = _CONCLUSIONS | {
+    "absent": "Absent from the backbone.",
+    "not shown": "Not shown in the backbone: more items would tell.",
+}
+"""The same of a model that did not act."""
 
 
 def _share(value: float | None, limits: Limits | None, marked: bool, intervals: bool) -> str:
@@ -236,7 +248,7 @@ def summary_table(
         gaps = [row for row in differences if row.category == name]
         lines += [(_name(name), f"{row.group} − {row.minus}", *_difference_cells(row, intervals)) for row in gaps]
     headings = ("category", "run", *HEADINGS)
-    shown = [at for at in range(len(headings)) if at == 0 or (several and at == 1)]
+    shown = [at for at in range(len(headings)) if at == 0 or (at == 1 and (several or differences))]
     shown += [at for at in range(2, len(headings)) if any(line[at] not in ("–", "") for line in lines)]
     legend = [_LEGENDS[headings[at]] for at in shown if headings[at] in _LEGENDS]
     return TextTable(

@@ -151,3 +151,12 @@ def test_used_is_said_only_where_an_intervention_was_stored() -> None:
     assert verdict(replace(absent, backbone=replace(absent.backbone, verdict="absent"))) == "absent"
     (found,) = summarise_runs(*split(acts("color", 1.0, None, 0.95), acts(MEAN, 1.0, None)))
     assert "was not tested: run `probe-kit intervene`" in found.sentences[0]
+
+
+def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
+    rows = [acts("color", 1.0, None, None), acts("shape", 0.5, None, None), acts(MEAN, 0.75, None, None)]
+    (found,) = summarise_runs(*split(*rows))
+    color, shape = found.sentences
+    assert color.endswith("the model did not act. Shown in the backbone.")
+    assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
+    assert "acted on" not in " ".join(cell for line in summary_table([found]).cells for cell in line)

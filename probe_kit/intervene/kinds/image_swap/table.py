@@ -30,8 +30,8 @@ def image_swap_table(rows: Sequence[ImageSwapEffect], context: TableContext) -> 
         names=tuple(row.category for row in rows),
         styles=("",) * len(rows),
         parts=(
-            swap_part("Does the action follow the images?", rows),
             Part("Verdict", ("verdict",), tuple((Cell(verdict),) for verdict in said)),
+            swap_part("Does the action follow the images?", rows),
         ),
     )
 
