@@ -36,7 +36,7 @@ class Demo:
             marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
             f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
             f"        {self.folder / 'episode.gif'}  what one episode looks like",
-            f"        {self.folder / 'table.md'}  the tables above",
+            f"        {self.folder / 'table.md'}  every table",
             f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
             marked("[bold]Try[/]     probe-kit suite show            the questions"),
             "        probe-kit extract --model expert --items 4    a policy that knows the answers",
