@@ -32,6 +32,7 @@ from probe_kit.extract.run_layout import DATA, StoredStream
 from probe_kit.extract.store.format.commits import commit_key, write_commit
 from probe_kit.extract.store.format.hashes import HASH
 from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.seconds import NOT_MEASURED, write_seconds
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 
@@ -141,7 +142,7 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
     episodes = max(1, round(gigabytes * 1e9 / stream.raw_bytes(True)))
     plan = make_plan(suite, [stream], 0, 1, True)
     many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
-    writer = RunWriter(locate(run), replace(plan, episodes=many), settings("none"))
+    writer = RunWriter(locate(run), _of_many(plan, many), settings("none"))
     record = episode(plan, 0).record
     with writer.owned():
         for planned in many:
@@ -172,7 +173,7 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
     plan = make_plan(suite, [replace(BACKBONE, width=2), replace(EXPERT, width=2)], 0, 1, True)
     first = plan.episodes[0]
     many = tuple(_numbered(first, number) for number in range(episodes))
-    writer = RunWriter(locate(run), replace(plan, episodes=many), settings("zstd"))
+    writer = RunWriter(locate(run), _of_many(plan, many), settings("zstd"))
     writer.write(episode(writer.plan, 0).record)
     model = writer.root.location.read(commit_key(0))
     commit = json.loads(model)
@@ -185,7 +186,14 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
             (run / DATA / new).parent.mkdir(parents=True)
             os.link(run / DATA / key, run / DATA / new)
         one = {**commit, "episode": number, "episode_id": many[number].episode.episode_id, "objects": objects}
+        write_seconds(writer.root, number, replace(NOT_MEASURED, inference=0.0, simulation=0.0))
         write_commit(writer.location, number, one)
+
+
+def _of_many(plan: Plan, episodes: tuple[PlannedEpisode, ...]) -> Plan:
+    """The plan with these episodes, whose items its suite then holds."""
+    items = tuple(planned.episode.item for planned in episodes)
+    return replace(plan, suite=replace(plan.suite, items=items), episodes=episodes)
 
 
 def _numbered(planned: PlannedEpisode, number: int) -> PlannedEpisode:
