@@ -177,7 +177,7 @@ class RetentionTable:
     @property
     def summary(self) -> list[RunSummary]:
         """Per run a row and a sentence for every category: what the table found."""
-        return summarise_runs(self.rows, self.means)
+        return summarise_runs(self.all_rows)
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = ()) -> "Group":
         """The summary for a rich console: one table, and a sentence per category as the last lines.

@@ -281,11 +281,14 @@ def _name(category: str) -> str:
     return spelt[:1].upper() + spelt[1:]
 
 
-def summarise_runs(rows: Sequence[RetentionRow], means: Sequence[RetentionRow]) -> list[RunSummary]:
-    """One per run and group, by the first view of each; policies have the answers of a VLM of their suite.
+def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
+    """One per run and group of a table's rows and means, by the first view of each.
 
+    Policies have the answers of a VLM of their suite.
     A VLM has a summary of its own only where no policy of its suite is in the table.
     """
+    rows = [row for row in all_rows if row.category != MEAN]
+    means = [row for row in all_rows if row.category == MEAN]
     asked = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
     asked_means = {row.run.location: row for row in means if is_vlm(row)}
     policies = _by_run([row for row in rows if not is_vlm(row)])

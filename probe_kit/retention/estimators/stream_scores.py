@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.statistics.bootstrap import units_seed
-from probe_kit.statistics.estimates.balanced import CHANCE, balanced_sums
+from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
 from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, mean_interval, not_surer
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
@@ -64,8 +64,7 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], suite
     """
     if not rows:
         return None
-    sums = balanced_sums(curve.decisions, curve.labels, curve.fold_of, curve.groups)
-    own = {name: sums.only(found) for name, found in rows.items()}
+    own = {name: curve.sums.only(found) for name, found in rows.items()}
     streams = []
     for name, found in rows.items():
         sites = [curve.sites[row] for row in found]

@@ -44,7 +44,7 @@ def latex(
     """
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
     parts = ["% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}", *colours]
-    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    found = summarise_runs(rows)
     whole = summary_table(found, differences)
     further = [whole, *further]
     parts += [_table(table.without_details()) for table in tables_of(rows, differences, unpaired)]

@@ -10,7 +10,7 @@ from probe_kit.retention.columns.tables import Table, cell_text, tables_of
 from probe_kit.retention.columns.text import ABOVE_CHANCE
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.retention.rows.row import RetentionRow
 
 
 def markdown(
@@ -25,7 +25,7 @@ def markdown(
 
     Differences stand below the runs of their category; unpaired: why others have none.
     """
-    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    found = summarise_runs(rows)
     whole = summary_table(found, differences)
     parts = [_markdown_table(whole.title, whole.columns, whole.cells), f"{whole.note}.\n"]
     parts += [f"* {sentence}" for run in found for sentence in run.sentences]

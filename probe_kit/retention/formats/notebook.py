@@ -8,7 +8,7 @@ from probe_kit.retention.columns.summary import summarise_runs, summary_table
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables, plain_tables
-from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.retention.rows.row import RetentionRow
 
 _CELL = "text-align:{align};padding:.25em .6em;white-space:nowrap"
 _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of text
@@ -16,7 +16,7 @@ _INK = ";color:#1b1f24"  # on a heat colour, whatever the page's own colour of t
 
 def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> str:
     """The summary, and folded below it the report's first tables: headings explain themselves when pointed at."""
-    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    found = summarise_runs(rows)
     summary = plain_tables([summary_table(found, differences)])
     said = "".join(f"<li>{_safe(sentence)}</li>" for run in found for sentence in run.sentences)
     tables = [

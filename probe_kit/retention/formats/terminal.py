@@ -54,7 +54,7 @@ def rich_tables(
         tables = [part for table in chosen for part in views_of(table)]
         blocks += [_block(table.without_details(), called) for table in tables]
     plain = [*(wording_tables(wordings) if "success" in details else []), *further]
-    found = summarise_runs([row for row in rows if row.category != MEAN], [r for r in rows if r.category == MEAN])
+    found = summarise_runs(rows)
     why = unpaired if details or len(found) > 1 else ()
     said = [Text(sentence, style="yellow") for sentence in (*why, *notes)]
     return Group(*blocks, *map(_plain, plain), _Summary(found, differences), *said, *_sentences(found))

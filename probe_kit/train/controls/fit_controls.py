@@ -122,13 +122,13 @@ def check_untrained(run: RunReader, untrained: RunReader, settings: ProbeSetting
         )
     here, there = (_labels_by_episode(one, settings) for one in (run, untrained))
     if here != there:
-        mend = "Extract both from the same suite"
+        advice = "Extract both from the same suite"
         if settings.call > 0:
             reached = f"Not the same episodes got as far as captured inference {settings.call}"
-            mend = f"{reached}: leave --call or --untrained out"
+            advice = f"{reached}: leave --call or --untrained out"
         raise UsageError(
             f"the untrained control {untrained.model!r} has {len(there)} episodes to probe, "
-            f"{run.model!r} has {len(here)}, and they are not the same. {mend}."
+            f"{run.model!r} has {len(here)}, and they are not the same. {advice}."
         )
     if run.settings_sha256 == untrained.settings_sha256:
         raise UsageError(

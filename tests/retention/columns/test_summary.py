@@ -70,7 +70,7 @@ def split(*rows: RetentionRow) -> tuple[list[RetentionRow], list[RetentionRow]]:
 
 
 def test_a_sentence_says_what_was_found_with_numbers_uncertainty_items_and_what_follows() -> None:
-    (found,) = summarise_runs(*split(*ASKED, *ACTED))
+    (found,) = summarise_runs([*ASKED, *ACTED])
     color, state, counting = found.sentences
     assert color == (
         "Color (24 items): the VLM answers right in 100 %, 90 to 100; the backbone holds the answer (100 %, 40 to "
@@ -84,7 +84,7 @@ def test_a_sentence_says_what_was_found_with_numbers_uncertainty_items_and_what_
 
 
 def test_a_regime_that_says_nothing_beside_an_interval_above_one_half_names_its_margin() -> None:
-    (found,) = summarise_runs(*split(*ACTED))
+    (found,) = summarise_runs(ACTED)
     assert "56 to 76, less than the 20 points above one half that guessing can reach" in found.sentences[1]
     assert "guessing can reach" not in found.sentences[0]
 
@@ -95,13 +95,13 @@ BLIND = [answers(name, picture="none") for name in ("color", MEAN)]
 
 @pytest.mark.parametrize("rows", [ACTED, [*ACTED, *ELSEWHERE], [*ACTED, *BLIND]])
 def test_a_policy_stands_alone_where_no_vlm_was_asked_the_same(rows: list[RetentionRow]) -> None:
-    found = next(one for one in summarise_runs(*split(*rows)) if one.run == "pi0-tiny")
+    found = next(one for one in summarise_runs(rows) if one.run == "pi0-tiny")
     assert found.beside == ""
     assert all("VLM" not in sentence for sentence in found.sentences)
 
 
 def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
-    (found,) = summarise_runs(*split(*ASKED))
+    (found,) = summarise_runs(ASKED)
     assert found.sentences[0] == (
         "Color (24 items): the VLM answers right in 100 %, 90 to 100. The VLM knows the answer."
     )
@@ -109,7 +109,7 @@ def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
 
 
 def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control() -> None:
-    (found,) = summarise_runs(*split(*ASKED, *ACTED))
+    (found,) = summarise_runs([*ASKED, *ACTED])
     table = summary_table([found])
     assert table.columns == ("category", *HEADINGS)
     color, _, counting, mean = table.cells
@@ -124,7 +124,7 @@ def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control
 
 def test_several_runs_stand_in_one_table_by_category() -> None:
     again = [replace(one, run=replace(one.run, location="b", label="early")) for one in ACTED]
-    found = summarise_runs(*split(*ACTED, *again))
+    found = summarise_runs([*ACTED, *again])
     table = summary_table(found)
     assert [cells[:2] for cells in table.cells[:2]] == [("Color", "pi0-tiny"), ("Color", "early")]
 
@@ -149,13 +149,13 @@ def test_used_is_said_only_where_an_intervention_was_stored() -> None:
     assert verdict(acts("color", 0.5, "used", 0.5)) == "used"
     absent = acts("color", 0.5, "absent", 0.5)
     assert verdict(replace(absent, backbone=replace(absent.backbone, verdict="absent"))) == "absent"
-    (found,) = summarise_runs(*split(acts("color", 1.0, None, 0.95), acts(MEAN, 1.0, None)))
+    (found,) = summarise_runs([acts("color", 1.0, None, 0.95), acts(MEAN, 1.0, None)])
     assert "was not tested: run `probe-kit intervene`" in found.sentences[0]
 
 
 def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     rows = [acts("color", 1.0, None, None), acts("shape", 0.5, None, None), acts(MEAN, 0.75, None, None)]
-    (found,) = summarise_runs(*split(*rows))
+    (found,) = summarise_runs(rows)
     color, shape = found.sentences
     assert color.endswith("the model did not act. Shown in the backbone.")
     assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
