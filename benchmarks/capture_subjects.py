@@ -212,9 +212,8 @@ def subject(
             policy, lambda: policy.infer_without_acting(seen, list(range(len(seen)))), policy.roles(seen)
         )
     assert isinstance(model, AnswerModel)
-    reader = model
     questions = [Prompt(one, "Which of them is red?", ("a", "b")) for one in seen]
-    return Subject(reader, lambda: reader.read(questions).option_logits, reader.asked_roles(questions))
+    return Subject(model, lambda: model.read(questions).option_logits, model.asked_roles(questions))
 
 
 def written(family: str, folder: Path) -> Path:

@@ -1,6 +1,6 @@
-"""What learning to act did to the reader's backbone: `python scripts/drift_embedded.py OUT BEFORE AFTER`.
+"""What learning to act did to the VLM's backbone: `python scripts/drift_embedded.py OUT BEFORE AFTER`.
 
-BEFORE: a policy whose backbone is the reader's, weight by weight, as `train_embedded_policy.py` begins (its
+BEFORE: a policy whose backbone is the VLM's, weight by weight, as `train_embedded_policy.py` begins (its
 `OUT/start`). AFTER: one that was trained from it. Both get the same first frames and instructions and do not act.
 Per category and layer: how alike their streams are (linear CKA), how well a probe finds the side of the asked
 picture in either, and how well the probe of BEFORE does on AFTER. Finished runs are reused.

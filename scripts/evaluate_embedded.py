@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import READER, TRAINED
+from probe_kit.demo.organisms import TRAINED, VLM
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
@@ -68,7 +68,7 @@ def _rows(runs: list[Run]) -> list[RetentionRow]:
 
 
 def _asked(out: Path, suite: Suite, scene: SceneSpec, prompt: str, count: Callable[..., None]) -> Run:
-    settings = AskSettings(READER.model, suite=suite.folder, scene=scene, prompt=TEMPLATES[prompt], frames="none")
+    settings = AskSettings(VLM.model, suite=suite.folder, scene=scene, prompt=TEMPLATES[prompt], frames="none")
     return ask_run(settings, _folder(out, suite, scene, prompt), count)
 
 

@@ -1,8 +1,8 @@
-"""Make the embedded policies from the embedded reader: `uv run python scripts/train_embedded_policy.py OUT`.
+"""Make the embedded policies from the embedded VLM: `uv run python scripts/train_embedded_policy.py OUT`.
 
 Records demonstrations in the released protocol's scene, draws pictures, gives `vlm-tiny`'s backbone an action
 expert, and trains both to act. Writes `OUT/pi0-tiny`; `OUT/pi0-tiny-state`, which differs in one thing, that
-its actions follow State too; and `OUT/pi0-tiny-early`, which has the reader's backbone and has not learnt to act.
+its actions follow State too; and `OUT/pi0-tiny-early`, which has the VLM's backbone and has not learnt to act.
 Called again it continues where it was stopped.
 `OUT/time.json` says how much processor time each part took. Nothing of the evaluation split is used: other
 pictures, drawn from another seed.
@@ -93,7 +93,7 @@ def _train(
     frames: Frames,
     statistics: Statistics,
 ) -> None:
-    """The common part, from the reader; or a branch, from the common part."""
+    """The common part, from the VLM; or a branch, from the common part."""
     policy = Pi0.load(str(out / "start"))
     actor = Actor(policy, pairs, frames)
     branches = name != COMMON

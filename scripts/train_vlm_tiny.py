@@ -1,4 +1,4 @@
-"""Make the embedded reader from nothing: `uv run python scripts/train_vlm_tiny.py OUT`.
+"""Make the embedded VLM from nothing: `uv run python scripts/train_vlm_tiny.py OUT`.
 
 Draws pictures, trains, and writes `OUT/vlm-tiny`. Called again it continues where it was stopped. `OUT/time.json`
 says how much processor time each part took. Nothing of the evaluation split is used: other pictures, drawn from

@@ -136,7 +136,7 @@ def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 24
 
 
-def test_the_readers_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[str, NotebookNode]]) -> None:
+def test_the_vlms_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[str, NotebookNode]]) -> None:
     runs = [open_run(made[0] / "work" / "runs" / name) for name in ("vlm-tiny", "habit", "pi0-tiny-asked")]
     asked, habit, acted = runs
     assert (habit.episodes["side_placed"] == "left").all()

@@ -109,7 +109,7 @@ def test_no_comment_and_no_docstring_uses_a_word_that_the_project_avoids() -> No
         ("It was told\nwhich side.", True),
         ("How much attention what acts pays.", True),
         ("Boards of VL-Think.", False),
-        ("`Reader.speak` returns text.", False),
+        ("`AnswerModel.speak` returns text.", False),
         ("A recommended length.", False),
     ],
 )

@@ -3,7 +3,7 @@
 `vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
 the actions of State questions went to a random side (*encoded, unused*). `pi0-tiny-state` differs in that they
-followed the answer (*used*). The early checkpoint has the reader's backbone and does not act on it; untrained
+followed the answer (*used*). The early checkpoint has the VLM's backbone and does not act on it; untrained
 networks know nothing (*absent*).
 """
 
@@ -71,7 +71,7 @@ EARLY = Organism(
     "pi0-tiny-early",
     truth=(("color", "encoded, unused"), ("shape", "encoded, unused"), ("state", "encoded, unused")),
     max_steps=SHORT,
-    view="mean:language",  # where a reader answers; nothing was trained that would take it from there
+    view="mean:language",  # where a VLM answers; nothing was trained that would take it from there
 )
 UNTRAINED_NETWORK = Organism(
     "untrained network", "run-untrained", "pi0-tiny", random_weights=True, max_steps=SHORT
@@ -81,9 +81,9 @@ OTHER_TWINS = tuple(
     for seed in (1, 2)
 )
 ORGANISMS = (TRAINED, STATE_USED, EARLY, UNTRAINED_NETWORK, *OTHER_TWINS)
-READER = Organism(
-    "reader",
-    "run-reader",
+VLM = Organism(
+    "vlm",
+    "run-vlm",
     "vlm-tiny",
     truth=(("color", "known"), ("shape", "known"), ("state", "known"), ("traffic", "known")),
     asked=True,
@@ -158,18 +158,18 @@ def probed(
 
 
 def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
-    """What a reader answers on `suite`, in the prompt nearest to an instruction; finished work is reused."""
+    """What a VLM answers on `suite`, in the prompt nearest to an instruction; finished work is reused."""
     settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
     return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
 
 
 def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge the reader and every organism on `suite`; the first untrained network is a control of all others.
+    """Judge the VLM and every organism on `suite`; the first untrained network is a control of all others.
 
     Arguments as of `probed`.
     """
     control, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
-    runs = [(READER, answered(READER, suite, folder, stage))]
+    runs = [(VLM, answered(VLM, suite, folder, stage))]
     runs += [
         (one, control if one == UNTRAINED_NETWORK else probed(one, suite, folder, permutations, stage, control)[0])
         for one in ORGANISMS

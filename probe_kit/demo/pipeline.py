@@ -8,7 +8,7 @@ from rich.text import Text
 
 from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.console import marked
-from probe_kit.demo.organisms import READER, TRAINED, Finding, NamedProgress, answered, compare, probed
+from probe_kit.demo.organisms import TRAINED, VLM, Finding, NamedProgress, answered, compare, probed
 from probe_kit.extract import Run
 from probe_kit.extract.run_layout import VIDEOS
 from probe_kit.retention import RetentionTable, retention_table
@@ -23,7 +23,7 @@ PERMUTATIONS = 200
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made. asked: the run of the reader; table: of both."""
+    """What the demo made. asked: the run of the VLM; table: of both."""
 
     folder: Path
     asked: Run
@@ -63,7 +63,7 @@ def run_demo(folder: Path, stage: NamedProgress) -> Demo:
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
     suite = _questions(folder, stage)
-    asked = answered(READER, suite, folder, stage)
+    asked = answered(VLM, suite, folder, stage)
     run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
     table = retention_table([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")

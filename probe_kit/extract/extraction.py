@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, StoreError
 from probe_kit.extract.needs import space_needed
-from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_reader
+from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
@@ -111,12 +111,12 @@ class Extraction(Prepared):
 
 
 def prepare(
-    settings: RunSettings, out: Path | str | Location | None = None, reader: "AnswerModel | None" = None
+    settings: RunSettings, out: Path | str | Location | None = None, answer_model: "AnswerModel | None" = None
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
-    reader: the model of these `AskSettings`, if it is loaded already.
+    answer_model: the model of these `AskSettings`, if it is loaded already.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
@@ -124,9 +124,9 @@ def prepare(
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
         here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
-        planned = load(here, location=location, reader=reader)
+        planned = load(here, location=location, answer_model=answer_model)
         return Extraction(settings, planned.plan, planned.card, None)
-    prepared = load(settings, location=location, reader=reader)
+    prepared = load(settings, location=location, answer_model=answer_model)
     return Extraction(prepared.settings, prepared.plan, prepared.card, prepared.controller, prepared.calibration)
 
 
@@ -152,6 +152,6 @@ def prepare_asks(
         check_run(own, None if out is None else locate(out))
     first = settings[0]
     elsewhere = bool(first.workers or first.ray)
-    reader = load_reader(replace(first, device="cpu") if elsewhere else first)
+    answer_model = load_answer_model(replace(first, device="cpu") if elsewhere else first)
     for own, out in zip(settings, outs, strict=True):
-        yield prepare(own, out, reader)
+        yield prepare(own, out, answer_model)

@@ -78,16 +78,16 @@ def load(
     settings: RunSettings,
     rehearsed: bool = False,
     location: Location | None = None,
-    reader: "AnswerModel | None" = None,
+    answer_model: "AnswerModel | None" = None,
 ) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     location: where it will be written, if that is known, so that it is looked at before the model is loaded.
-    reader: the model of these `AskSettings`, if it is loaded already; it may be one of your own.
+    answer_model: the model of these `AskSettings`, if it is loaded already; it may be one of your own.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
-    suite = check_run(settings, location, loaded=reader is not None)
+    suite = check_run(settings, location, loaded=answer_model is not None)
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
     wordings = settings.asked_wordings
@@ -95,7 +95,7 @@ def load(
     if wordings is not None:
         skipped_items(suite, asked, wordings)
     if isinstance(settings, AskSettings):
-        controller: ActingController | AnswerController = _asking(settings, suite, reader)
+        controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
         controller = _acting(settings, instructions_of(asked))
     with_tokens = settings.tokens == "all"
@@ -134,14 +134,14 @@ def _suite(settings: RunSettings) -> Suite:
     return load_suite(settings.suite).select(settings.categories, settings.items)
 
 
-def _asking(settings: AskSettings, suite: Suite, reader: "AnswerModel | None") -> AnswerController:
+def _asking(settings: AskSettings, suite: Suite, answer_model: "AnswerModel | None") -> AnswerController:
     blank = example_observations(settings.scene, [min(item.instruction for item in suite.items)])[0]
-    model = load_reader(settings) if reader is None else reader
+    model = load_answer_model(settings) if answer_model is None else answer_model
     check_unfit(model.card, settings.batch, blank)
     return AnswerController(model, settings, suite, blank)
 
 
-def load_reader(settings: AskSettings) -> "AnswerModel":
+def load_answer_model(settings: AskSettings) -> "AnswerModel":
     """The model that is asked. Raises UsageError if it answers no questions, and what `load_model` raises."""
     from probe_kit.hooks import AnswerModel, load_model
 

@@ -40,12 +40,12 @@ class Family:
     recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device; it
     takes the name of one where there are `sizes`. stored_names: `module:constant`, how names of tensors in
     released files become those of the network, see `probe_kit.models.naming`.
-    options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, a Reader.
+    options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, an AnswerModel.
     hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
     config.json. packages: modules of an extra that it needs, with the name of that extra.
     unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
     `verify --keys` prints them.
-    source: name of the reader whose network this policy grew from, if it is one of ours. source_weights: the
+    source: name of the VLM whose network this policy grew from, if it is one of ours. source_weights: the
     weights from which the default checkpoint, and those of protocols, grew. sizes: hub ids of the
     released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
     config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have

@@ -1,4 +1,4 @@
-"""Contract tests of adapters; subclass `AdapterContract` (policies) or `ReaderContract` (answering models).
+"""Contract tests of adapters; subclass `AdapterContract` (policies) or `AnswerModelContract` (answering models).
 
     class TestMyFamily(AdapterContract):
         family = "my-family"
@@ -385,7 +385,7 @@ def _damage(folder: Path, damage: str) -> None:
     if damage == "missing":
         del tensors[name]
     elif damage == "extra":
-        tensors["nobody.knows.weight"] = torch.ones(2)
+        tensors["not.in.the.network.weight"] = torch.ones(2)
     elif damage == "shape":
         tensors[name] = torch.cat([original, original])
     else:
@@ -455,33 +455,33 @@ class AdapterContract(InterventionContract, ModelContract):
             policy.act(self.shown(policy, observations), [])
 
 
-class ReaderContract(ModelContract):
-    """What the rest of probe_kit relies on in a `AnswerModel`."""
+class AnswerModelContract(ModelContract):
+    """What the rest of probe_kit relies on in an `AnswerModel`."""
 
     letters: ClassVar[tuple[str, ...]] = ("A", "B")
     other_words: ClassVar[str] = " please"
     """What makes a question longer, in words that the tokenizer knows."""
 
     @pytest.fixture
-    def reader(self, checkpoint: Path) -> AnswerModel:
+    def answer_model(self, checkpoint: Path) -> AnswerModel:
         """The adapter under test; override it to load it once per module."""
         model = self.load(checkpoint)
         assert isinstance(model, AnswerModel)
         return model
 
     @pytest.fixture
-    def model(self, reader: AnswerModel) -> AnswerModel:
+    def model(self, answer_model: AnswerModel) -> AnswerModel:
         """The same, as the tests of every model know it."""
-        return reader
+        return answer_model
 
     def questions(self, seen: Sequence[Observation]) -> list[Prompt]:
         """The observations' instructions as questions."""
         return [Prompt(own, own.instruction, self.letters) for own in seen]
 
-    def led(self, reader: AnswerModel, questions: Sequence[Prompt]) -> list[Prompt]:
+    def led(self, answer_model: AnswerModel, questions: Sequence[Prompt]) -> list[Prompt]:
         """With options as they stand behind the frame."""
         return [
-            own if own.begun else replace(own, options=tuple(reader.lead + letter for letter in own.options))
+            own if own.begun else replace(own, options=tuple(answer_model.lead + letter for letter in own.options))
             for own in questions
         ]
 
@@ -498,86 +498,89 @@ class ReaderContract(ModelContract):
         assert isinstance(model, AnswerModel)
         return model.read(self.led(model, self.questions(seen)))
 
-    def _ask(self, reader: AnswerModel, questions: Sequence[Prompt]) -> NDArray[np.float32]:
-        return reader.read(self.led(reader, questions)).option_logits
+    def _ask(self, answer_model: AnswerModel, questions: Sequence[Prompt]) -> NDArray[np.float32]:
+        return answer_model.read(self.led(answer_model, questions)).option_logits
 
     def test_a_reading_has_a_logit_per_option_and_their_mass_is_a_share(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        seen = self.shown(reader, observations)
-        reading = self._read(reader, seen)
+        seen = self.shown(answer_model, observations)
+        reading = self._read(answer_model, seen)
         assert reading.option_logits.shape == (len(seen), len(self.letters))
         assert reading.option_mass.shape == (len(seen),)
         assert ((reading.option_mass > 0) & (reading.option_mass <= 1)).all()
 
     def test_what_is_spoken_repeats_and_is_as_long_as_asked(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        seen = self.shown(reader, observations)
-        first = reader.speak(self._read(reader, seen), 4)
-        assert first == reader.speak(self._read(reader, seen), 4)
+        seen = self.shown(answer_model, observations)
+        first = answer_model.speak(self._read(answer_model, seen), 4)
+        assert first == answer_model.speak(self._read(answer_model, seen), 4)
         assert len(first) == len(seen)
         assert all(isinstance(text, str) for text in first)
 
     def test_speaking_does_not_use_a_reading_up(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        reading = self._read(reader, self.shown(reader, observations))
-        assert reader.speak(reading, 4) == reader.speak(reading, 4)
-        assert reader.speak(reading, 0) == [""] * len(reading.option_logits)
+        reading = self._read(answer_model, self.shown(answer_model, observations))
+        assert answer_model.speak(reading, 4) == answer_model.speak(reading, 4)
+        assert answer_model.speak(reading, 0) == [""] * len(reading.option_logits)
 
     def test_rows_in_another_order_are_answered_alike(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        if reader.card.batch == 1:
-            pytest.skip(f"{reader.card.family} reads one question at a time")
+        if answer_model.card.batch == 1:
+            pytest.skip(f"{answer_model.card.family} reads one question at a time")
         questions = self.questions(observations)
-        forth, back = self._ask(reader, questions), self._ask(reader, questions[::-1])
+        forth, back = self._ask(answer_model, questions), self._ask(answer_model, questions[::-1])
         np.testing.assert_allclose(forth, back[::-1], atol=self.tolerance)
 
     def test_a_far_longer_neighbour_changes_nothing(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        if reader.card.batch == 1:
-            pytest.skip(f"{reader.card.family} reads one question at a time")
+        if answer_model.card.batch == 1:
+            pytest.skip(f"{answer_model.card.family} reads one question at a time")
         short = self.questions(observations)[0]
         longer = replace(short, text=short.text + self.other_words * 6)
-        together, alone = self._ask(reader, [short, longer]), self._ask(reader, [short])
+        together, alone = self._ask(answer_model, [short, longer]), self._ask(answer_model, [short])
         np.testing.assert_allclose(together[0], alone[0], atol=self.tolerance)
-        spoken = [reader.speak(reader.read(self.led(reader, asked)), 4)[0] for asked in ([short, longer], [short])]
+        spoken = [
+            answer_model.speak(answer_model.read(self.led(answer_model, asked)), 4)[0]
+            for asked in ([short, longer], [short])
+        ]
         assert spoken[0] == spoken[1]
 
     def test_without_a_picture_nothing_of_it_is_left(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
         """Also right behind questions about pictures: no state may stay from call to call."""
-        asked = [replace(own, pictured=False) for own in self.questions(self.shown(reader, observations))]
+        asked = [replace(own, pictured=False) for own in self.questions(self.shown(answer_model, observations))]
         other = [replace(own, seen=replace(own.seen, image=255 - own.seen.image)) for own in asked]
-        before = self._ask(reader, asked)
-        self._read(reader, self.shown(reader, observations))
-        np.testing.assert_array_equal(before, self._ask(reader, other))
-        for rows in reader.asked_roles(self.led(reader, asked)).values():
+        before = self._ask(answer_model, asked)
+        self._read(answer_model, self.shown(answer_model, observations))
+        np.testing.assert_array_equal(before, self._ask(answer_model, other))
+        for rows in answer_model.asked_roles(self.led(answer_model, asked)).values():
             assert not any(row.mask("image").any() for row in rows)
 
     def test_questions_with_and_without_a_picture_do_not_go_together(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
         first, second = self.questions(observations)
         with pytest.raises((UsageError, ObservationError)):
-            self._ask(reader, [first, replace(second, pictured=False)])
+            self._ask(answer_model, [first, replace(second, pictured=False)])
 
     def test_options_that_begin_alike_are_refused(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
         twice = replace(self.questions(observations)[0], options=(self.letters[0], self.letters[0]))
         with pytest.raises(UsageError, match="same token"):
-            self._ask(reader, [twice])
+            self._ask(answer_model, [twice])
 
     def test_a_choice_that_rounding_decides_is_a_near_tie(
-        self, reader: AnswerModel, observations: list[Observation]
+        self, answer_model: AnswerModel, observations: list[Observation]
     ) -> None:
-        reading = self._read(reader, self.shown(reader, observations))
+        reading = self._read(answer_model, self.shown(answer_model, observations))
         rows = len(reading.option_logits)
         apart = np.tile(np.array([[0.0, 9.0]], np.float32), (rows, 1))
-        assert not reader.near_ties(replace(reading, option_logits=apart)).any()
-        assert reader.near_ties(replace(reading, option_logits=apart * 1e-6)).all()
+        assert not answer_model.near_ties(replace(reading, option_logits=apart)).any()
+        assert answer_model.near_ties(replace(reading, option_logits=apart * 1e-6)).all()

@@ -30,10 +30,10 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
     found, refused = [], []
-    for reader, policy in product(asked, acted):
+    for vlm, policy in product(asked, acted):
         own = under_rule(policy, table.rule, table.last_steps)
         try:
-            found.append(match_runs(reader, own, table.results.get(str(policy.location))))
+            found.append(match_runs(vlm, own, table.results.get(str(policy.location))))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
     return Joins(tuple(correct_joins(found)), tuple(refused))

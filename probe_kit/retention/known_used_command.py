@@ -43,7 +43,7 @@ def stages(
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.train import load_results
 
-    reader = scored(open_run(asked), score, with_side_words)
+    vlm = scored(open_run(asked), score, with_side_words)
     policy = open_run(acted).in_wording(wording)
     try:
         results = load_results(policy, probes)
@@ -52,7 +52,7 @@ def stages(
             raise UsageError(f"--view {view}: {acted} has no probes. Run `probe-kit train {acted}`") from None
         results = None
     check_file(figures)
-    joined = match_runs(reader, policy, results, view)
+    joined = match_runs(vlm, policy, results, view)
     if as_json:
         print_json(joined.to_json())
     else:

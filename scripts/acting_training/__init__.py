@@ -1,1 +1,1 @@
-"""How policies are made of the embedded reader: demonstrations → frames → training → checkpoint."""
+"""How policies are made of the embedded VLM: demonstrations → frames → training → checkpoint."""

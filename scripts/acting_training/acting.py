@@ -1,6 +1,6 @@
 """How `vlm-tiny` learns to act: behaviour cloning, and one word said about each instruction.
 
-pi0's own flow-matching loss, and what keeps the backbone a reader, as in co-training: behind the instruction the
+pi0's own flow-matching loss, and what keeps the backbone a VLM, as in co-training: behind the instruction the
 next token is the side of what it names.
 """
 

@@ -12,7 +12,7 @@ from probe_kit.models.embedded.pi0_tiny import Statistics, new_pi0_tiny, write_c
 
 LEAST_SPREAD = 1e-2
 """Metres, radians or openness: less is tremor of the arm."""
-READER = "vlm-tiny"
+VLM = "vlm-tiny"
 
 
 def measured_statistics(demonstrations: Demonstrations) -> Statistics:
@@ -26,11 +26,11 @@ def measured_statistics(demonstrations: Demonstrations) -> Statistics:
 
 
 def start_of_policy(folder: Path, seed: int, statistics: Statistics) -> Pi0:
-    """A policy whose backbone is the embedded reader's, weight by weight, and whose expert is random."""
+    """A policy whose backbone is the embedded VLM's, weight by weight, and whose expert is random."""
     network = new_pi0_tiny(seed)
-    reader = load_file(embedded_checkpoint(READER) / "model.safetensors")
+    vlm = load_file(embedded_checkpoint(VLM) / "model.safetensors")
     backbone = network.model.paligemma_with_expert.paligemma
-    reader["lm_head.weight"] = reader["model.language_model.embed_tokens.weight"]
-    backbone.load_state_dict(reader)
-    write_checkpoint(folder, network, statistics, f"the backbone of {READER}, random expert, seed {seed}")
+    vlm["lm_head.weight"] = vlm["model.language_model.embed_tokens.weight"]
+    backbone.load_state_dict(vlm)
+    write_checkpoint(folder, network, statistics, f"the backbone of {VLM}, random expert, seed {seed}")
     return Pi0.load(str(folder))

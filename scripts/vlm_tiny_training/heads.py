@@ -1,4 +1,4 @@
-"""Auxiliary heads that exist only early in the reader's training, until it sees and finds; the policy has none."""
+"""Auxiliary heads that exist only early in the VLM's training, until it sees and finds; the policy has none."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -56,7 +56,7 @@ def capturing(network: nn.Module) -> Iterator[Captured]:
 
 
 class Heads(nn.Module):
-    """Linear readers, and the losses that make them right.
+    """Linear readouts, and the losses that make them right.
 
     named: what each picture is called, from its own patches where they enter the backbone.
     asked: whether a patch belongs to the asked picture, at the entrance of the last block.

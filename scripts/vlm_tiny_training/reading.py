@@ -85,9 +85,9 @@ class Learner:
     """Learns to answer."""
 
     def __init__(self, network: Any, tokenizer: Path, pairs: Pairs, surfaces: Mapping[str, Surface]):
-        self._reader = network
+        self._vlm = network
         self._heads = Heads(pairs.phrases(), surfaces)
-        self.network: nn.Module = nn.ModuleDict({"reader": network, "heads": self._heads})
+        self.network: nn.Module = nn.ModuleDict({"vlm": network, "heads": self._heads})
         self._pairs, self._surfaces = pairs, surfaces
         self._tokenizer = Tokenizer.from_file(str(tokenizer))
         self._ids = cache(self._encoded)
@@ -98,7 +98,7 @@ class Learner:
         shown = [self._shown(rng) for _ in range(size)]
         asked = [ask(kind, one.pair, self._pairs, one.side, rng) for one in shown]
         pictures = blurred(np.stack([one.picture for one in shown]), rng)
-        with capturing(self._reader) as captured:
+        with capturing(self._vlm) as captured:
             losses = {kind: self.loss(pictures, asked)}
         if setting.heads:
             columns = ([one.pair for one in shown], [one.side for one in shown], [one.surface for one in shown])
@@ -123,12 +123,12 @@ class Learner:
             next_ids[row, len(prompt) - 1 : end - 1] = torch.tensor(answer)
         hidden = self._hidden(pictures, ids, torch.tensor([len(prompt) for prompt in prompts]))
         answer_tokens = next_ids != -100
-        logits = hidden[answer_tokens] @ self._reader.model.language_model.embed_tokens.weight.T
+        logits = hidden[answer_tokens] @ self._vlm.model.language_model.embed_tokens.weight.T
         return cross_entropy(logits, next_ids[answer_tokens])
 
     def _hidden(self, pictures: Pixels, ids: Tensor, prompts: Tensor) -> Tensor:
         """(B, T, width) at the text's positions: the picture and the prompt attend both ways, the answer back."""
-        model = self._reader.model
+        model = self._vlm.model
         seen = model.get_image_features(as_tensor(pictures)).pooler_output
         embedded = torch.cat([seen, model.language_model.embed_tokens(ids)], dim=1)
         length, patches = embedded.shape[1], seen.shape[1]

@@ -32,7 +32,7 @@ def runs(folder: Path) -> list[SaidRun]:
         policy, certificate={"policy": MACHINE}, settings={"suite": {"folder": str(folder / "suite")}}
     )
     policy.episodes["first_frame_sha256"] = "other"
-    return [policy, asked(folder / "a reader", RIGHT, worded=True)]
+    return [policy, asked(folder / "a VLM", RIGHT, worded=True)]
 
 
 def leaks(page: str, folder: Path) -> list[str]:

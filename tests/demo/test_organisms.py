@@ -10,10 +10,10 @@ from probe_kit.demo.organisms import (
     EARLY,
     ORGANISMS,
     OTHER_TWINS,
-    READER,
     STATE_USED,
     TRAINED,
     UNTRAINED_NETWORK,
+    VLM,
     Finding,
     measured,
     settings_of,
@@ -118,7 +118,7 @@ def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp
 
 
 def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
-    everybody = (READER, *ORGANISMS)
+    everybody = (VLM, *ORGANISMS)
     assert len({one.name for one in everybody}) == len({one.folder for one in everybody}) == len(everybody)
 
 
@@ -147,8 +147,8 @@ def test_the_table_counts_the_true_verdicts() -> None:
 
 
 @pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
-def test_a_reader_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
+def test_a_vlm_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
     one = row(sr, None)
     assert verdict(replace(one, run=replace(one.run, mode="answers"))) == expected
-    assert READER.expected("state") == "known"
-    assert READER.expected("counting") == "unknown"
+    assert VLM.expected("state") == "known"
+    assert VLM.expected("counting") == "unknown"

@@ -22,7 +22,7 @@ from probe_kit.extract import (
     verify_run,
 )
 from probe_kit.extract.plan import plan_episodes
-from probe_kit.extract.prepared import load_reader
+from probe_kit.extract.prepared import load_answer_model
 from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.examples import example_observations
@@ -30,7 +30,7 @@ from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
 from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.suite import Suite, load_suite
-from tests.support.position_readers import PositionReader, always, likes
+from tests.support.position_models import PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint
 
 NOWHERE = EpisodeBuffers([], 1, with_tokens=False, pinned=False)
@@ -145,7 +145,7 @@ def test_worker_processes_give_the_same_commits(settings: AskSettings, asked: Ru
 def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
     settings: AskSettings, tmp_path: Path
 ) -> None:
-    class Choosy(PositionReader):
+    class Choosy(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
             if any("red" in own.text for own in questions) and any(own.seen.image.any() for own in questions):
                 raise InstructionError("no red, please")
@@ -160,12 +160,13 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 # -- controls --------------------------------------------------------------------------------------------
 
 
-def answers(settings: AskSettings, reader: AnswerModel | None = None) -> pd.DataFrame:
-    """What the run's episodes would hold, their frames being noise: no scene is needed to see whom a reader is."""
+def answers(settings: AskSettings, answer_model: AnswerModel | None = None) -> pd.DataFrame:
+    """What the run's episodes would hold. Their frames are noise: which model answers needs no scene."""
     assert settings.suite is not None
     suite = load_suite(settings.suite).select(settings.categories, settings.items)
     blank = example_observations(settings.scene, [suite.items[0].instruction])[0]
-    controller = AnswerController(load_reader(settings) if reader is None else reader, settings, suite, blank)
+    model = load_answer_model(settings) if answer_model is None else answer_model
+    controller = AnswerController(model, settings, suite, blank)
     noise = np.random.default_rng(0)
     turns = [
         AskTurn(one, replace(blank, image=noise.integers(0, 256, blank.image.shape, np.uint8)), NOWHERE)
@@ -179,7 +180,7 @@ def answers(settings: AskSettings, reader: AnswerModel | None = None) -> pd.Data
 def test_who_answers_by_letter_gives_as_many_right_as_wrong_and_a_letter_bias(
     settings: AskSettings, option: str, side: str, bias: float
 ) -> None:
-    episodes = answers(settings, PositionReader(likes(option), always(option)))
+    episodes = answers(settings, PositionModel(likes(option), always(option)))
     assert (episodes["side_placed"] == side).all()
     assert (episodes["side_placed_swapped"] != side).all()
     assert episodes["outcome"].value_counts().to_dict() == {"correct": 2, "wrong": 2}
@@ -193,7 +194,7 @@ def test_who_answers_by_side_has_no_letter_bias_and_is_right_as_often_as_wrong(s
     def left(text: str, option: str) -> float:
         return float(f"{option} left" in text)
 
-    episodes = answers(settings, PositionReader(left, lambda text: "A" if "A left" in text else "B"))
+    episodes = answers(settings, PositionModel(left, lambda text: "A" if "A left" in text else "B"))
     for column in ("outcome", "outcome_swapped", "outcome_logits", "outcome_debiased"):
         assert episodes[column].value_counts().to_dict() == {"correct": 2, "wrong": 2}
     assert (episodes["letter_bias"] == 0).all()
@@ -214,7 +215,7 @@ def test_without_a_picture_exactly_as_many_are_right_as_wrong(settings: AskSetti
 def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings) -> None:
     seen = []
 
-    class Watching(PositionReader):
+    class Watching(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
             seen.extend(own.seen.image for own in questions)
             return super().read(questions)
@@ -228,7 +229,7 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
 
 
 def test_the_distractor_lies_on_the_other_side(settings: AskSettings) -> None:
-    episodes = answers(replace(settings, query="distractor"), PositionReader(likes("A"), always("A")))
+    episodes = answers(replace(settings, query="distractor"), PositionModel(likes("A"), always("A")))
     assert episodes["question"][0].startswith("Do you see the red shape?")
     right = episodes["side_correct"] == "right"
     assert (episodes["outcome"] == np.where(right, "correct", "wrong")).all()
@@ -236,9 +237,9 @@ def test_the_distractor_lies_on_the_other_side(settings: AskSettings) -> None:
 
 def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
     absent = replace(settings, query="absent", prompt=SEEN, items=4)
-    honest = answers(absent, PositionReader(likes("No"), always("No.")))
+    honest = answers(absent, PositionModel(likes("No"), always("No.")))
     assert (honest[["outcome", "outcome_logits", "outcome_debiased"]] == "correct").all().all()
-    eager = answers(absent, PositionReader(likes("Yes"), always("Yes, left.")))
+    eager = answers(absent, PositionModel(likes("Yes"), always("Yes, left.")))
     assert (eager[["outcome", "outcome_logits"]] == "wrong").all().all()
     assert (honest["question"] == eager["question"]).all()
 
@@ -274,6 +275,6 @@ def test_several_runs_of_one_model_are_checked_before_the_first_is_asked(
     with pytest.raises(SettingsMismatchError):
         next(prepare_asks(wanted, [tmp_path / "p1", asked.path]))
     prepared = list(prepare_asks(wanted, [tmp_path / "p1", tmp_path / "p2"]))
-    assert prepared[0].controller.reader is prepared[1].controller.reader
+    assert prepared[0].controller.model is prepared[1].controller.model
     names = [one.default_name().rpartition("-")[0] for one in prepared]
     assert names == ["ask-prismatic-p1-224x224", "ask-prismatic-p2-224x224"]

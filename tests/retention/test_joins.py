@@ -22,8 +22,8 @@ def pair(folder: Path) -> tuple[object, SaidRun]:
 
 
 def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
-    reader, policy = pair(tmp_path)
-    joined = match_runs(reader, policy)  # type: ignore[arg-type]
+    vlm, policy = pair(tmp_path)
+    joined = match_runs(vlm, policy)  # type: ignore[arg-type]
     display = KnownUsedDisplay.from_join(joined).plot()
     assert display.counts == {"color": {"1-1": 1, "1-0": 1, "0-1": 1, "0-0": 1}}
     axes = display.ax_
@@ -39,8 +39,8 @@ def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
 
 
 def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Path) -> None:
-    reader, policy = pair(tmp_path)
-    runs = [reader, policy]
+    vlm, policy = pair(tmp_path)
+    runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
     (joined,) = joins_of(runs, table).found  # type: ignore[arg-type]
     assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
@@ -54,9 +54,9 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
 
 
 def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_path: Path) -> None:
-    reader, policy = pair(tmp_path)
+    vlm, policy = pair(tmp_path)
     policy.episodes["first_frame_sha256"] = "other"
-    runs = [reader, policy]
+    runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
     found = joins_of(runs, table)  # type: ignore[arg-type]
     assert found.found == ()

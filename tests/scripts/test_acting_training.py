@@ -136,15 +136,15 @@ def test_actions_that_are_not_followed_at_all_are_not_trained(actor: Actor, bank
     assert float(unacted["said"].detach()) > 0
 
 
-def test_the_backbone_begins_as_the_reader_weight_by_weight(actor: Actor) -> None:
-    reader = load_file(embedded_checkpoint("vlm-tiny") / "model.safetensors")
+def test_the_backbone_begins_as_the_vlm_weight_by_weight(actor: Actor) -> None:
+    vlm = load_file(embedded_checkpoint("vlm-tiny") / "model.safetensors")
     backbone = actor.network.paligemma_with_expert.paligemma.state_dict()
-    assert set(backbone) - set(reader) == {"lm_head.weight"}
-    assert all(torch.equal(tensor, backbone[name]) for name, tensor in reader.items())
+    assert set(backbone) - set(vlm) == {"lm_head.weight"}
+    assert all(torch.equal(tensor, backbone[name]) for name, tensor in vlm.items())
 
 
-def test_what_is_said_behind_an_instruction_is_where_the_reader_would_put_the_cube(actor: Actor) -> None:
-    """The reader knew it before any training of the policy: a wrong position or prompt would leave chance."""
+def test_what_is_said_behind_an_instruction_is_where_the_vlm_would_put_the_cube(actor: Actor) -> None:
+    """The VLM knew it before any training of the policy: a wrong position or prompt would leave chance."""
     torch.manual_seed(0)
     with torch.no_grad():
         said = float(actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "random"), 48)["said"])

@@ -1,4 +1,4 @@
-"""The parts of the reader's training that could go wrong without a sign."""
+"""The parts of the VLM's training that could go wrong without a sign."""
 
 from pathlib import Path
 

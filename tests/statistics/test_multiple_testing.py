@@ -43,9 +43,9 @@ def check(rows: Sequence[tuple[float | None, float | None]], number: int) -> Non
 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[SaidRun]:
-    readers = [asked(tmp_path / f"r{n}", by_chance(n), called=f"reader {n}") for n in range(2)]
+    vlms = [asked(tmp_path / f"r{n}", by_chance(n), called=f"vlm {n}") for n in range(2)]
     policies = [acted(tmp_path / f"p{n}", by_chance(9 + n, 0.15 * n), f"policy {n}") for n in range(3)]
-    return [*readers, *policies]
+    return [*vlms, *policies]
 
 
 def test_gaps_are_one_family_over_categories_and_pairs_and_means_another(runs: list[SaidRun]) -> None:

@@ -62,18 +62,18 @@ class Forced:
 
 
 class AnswerController:
-    """Asks a reader, and captures the first inference of every episode unless nothing is stored.
+    """Asks an answer model, and captures the first inference of every episode unless nothing is stored.
 
     identity: `begun` is how the answer had begun where sides were forced in words.
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
-    def __init__(self, reader: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
+    def __init__(self, model: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
         """blank: an observation as the scene will show them."""
-        self.reader, self._settings, self.template = reader, settings, settings.prompt
+        self.model, self._settings, self.template = model, settings, settings.prompt
         self._phrases = phrases(suite, settings.query, settings.seed)
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
-        card = reader.card
+        card = model.card
         self.script: str | None = None
         self.limit = settings.inference_limit
         self.threads = 1 if card.parameters < SMALL else None
@@ -81,7 +81,7 @@ class AnswerController:
         self.streams: list[StoredStream] = []
         if settings.tokens != "none":
             self.streams = self._streams(blank)
-        self._capturer = Capturer(reader, self.streams, settings.tokens == "all", "answers")
+        self._capturer = Capturer(model, self.streams, settings.tokens == "all", "answers")
         self.identity: dict[str, Any] = {
             "model": settings.model,
             "random_weights": card.random_weights,
@@ -94,9 +94,9 @@ class AnswerController:
             self.identity["begun"] = self._form.begun
 
     def certificate(self) -> dict[str, Any]:
-        """The reader's card, fire counts of the last capture, and what the capture proved."""
+        """The answer model's card, fire counts of the last capture, and what the capture proved."""
         return {
-            "policy": self.reader.card.to_json(),
+            "policy": self.model.card.to_json(),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
         }
@@ -111,7 +111,7 @@ class AnswerController:
         for order in self.template.orders:
             questions = self._questions(shown, phrases_asked, order)
             reading = self._read(questions, buffers if order == "original" else {})
-            spoken.append(self.reader.speak(reading, self.template.tokens))
+            spoken.append(self.model.speak(reading, self.template.tokens))
             forced.append(self._forced(questions, reading, order))
         first = self._questions(shown, phrases_asked, "original")
         sizes = self._sizes(first)
@@ -142,7 +142,7 @@ class AnswerController:
 
     def _spoken_options(self, order: Order) -> dict[str, Said]:
         """What an answer may begin with, and what that says."""
-        lead = self.reader.lead
+        lead = self.model.lead
         if not self.template.lettered:
             return {f"{lead}Yes": "yes", f"{lead}No": "no"}
         first, second = sides(order)
@@ -150,11 +150,11 @@ class AnswerController:
 
     def _read(self, questions: Sequence["Prompt"], buffers: "Mapping[int, EpisodeBuffers]") -> "Reading":
         if not buffers:
-            return self.reader.read(questions)
+            return self.model.read(questions)
         return self._capturer.run(
-            lambda: self.reader.read(questions),
+            lambda: self.model.read(questions),
             lambda reading: reading.option_logits,
-            self.reader.asked_roles(questions),
+            self.model.asked_roles(questions),
             buffers,
         )
 
@@ -164,12 +164,12 @@ class AnswerController:
         if self._form is not None:
             meaning = self._form.options
             asked = [replace(own, options=tuple(meaning), begun=self._form.begun) for own in questions]
-            reading = self.reader.read(asked)
+            reading = self.model.read(asked)
         if np.isnan(reading.option_logits).any():
             raise PolicyFailedError(
                 "the model gave NaN as the logit of an answer; expected numbers for all of them"
             )
-        ties = self.reader.near_ties(reading)
+        ties = self.model.near_ties(reading)
         return [
             Forced(
                 {said: float(logit) for said, logit in zip(meaning.values(), row, strict=True)},
@@ -224,8 +224,8 @@ class AnswerController:
         ]
 
     def _backbone_roles(self, questions: Sequence["Prompt"]) -> "list[Roles]":
-        backbone = next(name for name, own in self.reader.streams.items() if own.part == "backbone")
-        return self.reader.asked_roles(questions)[backbone]
+        backbone = next(name for name, own in self.model.streams.items() if own.part == "backbone")
+        return self.model.asked_roles(questions)[backbone]
 
     # -- beforehand --------------------------------------------------------------------------------------
 
@@ -235,13 +235,13 @@ class AnswerController:
 
     def _streams(self, blank: Observation) -> list[StoredStream]:
         """At the longest prompt; a prompt without a picture has no view of one."""
-        roles = self.reader.asked_roles(self._blank_questions(blank))
+        roles = self.model.asked_roles(self._blank_questions(blank))
         played = {name: {span.role for row in rows for span in row.spans} for name, rows in roles.items()}
         names = {
-            name: [role for role in self.reader.role_names[name] if role in played[name]]
-            for name in self.reader.streams
+            name: [role for role in self.model.role_names[name] if role in played[name]]
+            for name in self.model.streams
         }
-        return stored_streams(self.reader, roles, names)
+        return stored_streams(self.model, roles, names)
 
     def _choose_form(self, blank: Observation) -> Form | None:
         """The first form in which the sides differ in their first token; None where options are letters or yes.
@@ -250,15 +250,15 @@ class AnswerController:
         episode. Raises UsageError as `AnswerModel.read` does.
         """
         questions = self._blank_questions(blank)[:1]
-        self.reader.read(questions)
+        self.model.read(questions)
         if self.template.lettered or self._settings.query == "absent":
             return None
-        lead = self.reader.lead
+        lead = self.model.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""
         forms = [Form.after(begun, " " if begun else lead), Form.after(f"{begun} " if begun else lead, "")]
         for number, form in enumerate(forms):
             try:
-                self.reader.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
+                self.model.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
             except UsageError:
                 if number == len(forms) - 1:
                     raise

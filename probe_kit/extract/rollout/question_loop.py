@@ -73,7 +73,7 @@ class Asking:
             return
         try:
             controller = self._controller
-            with while_acting(controller.identity["model"], controller.reader.card.checkpoint, controller.limit):
+            with while_acting(controller.identity["model"], controller.model.card.checkpoint, controller.limit):
                 started = perf_counter()
                 outcomes = controller.ask([turn for _, turn, _ in due])
                 seconds = (perf_counter() - started) / len(due)

@@ -29,7 +29,7 @@ class ModelCard:
     chunk, execute: actions per inference and how many of them are executed; 0 for a model that does not act.
     ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
     newest with the largest weight; None executes the head of the newest chunk.
-    source: the family of the reader whose network this policy grew from, if it is one of ours. source_weights: of
+    source: the family of the VLM whose network this policy grew from, if it is one of ours. source_weights: of
     that family, the weights; None where they are unknown, as for a checkpoint that is not the family's own.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """

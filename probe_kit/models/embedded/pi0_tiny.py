@@ -1,7 +1,7 @@
 """The embedded policy: a pi0 of 0.84 million parameters, stored as an ordinary lerobot checkpoint.
 
 Its weights lie in `checkpoints/` beside this file, with a model card; `scripts/train_embedded_policy.py` makes
-them of the embedded reader.
+them of the embedded VLM.
 """
 
 import json

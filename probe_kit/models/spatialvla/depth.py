@@ -48,7 +48,7 @@ def estimate_depth(network: Any, pictures: Tensor, vote: bool = False) -> Depth:
     if domains is not None and not vote:
         own, common = domains.argmax(dim=-1), int(domains.sum(dim=0).argmax())
         for domain in set(own.tolist()):
-            if domain != common:  # rows of one opinion outvote nobody: their sum has the same largest logit
+            if domain != common:  # rows of one domain alone: their sum has the same largest logit
                 raw[own == domain] = _predict(network, seen[own == domain])[0]
     whole = nn.functional.interpolate(
         raw[:, None], size=(side + 2 * MARGIN,) * 2, mode="bicubic", align_corners=True

@@ -214,7 +214,7 @@ def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
     if len(other):
         raise OtherFramesError(
             f"{len(other)} of {len(pairs)} episodes begin with another frame in {asked.location} than in "
-            f"{acted.location} ({', '.join(other[:_MOST_NAMED])} …): a reader and a policy that saw different "
+            f"{acted.location} ({', '.join(other[:_MOST_NAMED])} …): a VLM and a policy that saw different "
             "pictures cannot be joined. Repeat one of them with the --seed, --scene and suite of the other"
         )
     both: pd.DataFrame = pairs[pairs.groupby("item_id")["layout"].transform("nunique") == 2]
@@ -399,9 +399,9 @@ def _of_picture(asked: RunReader) -> list[str]:
     ask = ask_of(asked) or {}
     notes = []
     if ask.get("picture") != "frame":
-        notes.append(f"The reader was not shown the first frame (--picture {ask.get('picture')}).")
+        notes.append(f"The VLM was not shown the first frame (--picture {ask.get('picture')}).")
     if ask.get("object") != "target":
-        notes.append(f"The reader was asked for the {ask.get('object')}, not for what the instruction names.")
+        notes.append(f"The VLM was asked for the {ask.get('object')}, not for what the instruction names.")
     return notes
 
 

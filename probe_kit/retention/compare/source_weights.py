@@ -1,4 +1,4 @@
-"""Whether a policy's network grew from the weights that a reader was asked with."""
+"""Whether a policy's network grew from the weights that a VLM was asked with."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -8,13 +8,13 @@ from probe_kit.train.data.run_reader import RunReader
 Relation = Literal["yes", "no", "unknown"]
 
 
-def grew_from(policy: RunReader, reader: RunReader) -> Relation:
+def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     """Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little.
 
     A family's name says which network it is and not which weights: another name is another source, the same name
     is no evidence.
     """
-    grown, asked = _card(policy), _card(reader)
+    grown, asked = _card(policy), _card(vlm)
     if grown.get("random_weights") or asked.get("random_weights"):
         return "no"
     source = grown.get("source_weights") or {}

@@ -1,4 +1,4 @@
-"""VLM minus VLA: what a reader says of the first frames, against what a policy does in the same episodes."""
+"""VLM minus VLA: what a VLM says of the first frames, against what a policy does in the same episodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,38 +49,38 @@ def vlm_vla_differences(
 ) -> list[VlmVlaDifference]:
     """Every VLM run minus every acting one that it can be compared with, per category and over all of them.
 
-    A policy whose network grew from weights that were asked is not compared with readers of other weights.
+    A policy whose network grew from weights that were asked is not compared with VLMs of other weights.
     names: what runs are called, by their location; by default their labels. Runs as `retention` reads them.
     """
     called = names or {str(run.location): run.label for run in runs}
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None]
     found: list[VlmVlaDifference] = []
-    for reader, policy, source in _chosen(asked, acted):
-        found += [replace(row, source=source) for row in _pair(reader, policy, called)]
+    for vlm, policy, source in _chosen(asked, acted):
+        found += [replace(row, source=source) for row in _pair(vlm, policy, called)]
     p_holm = corrected(found, lambda row: row.p, lambda row: row.category == MEAN)
     return [replace(row, p_holm=p) for row, p in zip(found, p_holm, strict=True)]
 
 
 def _chosen(asked: Sequence[RunReader], acted: Sequence[RunReader]) -> list[tuple[RunReader, RunReader, Relation]]:
-    """The pairs that are compared, reader by reader."""
-    related = [(reader, policy, grew_from(policy, reader)) for reader, policy in product(asked, acted)]
+    """The pairs that are compared, VLM by VLM."""
+    related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(asked, acted)]
     grown = {id(policy) for _, policy, source in related if source == "yes"}
     return [pair for pair in related if pair[2] != "no" or id(pair[1]) not in grown]
 
 
-def _pair(reader: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmVlaDifference]:
+def _pair(vlm: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmVlaDifference]:
     there = dict(list(policy.episodes.groupby("category", sort=False)))
     rows, gaps = [], []
-    for category, here in reader.episodes.groupby("category", sort=False):
+    for category, here in vlm.episodes.groupby("category", sort=False):
         if category not in there:
             continue
-        row, gap = _compare(str(category), here, there[category], (reader, policy), called)
+        row, gap = _compare(str(category), here, there[category], (vlm, policy), called)
         rows.append(row)
         gaps.append(gap)
     if not rows:
         return []
-    return [*rows, _mean(rows, gaps, reader, policy)]
+    return [*rows, _mean(rows, gaps, vlm, policy)]
 
 
 def _compare(
@@ -90,14 +90,14 @@ def _compare(
     runs: tuple[RunReader, RunReader],
     called: Mapping[str, str],
 ) -> tuple[VlmVlaDifference, Rate]:
-    reader, policy = runs
+    vlm, policy = runs
     accuracy, sr = (
-        Rate.pooled([success_share(frame, run.suite)]) for frame, run in ((here, reader), (there, policy))
+        Rate.pooled([success_share(frame, run.suite)]) for frame, run in ((here, vlm), (there, policy))
     )
     gap = accuracy.minus(sr)
     paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.paired_with(sr)
     row = VlmVlaDifference(
-        asked=called[str(reader.location)],
+        asked=called[str(vlm.location)],
         acted=called[str(policy.location)],
         category=category,
         paired=paired,
@@ -127,12 +127,12 @@ def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
 
 
 def _mean(
-    rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate], reader: RunReader, policy: RunReader
+    rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate], vlm: RunReader, policy: RunReader
 ) -> VlmVlaDifference:
     gap = Rate.mean([one.value for one in gaps], [one.interval for one in gaps])
     categories = [row.category for row in rows]
     paired = all(row.paired for row in rows)
-    kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (reader, policy)]
+    kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (vlm, policy)]
     return replace(
         rows[0],
         category=MEAN,

@@ -26,7 +26,7 @@ def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it
 
 
 @pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if not family.acts])
-def test_a_reader_is_refused_because_it_does_not_act(name: str) -> None:
+def test_a_vlm_is_refused_because_it_does_not_act(name: str) -> None:
     with pytest.raises(UnsupportedInterventionError, match=f"{name}.*does not act"):
         FAMILIES[name].check_intervention("follow")
     assert FAMILIES[name].interventions_json() is None

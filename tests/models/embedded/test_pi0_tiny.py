@@ -18,16 +18,16 @@ from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS
 from probe_kit.suite import build_suite
 
 NAMES = ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state")
-READER = "vlm-tiny"
+VLM = "vlm-tiny"
 
 
-def test_reader_and_policy_are_small_and_so_is_all_that_comes_with_the_package() -> None:
+def test_vlm_and_policy_are_small_and_so_is_all_that_comes_with_the_package() -> None:
     sizes = {
         folder.name: file_size(folder.name)
-        for folder in embedded_checkpoint(READER).parent.iterdir()
+        for folder in embedded_checkpoint(VLM).parent.iterdir()
         if folder.is_dir()
     }
-    assert sizes[READER] + sizes["pi0-tiny"] < 8_000_000
+    assert sizes[VLM] + sizes["pi0-tiny"] < 8_000_000
     assert sum(sizes.values()) < 10_000_000
 
 
@@ -39,18 +39,18 @@ def file_size(name: str) -> int:
 def test_the_weights_say_how_they_were_made(name: str) -> None:
     path = embedded_checkpoint(name) / "model.safetensors"
     with safe_open(path, "pt") as file:
-        assert READER in file.metadata()["probe_kit.weights"]
+        assert VLM in file.metadata()["probe_kit.weights"]
         assert all(torch.isfinite(file.get_tensor(key)).all() for key in file.keys())  # noqa: SIM118
 
 
-def test_the_policy_begins_as_the_reader_and_is_another_afterwards() -> None:
-    """Weight by weight, as far as float16 holds them; an expert beside it that the reader has not."""
-    reader = weights_of(READER)
+def test_the_policy_begins_as_the_vlm_and_is_another_afterwards() -> None:
+    """Weight by weight, as far as float16 holds them; an expert beside it that the VLM has not."""
+    vlm = weights_of(VLM)
     start, policy = (backbone(weights_of(name)) for name in ("pi0-tiny-early", "pi0-tiny"))
-    assert start.keys() - {"lm_head.weight"} == reader.keys() == policy.keys() - {"lm_head.weight"}
-    for name, tensor in reader.items():
+    assert start.keys() - {"lm_head.weight"} == vlm.keys() == policy.keys() - {"lm_head.weight"}
+    for name, tensor in vlm.items():
         torch.testing.assert_close(start[name].float(), tensor.half().float(), rtol=0, atol=0)
-    assert any((policy[name] - tensor).abs().max() > 0.01 for name, tensor in reader.items())
+    assert any((policy[name] - tensor).abs().max() > 0.01 for name, tensor in vlm.items())
 
 
 def weights_of(name: str) -> dict[str, torch.Tensor]:
@@ -62,17 +62,17 @@ def backbone(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-@pytest.mark.parametrize("name", [*NAMES, READER])
+@pytest.mark.parametrize("name", [*NAMES, VLM])
 def test_an_embedded_model_is_at_home_where_it_was_trained(name: str) -> None:
     home = SceneSpec.preset("act2answer", early_stop=True, max_steps=40)
-    assert (AskSettings if name == READER else ExtractSettings)(name).scene == home
+    assert (AskSettings if name == VLM else ExtractSettings)(name).scene == home
     assert scene_of(name) == home
     assert scene_of(name, tile_side=0.2) == replace(home, tile_side=0.2)
     assert scene_of(name, name="bridge", max_steps=3) == SceneSpec(max_steps=3)
 
 
 def test_all_others_are_at_home_in_the_default_scene() -> None:
-    embedded = {*NAMES, READER}
+    embedded = {*NAMES, VLM}
     assert {scene_of(name) for name in {*known_families(), "expert", "nobody"} - embedded} == {SceneSpec()}
 
 

@@ -1,4 +1,4 @@
-"""The embedded reader: small enough to ship, readable by transformers itself, and it knows what its card says."""
+"""The embedded VLM: small enough to ship, readable by transformers itself, and it knows what its card says."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ FOLDER = embedded_checkpoint("vlm-tiny")
 
 
 @pytest.fixture(scope="module")
-def reader() -> PaliGemma:
+def vlm() -> PaliGemma:
     return load_vlm_tiny()
 
 
@@ -37,32 +37,32 @@ def test_the_weights_that_come_with_the_package_are_small_and_say_how_they_were_
         assert all(torch.isfinite(file.get_tensor(key)).all() for key in file.keys())  # noqa: SIM118
 
 
-def test_it_knows_every_word_of_the_suite_in_every_prompt(reader: PaliGemma) -> None:
+def test_it_knows_every_word_of_the_suite_in_every_prompt(vlm: PaliGemma) -> None:
     assert set(vocabulary()) <= set(WORDS)
     phrases = {concept.phrase for own in GENERATORS.values() for pair in own.pairs for concept in pair}
     longest = 0
     for template in TEMPLATES.values():
         for order in ORDERS:
             for phrase in sorted(phrases):
-                prompt = reader.text.prompt(template.render(Phrase(phrase, "the"), order), picture=[4] * 36)
+                prompt = vlm.text.prompt(template.render(Phrase(phrase, "the"), order), picture=[4] * 36)
                 longest = max(longest, len(prompt.ids))
-    assert longest + template.tokens <= reader.text_config.max_position_embeddings
+    assert longest + template.tokens <= vlm.text_config.max_position_embeddings
 
 
-def test_transformers_reads_the_same_network_from_the_same_folder(reader: PaliGemma) -> None:
+def test_transformers_reads_the_same_network_from_the_same_folder(vlm: PaliGemma) -> None:
     theirs = PaliGemmaForConditionalGeneration.from_pretrained(FOLDER).eval()
     picture = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     question = Prompt(Observation(picture, "", np.zeros(8, np.float32)), "Put cube on star", ("A", "B"))
-    reading = reader.read([question])
-    ids = torch.tensor([reader.prompt(question).ids])
+    reading = vlm.read([question])
+    ids = torch.tensor([vlm.prompt(question).ids])
     with torch.inference_mode():
         logits = theirs(
             input_ids=ids,
-            pixel_values=reader.shown([picture])["pixel_values"],
+            pixel_values=vlm.shown([picture])["pixel_values"],
             attention_mask=torch.ones_like(ids),
             token_type_ids=torch.zeros_like(ids),
         ).logits[0, -1]
-    options = [reader.text.option(reader.prompt(question), letter) for letter in "AB"]
+    options = [vlm.text.option(vlm.prompt(question), letter) for letter in "AB"]
     np.testing.assert_allclose(reading.option_logits[0], logits[options].numpy(), atol=1e-5)
 
 

@@ -27,7 +27,7 @@ OF_POLICIES = re.compile(
 )
 
 
-def reader(path: Path) -> SaidRun:
+def vlm(path: Path) -> SaidRun:
     run = asked(path, RIGHT)
     save_results(probes(run, {"color": [0.5, 0.9]}), run.location)
     return run
@@ -66,7 +66,7 @@ def written(figure) -> list[str]:  # type: ignore[no-untyped-def]
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
     """One with probes, and one without, of which a note says so."""
     folder = tmp_path_factory.mktemp("asked")
-    return formats([reader(folder), asked(folder / "plain", RIGHT, "vlm-tiny")])
+    return formats([vlm(folder), asked(folder / "plain", RIGHT, "vlm-tiny")])
 
 
 FORMATS = ("terminal", "markdown", "latex", "notebook", "report", "captions", "figures")
@@ -90,7 +90,7 @@ def test_the_summary_says_how_many_answers_are_right(shown: Mapping[str, str]) -
 
 def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -> None:
     policy = acted(tmp_path, RIGHT)
-    alone, both = formats([policy]), formats([policy, reader(tmp_path)])
+    alone, both = formats([policy]), formats([policy, vlm(tmp_path)])
     assert "The cube ended on the correct picture in" in alone["report"]
     assert "It answers right in" not in alone["report"]
     assert "The cube ended on the correct picture in" in both["report"]
@@ -102,7 +102,7 @@ def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -
 
 
 def test_axes_and_titles_name_the_share_they_show(tmp_path: Path) -> None:
-    table = retention_table([reader(tmp_path)])
+    table = retention_table([vlm(tmp_path)])
     assert SuccessTableDisplay.from_table(table).title == "Accuracy of answers (%)"
     assert SideTableDisplay.from_table(table).title.startswith("Accuracy of answers (%) where")
     axes = KnowledgeActionDisplay.from_table(table).plot().ax_

@@ -34,9 +34,9 @@ def runs(tmp_path: Path) -> tuple[SaidRun, SaidRun]:
 # -- the same, by loops ----------------------------------------------------------------------------------
 
 
-def recount(reader: SaidRun, policy: SaidRun, encoded: dict[str, bool], category: str) -> dict:
+def recount(vlm: SaidRun, policy: SaidRun, encoded: dict[str, bool], category: str) -> dict:
     """Every number of a row of the join by counting, without any of the package's functions."""
-    said = dict(zip(reader.episodes["episode_id"], reader.episodes["outcome"], strict=True))
+    said = dict(zip(vlm.episodes["episode_id"], vlm.episodes["outcome"], strict=True))
     items: dict[str, list[tuple[bool, bool, bool]]] = {}
     group: dict[str, str] = {}
     for row in policy.episodes.to_dict("records"):
@@ -106,15 +106,15 @@ def interval(hits: int, n: int) -> tuple[float, float]:
 
 
 def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
+    vlm, policy = runs
     results = probes(policy, {"color": [0.5, 0.8, 0.85], "shape": [0.7, 0.9]})
     encoded: dict[str, bool] = {}
     for curve in results.curves.values():
         encoded |= dict(zip(curve.episodes, encoded_decisions(curve), strict=True))
-    found = match_runs(reader, policy, results)
+    found = match_runs(vlm, policy, results)
     assert [row.category for row in found.rows] == ["color", "shape", "all"]
     for row in found.rows:
-        expected = recount(reader, policy, encoded, row.category)
+        expected = recount(vlm, policy, encoded, row.category)
         assert {code: n for code, n in row.counts.items() if n} == dict(expected["counts"])
         assert {code: n for code, n in row.episodes.items() if n} == dict(expected["episodes"])
         for one, (pair, (binomial_p, flip)) in zip(row.comparisons, expected["tests"].items(), strict=True):
@@ -154,58 +154,58 @@ def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(t
     assert row.episodes == {"1-1": 20, "1-0": 0, "0-1": 0, "0-0": 20}
 
 
-def test_another_score_of_the_reader_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
-    assert match_runs(scored(reader, "logits"), policy).rows[-1].answered_correctly == 0, "it always says left"
-    balanced = match_runs(scored(reader, "order-balanced"), policy)
+def test_another_score_of_the_vlm_is_another_join(runs: tuple[SaidRun, SaidRun]) -> None:
+    vlm, policy = runs
+    assert match_runs(scored(vlm, "logits"), policy).rows[-1].answered_correctly == 0, "it always says left"
+    balanced = match_runs(scored(vlm, "order-balanced"), policy)
     assert balanced.rows[-1].answered_correctly == 26
     assert balanced.score == "order-balanced"
 
 
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
-    found = match_runs(reader, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
+    vlm, policy = runs
+    found = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
     assert [row.has_signal for row in found.rows] == [True, False, None]
     assert any(note.startswith("In shape probes beat neither") for note in found.notes)
 
 
 def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
+    vlm, policy = runs
     other = policy.episodes.assign(
         first_frame_sha256=policy.episodes["first_frame_sha256"].where(policy.episodes.index > 1, "another")
     )
     with pytest.raises(OtherFramesError, match="2 of 52 episodes begin with another frame"):
-        match_runs(reader, replace(policy, episodes=other))
+        match_runs(vlm, replace(policy, episodes=other))
     for bare in (policy.episodes.drop(columns="first_frame_sha256"), other.assign(first_frame_sha256=None)):
         with pytest.raises(OtherFramesError, match="does not say what its first frames were"):
-            match_runs(reader, replace(policy, episodes=bare))
+            match_runs(vlm, replace(policy, episodes=bare))
 
 
 def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
+    vlm, policy = runs
     with pytest.raises(UsageError, match="not a VLM run and a policy run, in this order"):
-        match_runs(policy, reader)
+        match_runs(policy, vlm)
     strange = policy.episodes.assign(item_id="other-" + policy.episodes["item_id"])
     with pytest.raises(UsageError, match="no question in common"):
-        match_runs(reader, replace(policy, episodes=strange))
+        match_runs(vlm, replace(policy, episodes=strange))
     half = policy.episodes[policy.episodes["layout"] == "original"]
     with pytest.raises(UsageError, match="no item in both layouts"):
-        match_runs(reader, replace(policy, episodes=half))
+        match_runs(vlm, replace(policy, episodes=half))
     with pytest.raises(UsageError, match="view 'last' was not probed"):
-        match_runs(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
+        match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
 
 
 def test_what_is_left_out_is_said(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
-    fewer = replace(reader, episodes=reader.episodes[reader.episodes["category"] == "color"])
+    vlm, policy = runs
+    fewer = replace(vlm, episodes=vlm.episodes[vlm.episodes["category"] == "color"])
     found = match_runs(fewer, policy, probes(policy, {"color": [0.9]}))
     assert [row.category for row in found.rows] == ["color"]
     assert any(note.startswith("24 episodes of") for note in found.notes)
 
 
 def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRun, SaidRun]) -> None:
-    reader, policy = runs
-    found = match_runs(reader, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
+    vlm, policy = runs
+    found = match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
     console.print(rich_known_used(found))
     text = console.export_text()

@@ -211,11 +211,11 @@ def test_a_category_with_other_items_alone_is_left_out(tmp_path: Path) -> None:
 
 
 def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path: Path) -> None:
-    readers = [asked(tmp_path / str(at), hits(0.7, at), f"reader-{at}") for at in range(2)]
+    vlms = [asked(tmp_path / str(at), hits(0.7, at), f"vlm-{at}") for at in range(2)]
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
-    mixed = [policies[0], readers[0], policies[1], readers[1]]
+    mixed = [policies[0], vlms[0], policies[1], vlms[1]]
     table = retention_table(mixed)
-    assert pairs(table) == [("reader-0", "reader-1"), ("policy-0", "policy-1")]
+    assert pairs(table) == [("vlm-0", "vlm-1"), ("policy-0", "policy-1")]
     assert table.unpaired == (
         "VLM runs and policy runs are not compared with each other here; --vlm-vla does that.",
     )
@@ -224,12 +224,12 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     (header, _, *lines) = table.to_markdown().splitlines()[2:]
     columns = [cell.strip() for cell in header.split("|")]
     cells = {line.split("|")[2].strip(): line.split("|") for line in lines if line.startswith("| Mean")}
-    answered, acted = (cells[f"{name}-0 − {name}-1"] for name in ("reader", "policy"))
+    answered, acted = (cells[f"{name}-0 − {name}-1"] for name in ("vlm", "policy"))
     assert "[" in answered[columns.index("VLM %")]
     assert "[" not in answered[columns.index("success %")]
     assert "[" in acted[columns.index("success %")]
     assert "[" not in acted[columns.index("VLM %")]
-    accuracy = [(r.episodes["outcome"] == "correct").mean() for r in readers]
+    accuracy = [(r.episodes["outcome"] == "correct").mean() for r in vlms]
     gain = next(row.sr for row in table.differences if row.category == "mean")
     right = [row.success.sr for row in table.means if row.run.mode == "answers"]
     assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]

@@ -24,7 +24,7 @@ GROWN = {name: family for name, family in known_families().items() if family.sou
 RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 
-def reader(path: Path, card: ModelCard, called: str = "") -> SaidRun:
+def vlm(path: Path, card: ModelCard, called: str = "") -> SaidRun:
     return replace(asked(path, RIGHT, card.family, called), certificate={"policy": card.to_json()})
 
 
@@ -54,37 +54,37 @@ OTHERS = {
 
 def test_another_size_of_the_same_family_is_not_the_source(tmp_path: Path) -> None:
     grown = policy(tmp_path / "p", xiaomi())
-    assert grew_from(grown, reader(tmp_path, QWEN_4B)) == "yes"
-    assert grew_from(grown, reader(tmp_path, QWEN_32B)) == "no"
+    assert grew_from(grown, vlm(tmp_path, QWEN_4B)) == "yes"
+    assert grew_from(grown, vlm(tmp_path, QWEN_32B)) == "no"
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_cannot_be_told_is_unknown(tmp_path: Path, name: str) -> None:
     asked_card, expected = OTHERS[name]
-    assert grew_from(policy(tmp_path / "p", xiaomi()), reader(tmp_path, asked_card)) == expected
+    assert grew_from(policy(tmp_path / "p", xiaomi()), vlm(tmp_path, asked_card)) == expected
 
 
 def test_a_checkpoint_that_is_not_the_familys_own_grew_from_unknown_weights(tmp_path: Path) -> None:
     mine = policy(tmp_path / "p", xiaomi("my/fine-tune"))
-    assert grew_from(mine, reader(tmp_path, QWEN_4B)) == "unknown"
-    assert grew_from(mine, reader(tmp_path, OTHERS["another network"][0])) == "no"
-    assert grew_from(policy(tmp_path / "p", xiaomi(random=True)), reader(tmp_path, QWEN_4B)) == "no"
+    assert grew_from(mine, vlm(tmp_path, QWEN_4B)) == "unknown"
+    assert grew_from(mine, vlm(tmp_path, OTHERS["another network"][0])) == "no"
+    assert grew_from(policy(tmp_path / "p", xiaomi(random=True)), vlm(tmp_path, QWEN_4B)) == "no"
 
 
 def test_runs_of_before_whose_cards_hold_a_family_only_are_unknown(tmp_path: Path) -> None:
     """Their `source` is a name; a run without a certificate has an unknown source."""
     old = acted(tmp_path / "p", RIGHT, "xiaomi-r0", source="qwen3-vl")
-    assert grew_from(old, reader(tmp_path, QWEN_4B)) == "unknown"
+    assert grew_from(old, vlm(tmp_path, QWEN_4B)) == "unknown"
     assert grew_from(old, asked(tmp_path / "r", RIGHT)) == "unknown"
-    assert grew_from(acted(tmp_path / "p", RIGHT), reader(tmp_path, QWEN_4B)) == "unknown"
+    assert grew_from(acted(tmp_path / "p", RIGHT), vlm(tmp_path, QWEN_4B)) == "unknown"
 
 
-def test_the_embedded_policies_grew_from_the_embedded_reader_and_only_from_it(tmp_path: Path) -> None:
-    own = reader(tmp_path / "r", load_model("vlm-tiny").card)
-    untrained = reader(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)
-    place = tmp_path / "copy of the reader"
+def test_the_embedded_policies_grew_from_the_embedded_vlm_and_only_from_it(tmp_path: Path) -> None:
+    own = vlm(tmp_path / "r", load_model("vlm-tiny").card)
+    untrained = vlm(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)
+    place = tmp_path / "copy of the VLM"
     shutil.copytree(embedded_checkpoint("vlm-tiny"), place)
-    copied = reader(tmp_path / "c", load_model("paligemma", str(place)).card)
+    copied = vlm(tmp_path / "c", load_model("paligemma", str(place)).card)
     for name in ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state"):
         acting = policy(tmp_path / name, load_model(name).card)
         assert [grew_from(acting, one) for one in (own, untrained, copied)] == ["yes", "no", "yes"]
@@ -117,14 +117,14 @@ def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None
 
 
 def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_path: Path) -> None:
-    readers = [reader(tmp_path / str(n), one, f"reader {n}") for n, one in enumerate((QWEN_4B, QWEN_32B))]
+    vlms = [vlm(tmp_path / str(n), one, f"vlm {n}") for n, one in enumerate((QWEN_4B, QWEN_32B))]
     grown = policy(tmp_path / "p", xiaomi())
-    found = vlm_vla_differences([*readers, grown])
-    assert {(gap.asked, gap.source) for gap in found} == {("reader 0", "yes")}
-    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([readers[1], grown])} == {("reader 1", "no")}
-    unknown = reader(tmp_path / "u", replace(QWEN_4B, checkpoint="my/copy"), "copy")
-    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([*readers, unknown, grown])} == {
-        ("reader 0", "yes"),
+    found = vlm_vla_differences([*vlms, grown])
+    assert {(gap.asked, gap.source) for gap in found} == {("vlm 0", "yes")}
+    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([vlms[1], grown])} == {("vlm 1", "no")}
+    unknown = vlm(tmp_path / "u", replace(QWEN_4B, checkpoint="my/copy"), "copy")
+    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([*vlms, unknown, grown])} == {
+        ("vlm 0", "yes"),
         ("copy", "unknown"),
     }
 
@@ -137,8 +137,8 @@ def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_
         (replace(QWEN_4B, checkpoint="my/copy"), "unknown whether the policy grew from these weights"),
     ],
 )
-def test_every_format_says_whether_the_reader_is_the_source(tmp_path: Path, card: ModelCard, words: str) -> None:
-    runs = [reader(tmp_path / "r", card), policy(tmp_path / "p", xiaomi())]
+def test_every_format_says_whether_the_vlm_is_the_source(tmp_path: Path, card: ModelCard, words: str) -> None:
+    runs = [vlm(tmp_path / "r", card), policy(tmp_path / "p", xiaomi())]
     table = retention_table(runs, vlm_vla=True)
     console = Console(width=300, record=True, file=StringIO())
     console.print(table.to_rich("all"))

@@ -89,15 +89,15 @@ def test_items_with_a_side_in_their_name_are_left_out_unless_asked_for(tmp_path:
 
 def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None:
     table = retention_table(runs, vlm_vla=True)
-    policy, reader = (run.episodes.set_index("episode_id") for run in runs)
+    policy, vlm = (run.episodes.set_index("episode_id") for run in runs)
     ps = []
     for gap in table.vlm_vla[:2]:
-        here = reader[reader["category"] == gap.category]["outcome"] == "correct"
+        here = vlm[vlm["category"] == gap.category]["outcome"] == "correct"
         there = (policy["outcome"] == "correct")[here.index]
         assert gap.difference == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
         gains: dict[str, int] = {}
         for name in here.index:
-            group = reader.loc[name, "group_id"]
+            group = vlm.loc[name, "group_id"]
             gains[group] = gains.get(group, 0) + int(here[name]) - int(there[name])
         values = [value for value in gains.values() if value]
         sums = [
@@ -106,7 +106,7 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
         ]
         ps.append(sum(one >= abs(sum(values)) for one in sums) / len(sums))
         assert gap.p == pytest.approx(ps[-1])
-        tables = [run.loc[here.index].reset_index() for run in (reader, policy)]
+        tables = [run.loc[here.index].reset_index() for run in (vlm, policy)]
         assert gap.difference_ci == pytest.approx(mover(*tables))
         assert (gap.paired, gap.same_frames) == (True, True)
     smaller, larger = sorted(ps)
@@ -118,17 +118,17 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
 
 
 def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
-    policy, reader = runs
+    policy, vlm = runs
     fewer = replace(policy, episodes=policy.episodes[policy.episodes["item_id"] != "color-0"])
-    color = vlm_vla_differences([reader, fewer])[0]
+    color = vlm_vla_differences([vlm, fewer])[0]
     assert (color.paired, color.p) == (False, None)
     other = replace(policy, episodes=policy.episodes.assign(first_frame_sha256="another"))
-    assert vlm_vla_differences([reader, other])[0].same_frames is False
+    assert vlm_vla_differences([vlm, other])[0].same_frames is False
     bare = replace(policy, episodes=policy.episodes.drop(columns="first_frame_sha256"))
-    assert vlm_vla_differences([reader, bare])[0].same_frames is None
+    assert vlm_vla_differences([vlm, bare])[0].same_frames is None
 
 
-def test_a_policy_is_compared_with_the_reader_it_grew_from(tmp_path: Path) -> None:
+def test_a_policy_is_compared_with_the_vlm_it_grew_from(tmp_path: Path) -> None:
     qwen = asked(tmp_path / "a", by_chance(1, 0.9), "qwen3-vl")
     gemma = asked(tmp_path / "b", by_chance(3, 0.8), "paligemma")
     weights = {"family": "paligemma", "checkpoint": "google/paligemma-3b-pt-224"}

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.module_outputs import numpy_of
-from probe_kit.hooks.families.shared.qwen.reader import ASSISTANT, USER
 from probe_kit.hooks.families.shared.qwen.tower import by_picture
+from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
 from probe_kit.hooks.families.shared.vlm.adapter import Pictures
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
+from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.hooks.families.shared.vlm.verify import Reference, questions_of, verify_vlm
 from probe_kit.hooks.verification.verify import Comparison, Produce
@@ -33,7 +33,7 @@ STREAMS = 1e-4
 """Tolerance of activations, which enter through a softmax over visual words."""
 
 
-class Ovis25(RecipeReader):
+class Ovis25(RecipeVLM):
     """A loaded Ovis2.5."""
 
     family: ClassVar[str] = "ovis2.5"
@@ -86,7 +86,7 @@ class Ovis25(RecipeReader):
 
     @classmethod
     def verify(cls, folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
-        """As of every reader, with the visual words and patches in the order of the authors' code."""
+        """As of every VLM, with the visual words and patches in the order of the authors' code."""
         model = cls.load(str(folder / "checkpoint"), dtype="float32")
         reference = Reference(model, questions_of(folder, recorded, model), recorded)
 

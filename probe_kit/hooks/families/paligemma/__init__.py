@@ -7,7 +7,7 @@ from probe_kit.hooks.family import Family
 FAMILIES = (
     Family(
         "vlm-tiny",
-        "PaliGemma at 0.61 million parameters, the embedded reader: knows Color, Shape, State and Traffic",
+        "PaliGemma at 0.61 million parameters, the embedded VLM: knows Color, Shape, State and Traffic",
         None,
         "probe_kit.hooks.families.paligemma.adapter:load_vlm_tiny",
         streams="backbone 4 layers, answer 4 layers",

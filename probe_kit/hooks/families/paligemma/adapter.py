@@ -11,7 +11,7 @@ from transformers import PaliGemmaConfig
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.vlm.adapter import Pictures
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.reader import RecipeReader
+from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.packing import LeftPacked
@@ -20,7 +20,7 @@ from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligem
 _FIRST_POSITION = 1
 
 
-class PaliGemma(RecipeReader):
+class PaliGemma(RecipeVLM):
     """A loaded PaliGemma."""
 
     family: ClassVar[str] = "paligemma"
@@ -72,8 +72,8 @@ def load_vlm_tiny(
     random_weights: bool = False,
     weights_seed: int = 0,
 ) -> PaliGemma:
-    """The embedded reader: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
+    """The embedded VLM: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
     place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
-    reader = PaliGemma.load(place, device, dtype, random_weights, weights_seed=weights_seed)
-    reader.card = replace(reader.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
-    return reader
+    vlm = PaliGemma.load(place, device, dtype, random_weights, weights_seed=weights_seed)
+    vlm.card = replace(vlm.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
+    return vlm

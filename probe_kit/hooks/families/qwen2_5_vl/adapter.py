@@ -4,13 +4,13 @@ from typing import ClassVar
 
 from transformers import Qwen2_5_VLConfig
 
-from probe_kit.hooks.families.shared.qwen.reader import SYSTEM, QwenReader, qwen_frame
+from probe_kit.hooks.families.shared.qwen.vlm import SYSTEM, QwenVLM, qwen_frame
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.qwen import QWEN2_5_NAMES, build_qwen2_5_vl
 
 
-class Qwen25VL(QwenReader):
+class Qwen25VL(QwenVLM):
     """A loaded Qwen2.5-VL."""
 
     family: ClassVar[str] = "qwen2.5-vl"

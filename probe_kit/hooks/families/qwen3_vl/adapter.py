@@ -4,13 +4,13 @@ from typing import ClassVar
 
 from transformers import Qwen3VLConfig
 
-from probe_kit.hooks.families.shared.qwen.reader import QwenReader, qwen_frame
+from probe_kit.hooks.families.shared.qwen.vlm import QwenVLM, qwen_frame
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.qwen import build_qwen3_vl
 
 
-class Qwen3VL(QwenReader):
+class Qwen3VL(QwenVLM):
     """A loaded Qwen3-VL."""
 
     family: ClassVar[str] = "qwen3-vl"

@@ -10,7 +10,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks import Observation, Site, capture
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.families.magma.adapter import Magma, load_magma
-from probe_kit.hooks.testing import AdapterContract, ReaderContract, example_observations
+from probe_kit.hooks.testing import AdapterContract, AnswerModelContract, example_observations
 from tests.support.magma_checkpoints import IDS, small_network, weights, write_checkpoint
 
 INSTRUCTIONS = ["Put the cube on the star", "Put the cube on the red shape"]
@@ -74,7 +74,7 @@ class TestMagmaDrawn(AdapterContract):
         return load_magma(str(folder), temperature=0.7)
 
 
-class TestMagmaAsked(ReaderContract):
+class TestMagmaAsked(AnswerModelContract):
     """Its own questions, not those for an action; a begun answer behind the frames."""
 
     family = "magma"
@@ -89,7 +89,7 @@ class TestMagmaAsked(ReaderContract):
         return {"shrink": 0, "prompt": "act2answer", "temperature": 0.7, "tokenizer": str(checkpoint)}
 
     @pytest.fixture
-    def reader(self, unsteered: Magma) -> Magma:
+    def answer_model(self, unsteered: Magma) -> Magma:
         return unsteered
 
     def questions(self, seen: Sequence[Observation]) -> list[Prompt]:

@@ -10,7 +10,7 @@ from probe_kit.errors import InstructionError, ObservationError, UnknownSiteErro
 from probe_kit.hooks import Observation, Prompt, Site, capture, load_model, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
-from probe_kit.hooks.testing import ReaderContract
+from probe_kit.hooks.testing import AnswerModelContract
 from probe_kit.hooks.verification.verify import verify_reference
 from tests.support.prismatic_checkpoints import write_checkpoint, write_tokenizer
 
@@ -107,8 +107,8 @@ def test_chats_begin_with_their_system_prompt(language: str) -> None:
 def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Observation) -> None:
     """Against as many steps of one decoding, and without the towers being run once more."""
     folder = str(write_checkpoint(tmp_path, model_type="prismatic"))
-    reader, whole = (load_prismatic(folder, tokenizer="bytes", steps=steps) for steps in (1, 6))
-    reading = reader.read([Prompt(observation, "Which?", ("A", "B"))])
+    vlm, whole = (load_prismatic(folder, tokenizer="bytes", steps=steps) for steps in (1, 6))
+    reading = vlm.read([Prompt(observation, "Which?", ("A", "B"))])
     decoded = whole.generate(whole.pixel_values([observation.image]), [whole.prompt("Which?")])
     with torch.inference_mode():
         said = reading.state.speak(6, frozenset())
@@ -117,7 +117,7 @@ def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Ob
         whole.speak(reading, 3)
 
 
-class TestPrismatic(ReaderContract):
+class TestPrismatic(AnswerModelContract):
     family = "prismatic"
     options = {"tokenizer": "bytes"}
     unloadable_options = frozenset({"bits"})
@@ -131,17 +131,17 @@ class TestPrismatic(ReaderContract):
         return {"steps": 2, "tokenizer": str(write_tokenizer(tmp_path))}
 
     @pytest.fixture(scope="class")
-    def reader(self, checkpoint: Path) -> Prismatic:
+    def answer_model(self, checkpoint: Path) -> Prismatic:
         return load_prismatic(str(checkpoint), tokenizer="bytes")
 
 
 def test_a_reading_compares_what_may_stand_behind_the_prompt(
     model: Prismatic, tmp_path: Path, observation: Observation
 ) -> None:
-    reader = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")), tokenizer="bytes")
-    reading = reader.read([Prompt(observation, "Which?", ("A", "B"))])
-    ids = reader.tokenizer.encode("In: Which?\nOut:")
-    logits = reader.generate(reader.pixel_values([observation.image]), [ids]).logits[0, 0]
+    vlm = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")), tokenizer="bytes")
+    reading = vlm.read([Prompt(observation, "Which?", ("A", "B"))])
+    ids = vlm.tokenizer.encode("In: Which?\nOut:")
+    logits = vlm.generate(vlm.pixel_values([observation.image]), [ids]).logits[0, 0]
     expected = logits[[3 + ord(letter) for letter in "AB"]]
     np.testing.assert_allclose(reading.option_logits[0], expected, atol=1e-6)
     np.testing.assert_allclose(reading.option_mass[0], logits.softmax(0)[[3 + 65, 3 + 66]].sum(), rtol=1e-5)

@@ -47,13 +47,13 @@ def test_nothing_stays_on_the_meta_device(tmp_path: Path) -> None:
 
 
 def test_the_larger_internvl_has_another_tower(tmp_path: Path) -> None:
-    reader = load_model("internvl", str(write_internvl(tmp_path, large=True)))
-    names = {name.rpartition("encoder.layer.0.")[2] for name in reader.network.state_dict()}
+    vlm = load_model("internvl", str(write_internvl(tmp_path, large=True)))
+    names = {name.rpartition("encoder.layer.0.")[2] for name in vlm.network.state_dict()}
     assert "attention.q_norm.weight" in names
     assert "attention.q_proj.bias" not in names
     seen = example_observations(["Why?"])[0]
-    reading = reader.read([Prompt(seen, "Why?", ("A", "B"))])
-    other = reader.read([Prompt(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
+    reading = vlm.read([Prompt(seen, "Why?", ("A", "B"))])
+    other = vlm.read([Prompt(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
     assert np.abs(reading.option_logits - other.option_logits).max() > 0
 
 
@@ -109,14 +109,14 @@ def test_a_size_stands_for_a_checkpoint(tmp_path: Path) -> None:
 
 def test_two_pictures_of_different_size_go_together(tmp_path: Path) -> None:
     """Positions come from each row's own mask and picture."""
-    reader = load_model("qwen3-vl", str(write_qwen3_vl(tmp_path)))
+    vlm = load_model("qwen3-vl", str(write_qwen3_vl(tmp_path)))
     small, large = example_observations(["Why?", "Why not?"])
     large = replace(large, image=np.tile(large.image, (3, 2, 1)))
     asked = [Prompt(own, own.instruction, ("A", "B")) for own in (small, large)]
-    together = reader.read(asked)
-    alone = [reader.read([question]).option_logits[0] for question in asked]
+    together = vlm.read(asked)
+    alone = [vlm.read([question]).option_logits[0] for question in asked]
     np.testing.assert_allclose(together.option_logits, alone, atol=1e-5)
-    assert reader.speak(together, 5) == [reader.speak(reader.read([question]), 5)[0] for question in asked]
+    assert vlm.speak(together, 5) == [vlm.speak(vlm.read([question]), 5)[0] for question in asked]
 
 
 @pytest.mark.parametrize(

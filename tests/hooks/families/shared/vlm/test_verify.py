@@ -1,4 +1,4 @@
-"""Readers against what transformers' own models and processors, or their authors' code, put out."""
+"""VLMs against what transformers' own models and processors, or their authors' code, put out."""
 
 import gzip
 import json

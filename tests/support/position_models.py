@@ -1,4 +1,4 @@
-"""Readers that look at nothing: they answer by the place of an option, or by the word for a side."""
+"""VLMs that look at nothing: they answer by the place of an option, or by the word for a side."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -11,7 +11,7 @@ Liking = Callable[[str, str], float]
 """The logit of an option (without its lead) behind a question."""
 
 
-class PositionReader(AnswerModel):
+class PositionModel(AnswerModel):
     """Says what it likes best. liking: logit of every option. said: the text that is spoken, by question."""
 
     def __init__(self, liking: Liking, said: Callable[[str], str]) -> None:

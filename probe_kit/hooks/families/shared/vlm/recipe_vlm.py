@@ -12,7 +12,7 @@ from probe_kit.hooks.families.shared.vlm.verify import verify_vlm
 from probe_kit.hooks.verification.verify import Comparison
 
 
-class RecipeReader(VisionLanguageModel):
+class RecipeVLM(VisionLanguageModel):
     """A vision-language model whose `recipe` makes its network; `load` and `verify` are a family's entries."""
 
     recipe: ClassVar[Recipe]

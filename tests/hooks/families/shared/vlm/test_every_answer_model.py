@@ -8,7 +8,7 @@ from typing import Any, ClassVar, cast
 import pytest
 
 from probe_kit.hooks import AnswerModel, load_model
-from probe_kit.hooks.testing import ReaderContract
+from probe_kit.hooks.testing import AnswerModelContract
 from tests.support.vlm_checkpoints import (
     write_internvl,
     write_ovis2_5,
@@ -18,7 +18,7 @@ from tests.support.vlm_checkpoints import (
 )
 
 
-class OfTinyCheckpoint(ReaderContract):
+class OfTinyCheckpoint(AnswerModelContract):
     """write: writes the checkpoint into a folder. further_options: of the family, other than their defaults."""
 
     write: Callable[[Path], Path]
@@ -26,7 +26,7 @@ class OfTinyCheckpoint(ReaderContract):
 
     @pytest.fixture(scope="class")
     def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        return type(self).write(tmp_path_factory.mktemp("reader"))
+        return type(self).write(tmp_path_factory.mktemp("vlm"))
 
     @pytest.fixture
     def other_options(self, checkpoint: Path) -> dict[str, Any]:
@@ -37,7 +37,7 @@ class OfTinyCheckpoint(ReaderContract):
         return cast(AnswerModel, load_model(self.family, str(checkpoint)))
 
     @pytest.fixture
-    def reader(self, loaded: AnswerModel) -> AnswerModel:
+    def answer_model(self, loaded: AnswerModel) -> AnswerModel:
         return loaded
 
 
