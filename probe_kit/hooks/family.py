@@ -107,11 +107,15 @@ class Family:
         """Load a model; `checkpoint` None means the default one.
 
         options: by name, as text or values. weights_seed: of a untrained network's weights.
+        Switches off torch's fused encoder in this process, because hooks would change its rounding.
         Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
         """
         chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         place = self.place(checkpoint, chosen.pop(SIZE, None))
         check_machine(device, dtype)
+        from probe_kit.hooks.capturing.changed_outputs import switch_off_fused_encoder
+
+        switch_off_fused_encoder()
         with while_loading(self.name, self.loader):
             load = imported(self.loader)
         if weights_seed:

@@ -78,8 +78,18 @@ class Capturer:
         around: Callable[[], AbstractContextManager[None]],
     ) -> None:
         """Once per process: the same inference without hooks gives the same outputs, bit for bit."""
-        with around():
-            plain = output_of(infer())
+
+        def without_hooks() -> NDArray[np.float32]:
+            with around():
+                return output_of(infer())
+
+        def with_hooks() -> NDArray[np.float32]:
+            from probe_kit.hooks import capture
+
+            with around(), capture(self._model, self._model.sites(), lambda _, activation: activation[:0].clone()):
+                return output_of(infer())
+
+        plain = without_hooks()
         name = self._outputs
         self.check = {
             f"{name}_with_hooks_sha256": _sha256(captured),
@@ -87,9 +97,11 @@ class Capturer:
             "observations": len(captured),
         }
         if _sha256(captured) != _sha256(plain):
+            from probe_kit.hooks.capturing.changed_outputs import reason_of_change
+
             raise CaptureChangedActionError(
                 f"capturing changed the {name} by up to {np.abs(plain - captured).max():.3g}; they must be equal "
-                "bit for bit. The adapter keeps state between calls, or its model is not deterministic"
+                f"bit for bit. {reason_of_change(without_hooks, plain, with_hooks)}"
             )
 
     def _keep(

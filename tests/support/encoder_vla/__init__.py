@@ -1,0 +1,13 @@
+"""A third party's family on torch's own nn.TransformerEncoder; tests install it beside those of probe_kit."""
+
+from probe_kit.hooks import Family
+
+FAMILY = Family(
+    "encoder-vla",
+    "torch's own encoder",
+    None,
+    "encoder_vla.policy:load",
+    streams="backbone 3 layers, expert 3 layers x 2 iterations",
+    needs_checkpoint=True,
+    config_types=("encoder-vla",),
+)
